@@ -1,0 +1,1 @@
+"""The phone: lens, shutter, exposure curve, and the profile that holds them."""

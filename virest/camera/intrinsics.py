@@ -1,0 +1,150 @@
+"""The lens: how a ray in camera axes becomes a pixel, and back.
+
+Camera axes: x right, y down, z forward.  Pixel (0, 0) is the centre of the top-left pixel.
+Distortion models are OpenCV's: ``radtan`` (Brown 1971; k1 k2 p1 p2 k3) and ``fisheye``
+(Kannala & Brandt 2006, doi:10.1109/TPAMI.2006.153; k1 k2 k3 k4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.errors import SettingsError
+
+COEFFICIENT_NAMES: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "radtan": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+_UNDISTORT_STEPS = 12
+_RAY_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A pinhole camera with lens distortion."""
+
+    width: int
+    """Pixels of a stored row."""
+    height: int
+    """Number of stored rows."""
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    model: str = "none"
+    """``none``, ``radtan`` or ``fisheye``."""
+    coefficients: tuple[float, ...] = ()
+    """In the order of COEFFICIENT_NAMES."""
+
+    def __post_init__(self) -> None:
+        if self.model not in COEFFICIENT_NAMES:
+            raise SettingsError(
+                f"distortion model '{self.model}' is not known",
+                hint=f"use one of {', '.join(COEFFICIENT_NAMES)}",
+            )
+        if len(self.coefficients) != len(COEFFICIENT_NAMES[self.model]):
+            raise SettingsError(
+                f"distortion model '{self.model}' takes {len(COEFFICIENT_NAMES[self.model])} coefficients, "
+                f"got {len(self.coefficients)}"
+            )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """K of the paper, (3, 3)."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether distortion changes any pixel: the equidistant fisheye does even with zero coefficients."""
+        return self.model == "fisheye" or any(self.coefficients)
+
+    def scaled_focal(self, scale: float) -> Intrinsics:
+        """The same lens with both focal lengths multiplied by ``scale``."""
+        return replace(self, fx_px=self.fx_px * scale, fy_px=self.fy_px * scale)
+
+    def project(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (..., 2) of rays (..., 3) in camera axes; z > 0 is in front of the camera."""
+        plane = rays[..., :2] / rays[..., 2:]
+        return self._distort(plane) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
+
+    def rays(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Rays (..., 3) with z = 1 through pixels (..., 2): the inverse of :meth:`project`."""
+        distorted = (np.asarray(points_px, float) - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
+        plane = self._undistort(distorted)
+        return np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
+
+    def _distort(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not self.is_distorted:
+            return plane
+        if self.model == "fisheye":
+            radius = np.linalg.norm(plane, axis=-1, keepdims=True)
+            theta = np.arctan(radius)
+            scale = _fisheye_angle(theta, self.coefficients) / np.maximum(radius, 1e-12)
+            return plane * np.where(radius > 1e-9, scale, 1.0)
+        k1, k2, p1, p2, k3 = self.coefficients
+        x, y = plane[..., 0], plane[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.stack(
+            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
+            axis=-1,
+        )
+
+    def _undistort(self, distorted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Newton's method on the distortion; the Jacobian is taken as the local radial scale."""
+        if not self.is_distorted:
+            return distorted
+        if self.model == "fisheye":
+            angle = np.linalg.norm(distorted, axis=-1, keepdims=True)
+            theta = angle.copy()
+            for _ in range(_UNDISTORT_STEPS):
+                slope = _fisheye_slope(theta, self.coefficients)
+                theta -= (_fisheye_angle(theta, self.coefficients) - angle) / np.where(np.abs(slope) > 1e-3, slope, 1.0)
+            theta = np.clip(theta, 0.0, 1.55)
+            return distorted * np.where(angle > 1e-9, np.tan(theta) / np.maximum(angle, 1e-12), 1.0)
+        plane = distorted.copy()
+        for _ in range(_UNDISTORT_STEPS):
+            error = self._distort(plane) - distorted
+            step = _solve_2x2(self._distortion_jacobian(plane), error)
+            plane -= step
+            if np.max(np.abs(step), initial=0.0) < _RAY_TOLERANCE:
+                break
+        return plane
+
+    def _distortion_jacobian(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
+        k1, k2, p1, p2, k3 = self.coefficients
+        x, y = plane[..., 0], plane[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        cross = x * y * slope + 2 * p1 * x + 2 * p2 * y
+        return np.stack(
+            [
+                np.stack([radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, cross], axis=-1),
+                np.stack([cross, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
+            ],
+            axis=-2,
+        )
+
+
+def _fisheye_angle(theta: NDArray[np.float64], k: tuple[float, ...]) -> NDArray[np.float64]:
+    t2 = theta * theta
+    return theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+
+
+def _fisheye_slope(theta: NDArray[np.float64], k: tuple[float, ...]) -> NDArray[np.float64]:
+    t2 = theta * theta
+    return 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
+
+
+def _solve_2x2(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    a, b, c, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1]
+    determinant = a * d - b * c
+    determinant = np.where(np.abs(determinant) > 1e-6, determinant, 1.0)
+    x = (d * right[..., 0] - b * right[..., 1]) / determinant
+    y = (a * right[..., 1] - c * right[..., 0]) / determinant
+    return np.stack([x, y], axis=-1)

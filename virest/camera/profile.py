@@ -1,0 +1,525 @@
+"""The camera profile: everything known about one phone, read from and written to YAML (contract, section 3).
+
+Strict: an unknown key is an error that names its nearest neighbour.  ``null`` means unknown; what can be estimated
+from a capture then is.  Records inside are frozen; the pydantic models stand only at the edge.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from virest.camera.intrinsics import COEFFICIENT_NAMES, Intrinsics
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import Shutter
+from virest.errors import SettingsError
+
+MAX_PROFILE_BYTES = 1_000_000
+MAX_SIDE_PX = 20_000
+ANDROID_R_CAM_IMU = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+"""Stored portrait picture of an Android phone's rear camera against the device axes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A value that was found in data, with what it is worth."""
+
+    value: float | list[float] | str
+    std: float | list[float] | None
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Extensions:
+    """What a diagnosis added to the nominal model (contract, section 4); the defaults are off."""
+
+    focal_drift_per_s: float = 0.0
+    stabilisation_fraction: float = 0.0
+    stabilisation_cutoff_hz: float = 1.0
+    frame_lag_s: float = 0.0
+    frame_lag_frames: int = 0
+    vignetting_corner_loss: float = 0.0
+    flicker_amplitude: float = 0.0
+    flicker_frequency_hz: float = 100.0
+    flicker_phase_rad: float = 0.0
+    gain: tuple[float, ...] = ()
+    defocus_sigma_px: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraProfile:
+    """One phone. ``None`` stands for unknown."""
+
+    width: int
+    height: int
+    device: str = ""
+    intrinsics: Intrinsics | None = None
+    """None while the focal length is unknown."""
+    shutter: Shutter = field(default_factory=Shutter)
+    readout_known: bool = True
+    """False where the profile says ``readout_time_s: null``; the shutter then holds 0."""
+    r_cam_imu: tuple[tuple[float, ...], ...] = ANDROID_R_CAM_IMU
+    """Rotation, x_cam = r_cam_imu @ x_imu."""
+    p_cam_imu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Last column of T_cam_imu: the IMU's origin in camera axes, metres."""
+    time_offset_s: float | None = None
+    clock_skew: float = 0.0
+    gyro_bias_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """measured = scale x true + bias."""
+    response: ResponseCurve | None = None
+    """None while unknown; sRGB then stands in, with a warning. Holds the extensions response_gamma, black_level."""
+    sensor_width_mm: float | None = None
+    sensor_height_mm: float | None = None
+    focal_length_mm: float | None = None
+    depth_m: float | None = None
+    """None: to be triangulated; inf: rotation only."""
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    extensions: Extensions = field(default_factory=Extensions)
+
+    @property
+    def rotation_cam_imu(self) -> NDArray[np.float64]:
+        """R_cam_imu, (3, 3)."""
+        return np.array(self.r_cam_imu)
+
+    def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:
+        """The profile with fields changed and the change's origin noted."""
+        return replace(self, estimates={**self.estimates, name: Estimate(value, std, source)}, **changes)
+
+
+# ── the YAML edge ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _number(value: Any) -> Any:
+    """YAML 1.1 reads 1e-3 as text; accept it, and refuse what is no finite number (inf only where asked for)."""
+    if isinstance(value, bool):
+        raise ValueError("is true or false, not a number")
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            raise ValueError(f"'{value[:40]}' is no number") from None
+    if isinstance(value, int) and abs(value) > 10**15:
+        raise ValueError("is too large")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
+Depth = Annotated[float, BeforeValidator(_number), Field(gt=0)]
+Positive = Annotated[Number, Field(gt=0, lt=1e9)]
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class _Image(_Strict):
+    width: Annotated[int, Field(ge=16, le=MAX_SIDE_PX)]
+    height: Annotated[int, Field(ge=16, le=MAX_SIDE_PX)]
+
+
+class _Distortion(_Strict):
+    model: Literal["none", "radtan", "fisheye"]
+    k1: Number = 0.0
+    k2: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+
+    @model_validator(mode="after")
+    def _only_own(self) -> _Distortion:
+        foreign = {n for n in self.model_fields_set - {"model"} if getattr(self, n)} - set(
+            COEFFICIENT_NAMES[self.model]
+        )
+        if foreign:
+            raise ValueError(f"model '{self.model}' has no {', '.join(sorted(foreign))}")
+        return self
+
+
+class _Intrinsics(_Strict):
+    fx_px: Positive | None = None
+    fy_px: Positive | None = None
+    cx_px: Number | None = None
+    cy_px: Number | None = None
+    distortion: _Distortion | Literal["none"] | None = None
+
+
+class _Shutter(_Strict):
+    readout_time_s: Annotated[Number, Field(ge=0, le=1)] | None = None
+    readout_direction: Literal["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"] = "right_to_left"
+    timestamp: Literal["exposure_start", "exposure_middle", "exposure_end"] = "exposure_start"
+    exposure_scale: Annotated[Number, Field(gt=0, le=100)] = 1.0
+
+
+class _Imu(_Strict):
+    T_cam_imu: list[list[Number]] | None = None
+    time_offset_s: Annotated[Number, Field(ge=-1e6, le=1e6)] | None = None
+    clock_skew: Annotated[Number, Field(gt=-0.5, lt=0.5)] = 0.0
+    gyro_bias_rad_s: Triple = [0.0, 0.0, 0.0]
+    gyro_scale: Triple = [1.0, 1.0, 1.0]
+
+    @model_validator(mode="after")
+    def _rigid(self) -> _Imu:
+        if self.T_cam_imu is None:
+            return self
+        if len(self.T_cam_imu) not in (3, 4) or any(len(row) != 4 for row in self.T_cam_imu):
+            raise ValueError("T_cam_imu must be 4 rows of 4 numbers")
+        rotation = np.array(self.T_cam_imu)[:3, :3]
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if error > 1e-2 or np.linalg.det(rotation) < 0:
+            raise ValueError(
+                f"T_cam_imu is no rotation: R Rᵀ is off by {error:.2g}, determinant {np.linalg.det(rotation):.2f}"
+            )
+        if any(s <= 0 for s in self.gyro_scale):
+            raise ValueError("gyro_scale must be positive")
+        return self
+
+
+class _Response(_Strict):
+    kind: Literal["linear", "srgb", "gamma", "five_segment", "table"]
+    gamma: Positive = 2.2
+    b: Pair | None = None
+    c: Pair | None = None
+    y_max: Number = 1.0
+    x: Annotated[list[Number], Field(max_length=4096)] | None = None
+    y: Annotated[list[Number], Field(max_length=4096)] | None = None
+
+
+class _Sensor(_Strict):
+    width_mm: Positive | None = None
+    height_mm: Positive | None = None
+    focal_length_mm: Positive | None = None
+
+
+class _Scene(_Strict):
+    depth_m: Depth | None = None
+
+
+class _FocalDrift(_Strict):
+    focal_drift_per_s: Number = 0.0
+
+
+class _Stabilisation(_Strict):
+    fraction: Annotated[Number, Field(ge=-2, le=2)] = 0.0
+    cutoff_hz: Positive = 1.0
+
+
+class _FrameLag(_Strict):
+    lag_s: Annotated[Number, Field(ge=0, le=10)] = 0.0
+    frames: Annotated[int, Field(ge=0, le=100_000)] = 0
+
+
+class _Vignetting(_Strict):
+    corner_loss: Annotated[Number, Field(gt=-1, lt=1)] = 0.0
+
+
+class _Flicker(_Strict):
+    amplitude: Annotated[Number, Field(ge=0, lt=1)] = 0.0
+    frequency_hz: Positive = 100.0
+    phase_rad: Number = 0.0
+
+
+class _Defocus(_Strict):
+    sigma_px: Annotated[Number, Field(ge=0, le=100)] = 0.0
+
+
+class _Extensions(_Strict):
+    focal_drift: _FocalDrift = _FocalDrift()
+    stabilisation: _Stabilisation = _Stabilisation()
+    frame_lag: _FrameLag = _FrameLag()
+    response_gamma: Positive = 1.0
+    black_level: Annotated[Number, Field(ge=0, lt=0.9)] = 0.0
+    vignetting: _Vignetting = _Vignetting()
+    flicker: _Flicker = _Flicker()
+    gain: list[Positive] = []
+    defocus: _Defocus = _Defocus()
+
+
+class _Estimate(_Strict):
+    value: Any
+    std: Any = None
+    source: str = ""
+
+
+class _Profile(_Strict):
+    virest_profile: Literal[1]
+    device: str = ""
+    image: _Image
+    intrinsics: _Intrinsics = _Intrinsics()
+    shutter: _Shutter = _Shutter()
+    imu: _Imu = _Imu()
+    response: _Response | None = None
+    sensor: _Sensor = _Sensor()
+    scene: _Scene = _Scene()
+    estimates: dict[str, _Estimate] | None = None
+    extensions: _Extensions | None = None
+
+
+def read_profile(path: Path) -> CameraProfile:
+    """Read a profile file. Raises SettingsError with the file, the key, and the nearest known key."""
+    return parse_profile(load_yaml_mapping(path), path.name)
+
+
+def load_yaml_mapping(path: Path) -> dict[str, Any]:
+    """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
+    try:
+        if not path.is_file():
+            raise SettingsError(f"{path}: no such file", hint="pass a YAML file")
+        size = path.stat().st_size
+        if size > MAX_PROFILE_BYTES:
+            raise SettingsError(f"{path.name}: {size} bytes, more than {MAX_PROFILE_BYTES}", hint="is it a profile?")
+        text = path.read_text(encoding="utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            raise SettingsError(f"{path.name}: YAML aliases are not accepted", hint="write the values out")
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "cannot be read"
+        raise SettingsError(f"{path.name}:{where} is not plain YAML: {problem}", hint="see the profile in README") from None
+    except (UnicodeDecodeError, RecursionError, ValueError):
+        raise SettingsError(f"{path.name}: is not YAML text", hint="is it a profile?") from None
+    except OSError as error:
+        raise SettingsError(f"{path}: {error.strerror}", hint="check the path and its permissions") from None
+    if not isinstance(content, dict):
+        raise SettingsError(f"{path.name}: no keys at the top level", hint="see the profile in README")
+    return content
+
+
+def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfile:
+    """Build a profile from the YAML's mapping; ``name`` is used in messages."""
+    try:
+        model = _Profile.model_validate(content)
+    except ValidationError as error:
+        raise explain_validation(error, _Profile, name) from None
+    return _from_model(model)
+
+
+def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
+    """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
+    first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
+    path = [str(part) for part in first["loc"] if not str(part).startswith(("_", "literal", "function-", "constrained"))]
+    where = ".".join(path)
+    if first["type"] == "extra_forbidden":
+        known = _keys_at(model, path[:-1])
+        near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+        hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"
+        return SettingsError(f"{name}: unknown key '{where[:80]}', {hint}")
+    value = "" if isinstance(first.get("input"), dict) else f", got {str(first.get('input'))[:60]!r}"
+    message = first["msg"].removeprefix("Value error, ")
+    return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see the profile in README")
+
+
+def _keys_at(model: Any, path: list[str]) -> list[str]:
+    for part in path:
+        found = model.model_fields.get(part)
+        if found is None:
+            continue
+        candidates = [found.annotation, *getattr(found.annotation, "__args__", ())]
+        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), model)
+    return sorted(model.model_fields)
+
+
+def _from_model(model: _Profile) -> CameraProfile:
+    width, height = model.image.width, model.image.height
+    extensions = model.extensions or _Extensions()
+    transform = model.imu.T_cam_imu
+    pose = np.array(transform) if transform is not None else np.hstack([ANDROID_R_CAM_IMU, np.zeros((3, 1))])
+    response = _response(model.response, extensions)
+    if response is None and (extensions.response_gamma != 1.0 or extensions.black_level):
+        response = ResponseCurve("srgb", extra_gamma=extensions.response_gamma, black_level=extensions.black_level)
+    return CameraProfile(
+        width=width,
+        height=height,
+        device=model.device,
+        intrinsics=_intrinsics(model, width, height),
+        shutter=Shutter(
+            model.shutter.readout_time_s or 0.0,
+            model.shutter.readout_direction,
+            model.shutter.timestamp,
+            model.shutter.exposure_scale,
+        ),
+        readout_known=model.shutter.readout_time_s is not None,
+        r_cam_imu=tuple(map(tuple, _nearest_rotation(pose[:3, :3]).tolist())),
+        p_cam_imu_m=tuple(pose[:3, 3].tolist()),
+        time_offset_s=model.imu.time_offset_s,
+        clock_skew=model.imu.clock_skew,
+        gyro_bias_rad_s=tuple(model.imu.gyro_bias_rad_s),
+        gyro_scale=tuple(model.imu.gyro_scale),
+        response=response,
+        sensor_width_mm=model.sensor.width_mm,
+        sensor_height_mm=model.sensor.height_mm,
+        focal_length_mm=model.sensor.focal_length_mm,
+        depth_m=model.scene.depth_m,
+        estimates={n: Estimate(e.value, e.std, e.source) for n, e in (model.estimates or {}).items()},
+        extensions=Extensions(
+            focal_drift_per_s=extensions.focal_drift.focal_drift_per_s,
+            stabilisation_fraction=extensions.stabilisation.fraction,
+            stabilisation_cutoff_hz=extensions.stabilisation.cutoff_hz,
+            frame_lag_s=extensions.frame_lag.lag_s,
+            frame_lag_frames=extensions.frame_lag.frames,
+            vignetting_corner_loss=extensions.vignetting.corner_loss,
+            flicker_amplitude=extensions.flicker.amplitude,
+            flicker_frequency_hz=extensions.flicker.frequency_hz,
+            flicker_phase_rad=extensions.flicker.phase_rad,
+            gain=tuple(extensions.gain),
+            defocus_sigma_px=extensions.defocus.sigma_px,
+        ),
+    )
+
+
+def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    u, _, vt = np.linalg.svd(matrix)
+    rotation = u @ vt
+    return np.where(np.abs(rotation - np.round(rotation)) < 1e-12, np.round(rotation), rotation)
+
+
+def _intrinsics(model: _Profile, width: int, height: int) -> Intrinsics | None:
+    lens, sensor = model.intrinsics, model.sensor
+    fx, fy = lens.fx_px, lens.fy_px
+    if fx is None and fy is None and sensor.focal_length_mm and (sensor.width_mm or sensor.height_mm):
+        # eq 17: pixels per millimetre from whichever side is known, square pixels otherwise
+        per_mm_x = width / sensor.width_mm if sensor.width_mm else height / sensor.height_mm  # type: ignore[operator]
+        per_mm_y = height / sensor.height_mm if sensor.height_mm else per_mm_x
+        fx, fy = sensor.focal_length_mm * per_mm_x, sensor.focal_length_mm * per_mm_y
+    if fx is None and fy is None:
+        return None
+    distortion = lens.distortion
+    kind = "none" if distortion in (None, "none") else distortion.model  # type: ignore[union-attr]
+    return Intrinsics(
+        width,
+        height,
+        fx or fy,  # type: ignore[arg-type]
+        fy or fx,  # type: ignore[arg-type]
+        (width - 1) / 2 if lens.cx_px is None else lens.cx_px,
+        (height - 1) / 2 if lens.cy_px is None else lens.cy_px,
+        kind,
+        tuple(getattr(distortion, name) for name in COEFFICIENT_NAMES[kind]),
+    )
+
+
+def _response(block: _Response | None, extensions: _Extensions) -> ResponseCurve | None:
+    if block is None:
+        return None
+    if block.kind == "five_segment" and (block.b is None or block.c is None):
+        raise SettingsError("profile: response: five_segment needs b and c", hint="see the profile in README")
+    if block.kind == "table" and (block.x is None or block.y is None):
+        raise SettingsError("profile: response: table needs x and y", hint="see the profile in README")
+    return ResponseCurve(
+        block.kind,
+        block.gamma,
+        tuple(block.b or (0.0, 0.0)),
+        tuple(block.c or (1.0, 1.0)),
+        block.y_max,
+        tuple(block.x or ()),
+        tuple(block.y or ()),
+        extensions.response_gamma,
+        extensions.black_level,
+    )
+
+
+def response_block(curve: ResponseCurve) -> dict[str, Any]:
+    """The ``response:`` block of a curve, without the extensions."""
+    match curve.kind:
+        case "gamma":
+            return {"kind": "gamma", "gamma": curve.gamma}
+        case "five_segment":
+            return {"kind": curve.kind, "b": list(curve.b), "c": list(curve.c), "y_max": curve.y_max}
+        case "table":
+            return {"kind": "table", "x": list(curve.x), "y": list(curve.y)}
+        case _:
+            return {"kind": curve.kind}
+
+
+def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
+    """The profile as the plain mapping that YAML and JSON take; infinity becomes the text ``inf``."""
+    lens, ext = profile.intrinsics, profile.extensions
+    distortion: Any = "none"
+    if lens and lens.model != "none":
+        names = COEFFICIENT_NAMES[lens.model]
+        distortion = {"model": lens.model, **dict(zip(names, lens.coefficients, strict=True))}
+    pose = [[*row, shift] for row, shift in zip(profile.r_cam_imu, profile.p_cam_imu_m, strict=True)]
+    depth = profile.depth_m
+    extensions: dict[str, Any] = {}
+    if ext.focal_drift_per_s:
+        extensions["focal_drift"] = {"focal_drift_per_s": ext.focal_drift_per_s}
+    if ext.stabilisation_fraction:
+        extensions["stabilisation"] = {
+            "fraction": ext.stabilisation_fraction,
+            "cutoff_hz": ext.stabilisation_cutoff_hz,
+        }
+    if ext.frame_lag_frames:
+        extensions["frame_lag"] = {"lag_s": ext.frame_lag_s, "frames": ext.frame_lag_frames}
+    if profile.response and profile.response.extra_gamma != 1.0:
+        extensions["response_gamma"] = profile.response.extra_gamma
+    if profile.response and profile.response.black_level:
+        extensions["black_level"] = profile.response.black_level
+    if ext.vignetting_corner_loss:
+        extensions["vignetting"] = {"corner_loss": ext.vignetting_corner_loss}
+    if ext.flicker_amplitude:
+        extensions["flicker"] = {
+            "amplitude": ext.flicker_amplitude,
+            "frequency_hz": ext.flicker_frequency_hz,
+            "phase_rad": ext.flicker_phase_rad,
+        }
+    if ext.gain:
+        extensions["gain"] = list(ext.gain)
+    if ext.defocus_sigma_px:
+        extensions["defocus"] = {"sigma_px": ext.defocus_sigma_px}
+    return {
+        "virest_profile": 1,
+        "device": profile.device,
+        "image": {"width": profile.width, "height": profile.height},
+        "intrinsics": {
+            "fx_px": lens.fx_px if lens else None,
+            "fy_px": lens.fy_px if lens else None,
+            "cx_px": lens.cx_px if lens else None,
+            "cy_px": lens.cy_px if lens else None,
+            "distortion": distortion,
+        },
+        "shutter": {
+            "readout_time_s": profile.shutter.readout_time_s if profile.readout_known else None,
+            "readout_direction": profile.shutter.readout_direction,
+            "timestamp": profile.shutter.timestamp,
+            "exposure_scale": profile.shutter.exposure_scale,
+        },
+        "imu": {
+            "T_cam_imu": [*pose, [0.0, 0.0, 0.0, 1.0]],
+            "time_offset_s": profile.time_offset_s,
+            "clock_skew": profile.clock_skew,
+            "gyro_bias_rad_s": list(profile.gyro_bias_rad_s),
+            "gyro_scale": list(profile.gyro_scale),
+        },
+        "response": response_block(profile.response) if profile.response else None,
+        "sensor": {
+            "width_mm": profile.sensor_width_mm,
+            "height_mm": profile.sensor_height_mm,
+            "focal_length_mm": profile.focal_length_mm,
+        },
+        "scene": {"depth_m": "inf" if depth is not None and math.isinf(depth) else depth},
+        "estimates": {n: {"value": e.value, "std": e.std, "source": e.source} for n, e in profile.estimates.items()},
+        "extensions": extensions,
+    }
+
+
+def format_profile(profile: CameraProfile) -> str:
+    """The profile as YAML text; reading it back gives the same profile."""
+    return yaml.safe_dump(profile_mapping(profile), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+
+
+def write_profile(profile: CameraProfile, path: Path) -> None:
+    """Write the profile as YAML; the file appears whole or not at all."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(format_profile(profile), encoding="utf-8")
+    part.replace(path)

@@ -1,0 +1,65 @@
+"""The shutter: when each row (or column) of the stored picture gathers light (forward_model, section 1; eq 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.errors import SettingsError
+
+READOUT_DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
+STAMP_FRACTION = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
+"""Where in the first row's exposure a frame's time stamp lies."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """A rolling shutter."""
+
+    readout_time_s: float = 0.0
+    """Start of the first row -> start of one past the last row; 0 is a global shutter."""
+    readout_direction: str = "top_to_bottom"
+    """In the stored picture; one of READOUT_DIRECTIONS."""
+    timestamp: str = "exposure_start"
+    """What a stamp means, of the first row read; a key of STAMP_FRACTION."""
+    exposure_scale: float = 1.0
+    """True exposure = logged exposure x this."""
+
+    def __post_init__(self) -> None:
+        if self.readout_direction not in READOUT_DIRECTIONS:
+            raise SettingsError(f"readout_direction '{self.readout_direction}' is none of {READOUT_DIRECTIONS}")
+        if self.timestamp not in STAMP_FRACTION:
+            raise SettingsError(f"timestamp '{self.timestamp}' is none of {tuple(STAMP_FRACTION)}")
+
+    @property
+    def reads_columns(self) -> bool:
+        """Whether the readout runs along x of the stored picture."""
+        return self.readout_direction in ("left_to_right", "right_to_left")
+
+    def readout_fraction(self, points_px: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
+        """Fraction s of the readout at which pixels (..., 2) start, 0 for the first row read.
+
+        Linear in the pixel's coordinate and not clipped, so it also holds a little outside the picture.
+        """
+        points = np.asarray(points_px, float)
+        match self.readout_direction:
+            case "top_to_bottom":
+                return points[..., 1] / height
+            case "bottom_to_top":
+                return 1.0 - (points[..., 1] + 1.0) / height
+            case "left_to_right":
+                return points[..., 0] / width
+            case _:
+                return 1.0 - (points[..., 0] + 1.0) / width
+
+    def true_exposure_s(self, logged_exposure_s: Any) -> Any:
+        """The exposure that the sensor really made."""
+        return logged_exposure_s * self.exposure_scale
+
+    def first_row_start_s(self, stamp_s: Any, logged_exposure_s: Any) -> Any:
+        """Start of the first row's exposure, on the clock of the stamps."""
+        fraction = STAMP_FRACTION[self.timestamp]
+        return stamp_s if fraction == 0.0 else stamp_s - fraction * self.true_exposure_s(logged_exposure_s)

@@ -1,0 +1,84 @@
+"""The error tree.
+
+    VirestError                    exit  1   a fault of ours, unless a subclass says otherwise
+    ├── SettingsError              exit  3   settings or camera profile
+    ├── CaptureError               exit  4   the capture cannot be used
+    │   ├── VideoError             exit  4   the movie
+    │   ├── ImuError               exit  4   gyroscope or accelerometer
+    │   └── ClockError             exit  4   times that do not fit together
+    ├── CalibrationError           exit  6   the data do not determine what was asked
+    ├── RestorationError           exit  7   the restoration of a frame failed
+    └── OutputError                exit  8   exists, locked, disk full, not writable
+
+Exit codes are a stable interface; 0 done, 2 usage, 9 part of a batch failed, 10 ``diagnose --check``, 130 interrupted.
+Every error says what, where and how much in its message, and what to do next in its hint.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class VirestError(Exception):
+    """What went wrong (message), what to do next (hint), and the numbers behind it (facts)."""
+
+    exit_code = 1
+
+    def __init__(self, message: str, *, hint: str = "", **facts: Any) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+        self.facts = facts
+
+    def __str__(self) -> str:
+        return f"{self.message}; {self.hint}" if self.hint else self.message
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Keep hint and facts when the error crosses a process border."""
+        return _rebuild, (type(self), self.message, self.hint, self.facts)
+
+
+def _rebuild(kind: type[VirestError], message: str, hint: str, facts: dict[str, Any]) -> VirestError:
+    return kind(message, hint=hint, **facts)
+
+
+class SettingsError(VirestError):
+    """A setting, a settings file or a camera profile cannot be used."""
+
+    exit_code = 3
+
+
+class CaptureError(VirestError):
+    """A capture cannot be used."""
+
+    exit_code = 4
+
+
+class VideoError(CaptureError):
+    """The movie is missing, cut, not decodable, or not the one that the time stamps belong to."""
+
+
+class ImuError(CaptureError):
+    """Gyroscope or accelerometer data are missing, damaged, or do not cover the frames."""
+
+
+class ClockError(CaptureError):
+    """Times that fall, repeat, lost their precision, or come from different clocks."""
+
+
+class CalibrationError(VirestError):
+    """The data do not determine what was asked for."""
+
+    exit_code = 6
+
+
+class RestorationError(VirestError):
+    """A frame could not be restored."""
+
+    exit_code = 7
+
+
+class OutputError(VirestError):
+    """A result cannot be written: it exists, the folder is locked or read-only, or the disk is full."""
+
+    exit_code = 8

@@ -1,0 +1,45 @@
+"""What a restoration may be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+DEBLUR_METHODS = (
+    "none",
+    "inverse",
+    "wiener",
+    "gradient-wiener",
+    "richardson-lucy",
+    "hyper-laplacian",
+    "hyper-laplacian-global",
+)
+SHUTTER_METHODS = ("none", "perspective", "rowwise")
+REFERENCES = ("exposure-start", "frame-middle")
+
+
+@dataclass(frozen=True, slots=True)
+class RestorationSettings:
+    """How frames are restored; a preset is one such record."""
+
+    preset: str = "balanced"
+    deblur: str = "hyper-laplacian"
+    """One of DEBLUR_METHODS."""
+    shutter: str = "rowwise"
+    """One of SHUTTER_METHODS."""
+    reference: str = "exposure-start"
+    """Time of the restored picture: exposure start of the first row read, or the frame's middle."""
+    iterations: int = 4
+    """Of the iterative methods."""
+    strength: float = 1.0
+    """Multiplies the measured noise in the regularisation: 1 trusts it, more is smoother."""
+    min_blur_px: float = 1.0
+    """Frames whose longest blur path is shorter are not deblurred."""
+    keep_start_up: bool = False
+    """Process the frames of the recorder's start-up too, although their content is later than their stamps."""
+
+
+PRESETS: dict[str, RestorationSettings] = {
+    "fast": RestorationSettings("fast", "gradient-wiener", iterations=1),
+    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=4),
+    "best": RestorationSettings("best", "hyper-laplacian-global", iterations=6),
+}
