@@ -90,6 +90,13 @@ class CameraProfile:
         """R_cam_imu, (3, 3)."""
         return np.array(self.r_cam_imu)
 
+    def imu_time_s(self, camera_time_s: Any) -> Any:
+        """IMU clock of a camera time, both in seconds from stamp_0: t_cam (1 + clock_skew) + time_offset_s.
+
+        An unknown offset counts as 0.
+        """
+        return camera_time_s * (1.0 + self.clock_skew) + (self.time_offset_s or 0.0)
+
     def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:
         """The profile with fields changed and the change's origin noted."""
         return replace(self, estimates={**self.estimates, name: Estimate(value, std, source)}, **changes)

@@ -1,77 +1,458 @@
-"""A capture: movie, frame stamps, exposures and inertial samples, joined by time."""
+"""A capture folder: find its files, join them by time, say what is missing, and hand on one `Capture`.
+
+Files are told by their headers, frames are joined by time, and whatever is left out is counted and explained.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.capture import startup as start
+from virest.capture.files import is_present, require_regular_file
 from virest.capture.imu import ImuSamples
+from virest.capture.join import (
+    Alignment,
+    align_frames,
+    clock_shift_ns,
+    find_gaps,
+    floor_us,
+    join_metadata,
+    outside_reason,
+    pts_tolerance_ns,
+)
+from virest.capture.marslogger_android import (
+    EdgeEpochs,
+    GyroTable,
+    MetadataTable,
+    StampTable,
+    read_edge_epochs,
+    read_frame_timestamps,
+    read_gyro_accel,
+    read_movie_metadata,
+)
+from virest.capture.profile_source import default_profile, resolve_profile
+from virest.capture.records import NO_STAMP, STARTUP, Capture, CaptureMetadata, Frame, Note
+from virest.capture.video import MovieIndex, probe_movie, read_gray
+from virest.errors import CaptureError, ClockError, ImuError
+
+__all__ = [
+    "Capture",
+    "CaptureMetadata",
+    "Frame",
+    "Note",
+    "default_profile",
+    "read_capture",
+    "resolve_profile",
+]
+
+MOVIE, STAMPS, METADATA = "movie.mp4", "frame_timestamps.txt", "movie_metadata.csv"
+GYRO, EPOCHS, UNFINISHED = "gyro_accel.csv", "edge_epochs.txt", ".marslogger_recording_in_progress"
+PLAUSIBLE_FOCAL = (0.55, 1.1)
+"""fx over the long side of a phone's main camera."""
+BEARABLE_FOCAL = (0.4, 1.6)
+"""Outside, fx counts other pixels than the movie's: those of the sensor's whole array."""
+GUESSED_FOCAL = 0.8
+LARGE_RATE_RAD_S = 35.0
+"""2000 °/s, where phone gyroscopes end."""
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
-    """One frame of the movie and what was logged for it."""
+class _Files:
+    """What stood in the folder, parsed."""
 
-    index: int
-    """Index in the movie, from 0."""
-    timestamp_ns: int
-    """As logged; on the IMU's clock once the capture is read (clock source UNKNOWN: brought there by edge_epochs)."""
-    time_s: float
-    """The same, seconds from the capture's stamp_0 (row 0 of frame_timestamps.txt)."""
-    exposure_s: float | None = None
-    """As logged; None: unknown."""
-    iso: float | None = None
-    skip_reason: str | None = None
-    """Why the frame cannot be processed (start-up content lag, no IMU, IMU gap, no stamp); None: it can."""
+    movie: MovieIndex
+    gyro: GyroTable
+    stamps: StampTable | None
+    metadata: MetadataTable | None
+    epochs: EdgeEpochs
 
 
 @dataclass(frozen=True, slots=True)
-class CaptureMetadata:
-    """What the recorder logged about the camera, medians over the frames; None: not logged or not usable."""
+class _Joined:
+    """Movie frames with their stamps and metadata rows, camera clock."""
 
-    fx_px: float | None = None
-    fy_px: float | None = None
-    readout_time_s: float | None = None
-    exposure_s: float | None = None
-    iso: float | None = None
-    focal_length_mm: float | None = None
-    device: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Note:
-    """One thing that a reader of the capture should know."""
-
-    severity: str
-    """``info``, ``warning`` or ``error`` (the capture is unusable)."""
-    code: str
-    """A stable short name, such as ``imu-gap`` or ``content-lag``."""
-    text: str
-    """What, where, how much, what it means."""
+    stamps_ns: NDArray[np.int64]
+    """(n,) stamp of each frame; from PTS where the row is missing."""
+    has_stamp: NDArray[np.bool_]
+    stamp_0_ns: int
+    metadata_rows: NDArray[np.int64]
+    """(n,) −1 for none."""
+    unix_lag_s: NDArray[np.float64] | None
 
 
-@dataclass(frozen=True, slots=True)
-class Capture:
-    """One recording, checked and joined."""
+def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
+    """Read, join and check a MARSLogger folder.
 
-    name: str
-    """Name of its folder."""
-    folder: Path
-    movie: Path
-    width: int
-    height: int
-    frames: tuple[Frame, ...]
-    """Every frame of the movie, in order; those that cannot be used carry their reason."""
-    imu: ImuSamples
-    metadata: CaptureMetadata
-    clock_source: str
-    """``REALTIME``, ``UNKNOWN`` or ``not logged``."""
-    clock_shift_ns: int
-    """What was added to the camera's stamps to bring them to the IMU's clock."""
-    imu_gaps_s: tuple[tuple[float, float], ...] = ()
-    """(start, end) of each hole in the inertial data."""
-    keyframes: tuple[int, ...] = ()
-    """Indices of the frames that the decoder can start from."""
-    notes: tuple[Note, ...] = ()
-    counts: dict[str, int] = field(default_factory=dict)
-    """Rows and frames read, joined, and dropped, by reason."""
+    ``look_at_pictures``: decode the first two seconds to find repeated pictures (start-up lag).
+    Raises VideoError, ImuError, ClockError or CaptureError where the capture cannot be used; what can be used in part
+    comes back with notes, counts and a reason on each frame left out.
+    """
+    folder = require_folder(path)
+    notes: list[Note] = []
+    files = _read_files(folder, notes)
+    joined = _join(files, notes)
+    camera_ns = np.array([joined.stamps_ns[0], joined.stamps_ns[-1]])
+    shift_ns, remark = clock_shift_ns(camera_ns, files.gyro.time_ns, files.epochs)
+    if remark:
+        notes.append(Note("warning", "clock-shift", remark))
+    zero_ns = joined.stamp_0_ns + shift_ns
+    imu = ImuSamples((files.gyro.time_ns - zero_ns) / 1e9, files.gyro.gyro_rad_s, files.gyro.accel_m_s2)
+    gaps = find_gaps(imu.time_s)
+    metadata = summarise_metadata(files.metadata, files.movie.width, files.movie.height, notes)
+    time_s = (joined.stamps_ns + shift_ns - zero_ns) / 1e9
+    began = _startup(folder / MOVIE, files, joined, time_s, imu, metadata, notes, look_at_pictures)
+    frames = _frames(files, joined, shift_ns, time_s, imu, gaps, metadata, began)
+    _note_imu(imu, gaps, notes)
+    _note_frames(frames, notes)
+    return Capture(
+        name=folder.name,
+        folder=folder,
+        movie=folder / MOVIE,
+        width=files.movie.width,
+        height=files.movie.height,
+        frames=frames,
+        imu=imu,
+        metadata=metadata,
+        clock_source=files.epochs.source,
+        clock_shift_ns=shift_ns,
+        imu_gaps_s=gaps,
+        keyframes=files.movie.keyframes,
+        notes=tuple(notes),
+        counts=_counts(files, joined, frames),
+        stamp_0_ns=zero_ns,
+        repeats=began.repeats,
+        startup_lag_s=began.lag_s,
+    )
+
+
+def require_folder(path: Path) -> Path:
+    """The folder, resolved, so that `.` has a name. Raises CaptureError if it is missing or no folder."""
+    try:
+        folder = Path(path).resolve(strict=True)
+        if folder.is_dir():
+            return folder
+    except FileNotFoundError:
+        raise CaptureError(f"{path}: no such folder", hint="pass the folder that holds movie.mp4") from None
+    except (OSError, RuntimeError, ValueError) as fault:
+        reason = getattr(fault, "strerror", None) or str(fault)
+        raise CaptureError(f"{path}: {reason}", hint="check the path and its links") from None
+    raise CaptureError(f"{path}: is no folder", hint="pass the folder that holds movie.mp4")
+
+
+# ── reading ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _read_files(folder: Path, notes: list[Note]) -> _Files:
+    if is_present(folder / UNFINISHED):
+        notes.append(Note("warning", "unfinished", f"{UNFINISHED} is there: the recording was not stopped cleanly"))
+    try:
+        names = sorted(entry.name for entry in folder.iterdir())
+    except OSError as fault:
+        raise CaptureError(f"{folder.name}: {fault.strerror}", hint="check the folder's permissions") from None
+    if not {MOVIE, GYRO} & set(names):
+        shown = ", ".join(names[:6]) or "nothing"
+        text = f"{folder.name}: holds no {MOVIE} and no {GYRO} (but {shown})"
+        raise CaptureError(text, hint="pass a capture's folder")
+    gyro = read_gyro_accel(folder / GYRO)
+    movie = probe_movie(folder / MOVIE)
+    metadata = _read_metadata(folder, notes)
+    stamps = _read_stamps(folder, metadata, notes)
+    epochs = read_edge_epochs(folder / EPOCHS) if is_present(folder / EPOCHS) else EdgeEpochs("not logged", ())
+    if 0 < len(movie) < movie.declared_frames:
+        text = f"{MOVIE}: its index promises {movie.declared_frames} frames, {len(movie)} are there: the copy was cut"
+        notes.append(Note("warning", "movie-cut", text))
+    return _Files(movie, gyro, stamps, metadata, epochs)
+
+
+def _read_metadata(folder: Path, notes: list[Note]) -> MetadataTable | None:
+    if not is_present(folder / METADATA):
+        text = f"{METADATA} is missing: exposure, focal length and readout are unknown unless a profile has them"
+        notes.append(Note("warning", "no-metadata", text))
+        return None
+    if require_regular_file(folder / METADATA) == 0:
+        notes.append(Note("warning", "no-metadata", f"{METADATA} is empty: exposure, focal length, readout unknown"))
+        return None
+    table = read_movie_metadata(folder / METADATA)
+    if not len(table.time_ns):
+        notes.append(Note("warning", "no-metadata", f"{METADATA} has no rows: exposure, focal length, readout unknown"))
+        return None
+    return table
+
+
+def _read_stamps(folder: Path, metadata: MetadataTable | None, notes: list[Note]) -> StampTable | None:
+    """The stamps; None (with a note) where they were never written and the metadata can stand in."""
+    path, why = folder / STAMPS, ""
+    if not is_present(path):
+        why = "is missing"
+    elif require_regular_file(path) == 0:
+        why = "is empty"
+    else:
+        table = read_frame_timestamps(path)
+        if len(table.time_ns):
+            return table
+        why = "has no rows"
+    if metadata is None:
+        text = f"{folder.name}/{STAMPS}: {why}, and there is no {METADATA}"
+        raise ClockError(text, hint="frames have no times without either")
+    text = f"{STAMPS} {why} (written only at a clean Stop): PTS were slid over the rows of {METADATA} instead"
+    notes.append(Note("warning", "no-stamps", text))
+    return None
+
+
+# ── joining ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _join(files: _Files, notes: list[Note]) -> _Joined:
+    movie, metadata = files.movie, files.metadata
+    pts_ns = movie.pts_ns
+    tolerance = pts_tolerance_ns(float(movie.time_base) * 1e9)
+    meta_ns = metadata.time_ns if metadata else np.zeros(0, np.int64)
+    rows_ns = files.stamps.time_ns if files.stamps else floor_us(meta_ns)
+    what = STAMPS if files.stamps else METADATA
+    alignment = align_frames(pts_ns, rows_ns, tolerance, meta_ns if files.stamps else None, what)
+    _note_alignment(alignment, len(pts_ns), len(rows_ns), what, notes)
+    found = alignment.rows >= 0
+    stamps_ns = np.where(found, rows_ns[alignment.rows], pts_ns + alignment.offset_ns)
+    stamp_0_ns = int(files.stamps.time_ns[0]) if files.stamps else int(stamps_ns[0])
+    joined = join_metadata(stamps_ns, meta_ns)
+    if metadata is not None:
+        _note_metadata(joined, stamps_ns, meta_ns, notes)
+    lag = _unix_lag_s(files, alignment, joined)
+    return _Joined(stamps_ns, found, stamp_0_ns, joined, lag)
+
+
+def _note_alignment(alignment: Alignment, frames: int, rows: int, what: str, notes: list[Note]) -> None:
+    if alignment.slid:
+        matched = int((alignment.rows >= 0).sum())
+        text = f"{MOVIE} has {frames} frames, {what} {rows} rows: {matched} frames joined by sliding PTS over the rows"
+        notes.append(Note("warning" if matched < frames or rows != frames else "info", "stamps-slid", text))
+    if alignment.rivals:
+        text = (
+            f"{alignment.rivals} other positions of the movie among the rows of {what} fit as well (even spacing): the "
+            "frames' times may be off by whole frames; estimate the time offset before trusting them"
+        )
+        notes.append(Note("warning", "stamps-ambiguous", text))
+
+
+def _note_metadata(
+    joined: NDArray[np.int64], stamps_ns: NDArray[np.int64], meta_ns: NDArray[np.int64], notes: list[Note]
+) -> None:
+    lost = int((joined < 0).sum())
+    if lost == len(joined):
+        raise ClockError(
+            f"{METADATA} covers {meta_ns[0] / 1e9:.3f}–{meta_ns[-1] / 1e9:.3f} s, the frames "
+            f"{stamps_ns[0] / 1e9:.3f}–{stamps_ns[-1] / 1e9:.3f} s: no row joins",
+            hint="the files are of different sessions; remove the metadata to go on without exposures",
+        )
+    if lost:
+        text = f"{lost} of {len(joined)} frames have no row in {METADATA}: their exposure is unknown"
+        notes.append(Note("warning", "metadata-missing", text))
+    spare = len(meta_ns) - len(np.unique(joined[joined >= 0]))
+    if spare:
+        notes.append(Note("info", "metadata-spare", f"{spare} rows of {METADATA} belong to no frame of the movie"))
+
+
+def _unix_lag_s(files: _Files, alignment: Alignment, joined: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Encoder output − capture result of each frame, from the two Unix columns; None where either is missing."""
+    if files.stamps is None or files.metadata is None:
+        return None
+    out_ns, in_ns = files.stamps.unix_ns, files.metadata.unix_ns
+    if out_ns is None or in_ns is None:
+        return None
+    left, right = out_ns[alignment.rows], in_ns[joined]
+    known = (alignment.rows >= 0) & (joined >= 0) & (left > 0) & (right > 0)
+    return np.where(known, (left - right) / 1e9, np.nan)
+
+
+# ── what the metadata say ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def summarise_metadata(table: MetadataTable | None, width: int, height: int, notes: list[Note]) -> CaptureMetadata:
+    """Medians over the rows; fx belongs to the sensor's long axis, which is vertical in a portrait picture."""
+    if table is None:
+        return CaptureMetadata()
+    fx, fy = _median(table.fx_px), _median(table.fy_px)
+    if not _focal_plausible(fx, width, height, notes):
+        fx = fy = None
+    if height > width:
+        fx, fy = fy, fx
+    readout = _median(table.readout_time_s)
+    if readout is None:
+        notes.append(Note("info", "readout-unknown", f"{METADATA} has no readout time"))
+    if _median(table.exposure_s) is None:
+        notes.append(Note("warning", "exposure-unknown", f"{METADATA} has no exposure times: no deblurring"))
+    return CaptureMetadata(
+        fx_px=fx,
+        fy_px=fy,
+        readout_time_s=readout,
+        exposure_s=_median(table.exposure_s),
+        iso=_median(table.iso),
+        focal_length_mm=_median(table.focal_length_mm),
+    )
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def _focal_plausible(fx: float | None, width: int, height: int, notes: list[Note]) -> bool:
+    if fx is None:
+        text = f"{METADATA} has no focal length: give fx_px in camera.yaml, or let `virest calibrate` find it"
+        notes.append(Note("warning", "fx-unknown", text))
+        return False
+    ratio = fx / max(width, height)
+    if not BEARABLE_FOCAL[0] <= ratio <= BEARABLE_FOCAL[1]:
+        text = (
+            f"fx {fx:.1f} is {ratio:.2f} of the picture's long side ({max(width, height)} px), a phone has "
+            f"{PLAUSIBLE_FOCAL[0]}–{PLAUSIBLE_FOCAL[1]}: it counts pixels of the sensor's whole array, not "
+            "the movie's; not used. Multiply it by long side / array width, or calibrate, and give fx_px in camera.yaml"
+        )
+        notes.append(Note("warning", "fx-active-array", text))
+        return False
+    if not PLAUSIBLE_FOCAL[0] <= ratio <= PLAUSIBLE_FOCAL[1]:
+        usual = f"{PLAUSIBLE_FOCAL[0]}–{PLAUSIBLE_FOCAL[1]}"
+        text = f"fx {fx:.1f} is {ratio:.2f} of the picture's long side, unusual for a phone ({usual})"
+        notes.append(Note("warning", "fx-unusual", text))
+    return True
+
+
+# ── start-up, frames, report ─────────────────────────────────────────────────────────────────────────────────────
+
+
+def _startup(
+    movie: Path,
+    files: _Files,
+    joined: _Joined,
+    time_s: NDArray[np.float64],
+    imu: ImuSamples,
+    metadata: CaptureMetadata,
+    notes: list[Note],
+    look_at_pictures: bool,
+) -> start.Startup:
+    period = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    repeats: tuple[int, ...] = ()
+    if look_at_pictures and len(time_s) > 2:
+        look = int(np.searchsorted(time_s, time_s[0] + start.LOOK_S))
+        focal = metadata.fx_px or GUESSED_FOCAL * max(files.movie.width, files.movie.height)
+        motion = start.expected_motion_px(time_s[:look], imu.time_s, imu.gyro_rad_s, focal, period)
+        if (motion > start.MIN_MOTION_PX).any():
+            pictures = [p if p is None else p[::2, ::2].copy() for _, p in read_gray(movie, files.movie, range(look))]
+            repeats = start.find_repeats(start.picture_differences(pictures), motion)
+    began = start.judge_startup(joined.unix_lag_s, repeats, len(time_s), period)
+    if began.frames:
+        notes.append(_startup_note(began))
+    return began
+
+
+def _startup_note(began: start.Startup) -> Note:
+    seen = []
+    if began.unix_lag_s and began.unix_lag_s[0] > began.unix_lag_s[1]:
+        first, steady = began.unix_lag_s
+        seen.append(f"capture to encoder (Unix columns) falls from {first * 1e3:.0f} to {steady * 1e3:.0f} ms")
+    if began.repeats:
+        seen.append(f"frames {', '.join(map(str, began.repeats))} repeat their predecessor while the phone turns")
+    text = (
+        f"the first {began.frames} frames show pictures later than their stamps, frame 0 by at least "
+        f"{began.lag_s or 0.0:.2f} s: {'; '.join(seen)}"
+    )
+    return Note("warning", "content-lag", text)
+
+
+def _frames(
+    files: _Files,
+    joined: _Joined,
+    shift_ns: int,
+    time_s: NDArray[np.float64],
+    imu: ImuSamples,
+    gaps: tuple[tuple[float, float], ...],
+    metadata: CaptureMetadata,
+    began: start.Startup,
+) -> tuple[Frame, ...]:
+    readout_s = metadata.readout_time_s or 0.0
+    frames = []
+    for i, row in enumerate(joined.metadata_rows.tolist()):
+        exposure_s = _value(files.metadata.exposure_s, row) if files.metadata else None
+        reasons: list[tuple[str, str]] = []
+        if i < began.frames:
+            late = f"(at frame 0 by {began.lag_s or 0.0:.2f} s)"
+            reasons.append((STARTUP, f"start-up: content later than its stamp {late}"))
+        if not joined.has_stamp[i]:
+            reasons.append((NO_STAMP, f"no row in {STAMPS if files.stamps else METADATA}"))
+        start_s = float(time_s[i])
+        end_s = start_s + (exposure_s or metadata.exposure_s or 0.0) + readout_s
+        if outside := outside_reason(start_s, end_s, imu.time_s, gaps):
+            reasons.append(outside)
+        frames.append(
+            Frame(
+                index=i,
+                timestamp_ns=int(joined.stamps_ns[i]) + shift_ns,
+                time_s=start_s,
+                exposure_s=exposure_s,
+                iso=_value(files.metadata.iso, row) if files.metadata else None,
+                skip_reason="; ".join(text for _, text in reasons) or None,
+                skip_codes=tuple(code for code, _ in reasons),
+            )
+        )
+    return tuple(frames)
+
+
+def _value(column: NDArray[np.float64], row: int) -> float | None:
+    return float(column[row]) if row >= 0 and np.isfinite(column[row]) else None
+
+
+def _note_imu(imu: ImuSamples, gaps: tuple[tuple[float, float], ...], notes: list[Note]) -> None:
+    for gap_start, gap_end in gaps[:20]:
+        text = f"no IMU rows from {gap_start:.3f} to {gap_end:.3f} s ({(gap_end - gap_start) * 1e3:.0f} ms)"
+        notes.append(Note("warning", "imu-gap", text))
+    if len(gaps) > 20:
+        notes.append(Note("warning", "imu-gap", f"{len(gaps) - 20} more gaps in the IMU rows"))
+    if not imu.has_accelerometer:
+        notes.append(Note("info", "no-accelerometer", "no accelerometer values: camera velocity cannot be estimated"))
+    peak = float(np.abs(imu.gyro_rad_s).max())
+    if peak > LARGE_RATE_RAD_S:
+        text = f"turning rates up to {peak:.0f} rad/s, beyond what phones measure: are they in degrees?"
+        notes.append(Note("warning", "gyro-large", text))
+
+
+def _note_frames(frames: tuple[Frame, ...], notes: list[Note]) -> None:
+    """Say which frames the IMU does not cover. Raises ImuError if it covers none."""
+    outside = [frame.index for frame in frames if {"no-imu", "imu-gap"} & set(frame.skip_codes)]
+    if len(outside) == len(frames):
+        raise ImuError(
+            f"none of the {len(frames)} frames lies inside the IMU's time: frame {outside[0]} {frames[0].skip_reason}",
+            hint="the gyroscope was not logged while the camera ran; see `virest inspect`",
+        )
+    if outside:
+        shown = ", ".join(map(str, outside[:12])) + (" …" if len(outside) > 12 else "")
+        text = f"{len(outside)} of {len(frames)} frames are not covered by the IMU and left out: {shown}"
+        notes.append(Note("warning", "frames-without-imu", text))
+
+
+def _counts(files: _Files, joined: _Joined, frames: tuple[Frame, ...]) -> dict[str, int]:
+    counts = {
+        "movie_frames": len(files.movie),
+        "movie_repeated_pts": files.movie.repeated_pts,
+        "stamp_rows": files.stamps.rows if files.stamps else 0,
+        "metadata_rows": files.metadata.rows if files.metadata else 0,
+        "metadata_joined": int((joined.metadata_rows >= 0).sum()),
+        "gyro_rows": files.gyro.rows,
+        "gyro_rows_used": len(files.gyro.time_ns),
+        "frames_usable": sum(frame.skip_reason is None for frame in frames),
+    }
+    for code in sorted({code for frame in frames for code in frame.skip_codes}):
+        counts[f"frames_skipped: {code}"] = sum(code in frame.skip_codes for frame in frames)
+    tables: Mapping[str, StampTable | MetadataTable | GyroTable | None] = {
+        STAMPS: files.stamps,
+        METADATA: files.metadata,
+        GYRO: files.gyro,
+    }
+    for name, table in tables.items():
+        for reason, number in (table.dropped if table else {}).items():
+            counts[f"{name} dropped: {reason}"] = number
+    return counts

@@ -30,6 +30,10 @@ class RestorationSettings:
     """Time of the restored picture: exposure start of the first row read, or the frame's middle."""
     iterations: int = 4
     """Of the iterative methods."""
+    inner_iterations: int = 4
+    """Of the whole-picture method: conjugate-gradient steps in each iteration."""
+    tile_px: int = 128
+    """Side of a tile; each has a kernel of its own."""
     strength: float = 1.0
     """Multiplies the measured noise in the regularisation: 1 trusts it, more is smoother."""
     min_blur_px: float = 1.0

@@ -1,0 +1,50 @@
+# Everything here works from a fresh clone with Python 3.11 and make.
+#   make demo     process a sample capture and say where to look
+#   make test     all tests: the fast ones first, then the scenarios
+#   make bench    quality and speed tables
+#   make lint     ruff and mypy
+#   make sample   write sample_data/ anew
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.PHONY: demo test bench lint sample clean
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+JOBS   ?= 2
+
+demo: $(READY)
+	@for capture in sample_data/*/; do \
+		$(BIN)/virest process "$$capture" --out demo-out --overwrite; \
+	done
+	@echo
+	@echo "Look at demo-out/<capture>/frames/ beside sample_data/<capture>/movie.mp4;"
+	@echo "demo-out/<capture>/parameters.jsonl has one line a frame, run.json the account of the run."
+
+test: $(READY)
+	$(BIN)/python -m pytest -n $(JOBS)
+
+bench: $(READY)
+	$(BIN)/python -m virest.app.bench
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy virest
+
+sample: $(READY)
+	$(BIN)/python -m virest.app.sample sample_data
+
+clean:
+	rm -rf demo-out bench-out virest-out build dist .pytest_cache .mypy_cache .ruff_cache
+
+$(READY): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "make: no python3.11 and no python3 found" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "make: $(PYTHON) is older than Python 3.11; set PYTHON=..." >&2; exit 1; }
+	test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $(READY)

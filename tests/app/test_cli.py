@@ -1,0 +1,497 @@
+"""The program as its users meet it: exit codes, one line for an error, results on standard output only."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Virest = Callable[..., "subprocess.CompletedProcess[str]"]
+Edit = Callable[[Callable[[list[str]], list[str]]], None]
+FAST = ("--preset", "fast", "--jobs", "1")
+
+
+def below(folder: Path) -> set[str]:
+    """Names of everything below a folder."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")} if folder.exists() else set()
+
+
+def content(run: Path) -> dict[str, Any]:
+    """Everything in a run's folder, without what a clock or the command line decides."""
+    found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
+    lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
+    found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+    account = json.loads(found["run.json"])
+    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
+    return found
+
+
+def assert_refused(result: "subprocess.CompletedProcess[str]", code: int, *says: str) -> None:
+    """One line for the error, the right exit code, nothing on standard output, and no traceback."""
+    errors = [line for line in result.stderr.splitlines() if line.startswith("virest: error: ")]
+    assert result.returncode == code, result.stderr
+    assert len(errors) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    for text in says:
+        assert text in errors[0]
+
+
+def wait_for(condition: Callable[[], bool], process: "subprocess.Popen[str]", seconds: float = 60) -> None:
+    """Wait until a condition holds, while a process runs."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
+    """Start the program in a process group of its own, as a terminal does."""
+
+    def popen(*arguments: object) -> "subprocess.Popen[str]":
+        command = [sys.executable, "-m", "virest", *map(str, arguments)]
+        return subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True
+        )
+
+    return popen
+
+
+# ── calling it ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """`virest --help` answers at once: no numpy, no OpenCV, no PyAV."""
+    program = (
+        "import sys; from virest.app.cli import run; code = run(['--help']);"
+        "print(code, sorted({'numpy', 'cv2', 'av', 'scipy', 'pandas', 'pydantic', 'rich'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "0 []"
+    assert "process" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["process"], "CAPTURE"),
+        (["proces", "x"], "process"),
+        (["process", "x", "--pre", "fast"], "--pre"),
+        (["process", "x", "--preset", "quick"], "quick"),
+        (["process", "x", "--deblur", "sharp"], "richardson-lucy"),
+        (["process", "x", "--frames", "5"], "slice"),
+        (["process", "x", "--frames", "1:2:0"], "step"),
+        (["process", "x", "--frames", "a:b"], "slice"),
+        (["process", "x", "--jobs", "0"], "--jobs"),
+        (["process", "x", "--resume", "--overwrite"], "--resume"),
+        (["inspect", "--deep", "x"], "--deep"),
+    ],
+)
+def test_a_wrong_call_is_one_line_and_exit_2(virest: Virest, arguments: list[str], says: str) -> None:
+    """The line says what was wrong and where the help is."""
+    result = virest(*arguments)
+    assert_refused(result, 2, says, "--help")
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_scheduler_needs_its_extra(virest: Virest) -> None:
+    """Without Dask, --scheduler says how to get it."""
+    program = (
+        "import sys; sys.modules['distributed'] = None; from virest.app.cli import run; sys.exit(run(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", program, "process", "x", "--scheduler", "tcp://localhost:8786"]
+    assert_refused(subprocess.run(command, capture_output=True, text=True, check=False), 2, "virest[cluster]")
+
+
+def test_version_goes_to_standard_output(virest: Virest) -> None:
+    """Everywhere where it is asked for."""
+    for arguments in (["--version"], ["process", "--version"], ["inspect", "--version"]):
+        result = virest(*arguments)
+        assert (result.returncode, result.stderr) == (0, "")
+        assert re.fullmatch(r"virest \d+\.\d+\S*\n", result.stdout)
+
+
+def test_a_closed_pipe_ends_the_program_quietly() -> None:
+    """`virest --help | head -0` complains of nothing."""
+    read, write = os.pipe()
+    os.close(read)
+    result = subprocess.run(
+        [sys.executable, "-m", "virest", "--help"], stdout=write, stderr=subprocess.PIPE, check=False
+    )
+    os.close(write)
+    assert (result.returncode, result.stderr) == (141, b"")
+
+
+def test_a_full_standard_output_is_an_output_error(virest: Virest) -> None:
+    """Results that cannot be written are not done."""
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full here")
+    with open("/dev/full", "wb") as full:
+        command = [sys.executable, "-m", "virest", "--version"]
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert result.returncode == 8
+    assert "No space left" in result.stderr
+
+
+# ── a good run ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_process_writes_pictures_parameters_and_run(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """The files of the contract, and nothing else; a table on standard output."""
+    result = virest("process", tiny, "--out", "out", *FAST, "--frames", "2:5", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    pictures = {f"frames/{i:06d}.png" for i in (2, 3, 4)}
+    assert below(tmp_path / "out") == {"tiny", *(f"tiny/{n}" for n in pictures), "tiny/frames", "tiny/run.json",
+                                       "tiny/parameters.jsonl"}  # fmt: skip
+    account = json.loads((tmp_path / "out/tiny/run.json").read_text())
+    assert account["version"]
+    assert account["command"].startswith("virest process ")
+    assert account["settings"]["preset"] == "fast"
+    assert account["profile"]["virest_profile"] == 1
+    assert sum(account["counts"].values()) == account["totals"]["frames"] == 3
+    assert {f["file"] for f in account["inputs"]} >= {"movie.mp4", "gyro_accel.csv", "camera.yaml"}
+    assert all(len(f["sha256"]) == 64 and f["bytes"] > 0 for f in account["inputs"])
+    assert result.stdout.splitlines()[1].split()[0] == "tiny"
+
+
+def test_json_lines_are_the_parameters_and_nothing_else(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """Names come from standard input; the lines come in frame order, for the program after the pipe."""
+    result = virest("process", "-", "--out", "out", "--json", "--preset", "fast", "--jobs", 2, cwd=tmp_path,
+                    stdin=f"{tiny}\n\n")  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == (tmp_path / "out/tiny/parameters.jsonl").read_text()
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [line["frame"] for line in lines] == list(range(24))
+    assert all(line["blur"]["length_px"] >= 0 for line in lines if line["status"] != "skipped")
+
+
+def test_quiet_is_quiet(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """With -q a good run says nothing on standard error."""
+    result = virest("process", tiny, "-q", *FAST, "--frames", ":1", cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_a_dot_is_named_after_its_folder(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """`cd capture; virest process .` writes OUT/<capture>."""
+    result = virest("process", ".", "--out", tmp_path / "out", *FAST, "--frames", "0:1", cwd=tiny)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "out/tiny/run.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("frames", "chosen"),
+    [("-2:", [22, 23]), ("20:900:3", [20, 23]), ("1:0:-1", [1]), ("::23", [0, 23]), ("30:", [])],
+)
+def test_frames_is_a_python_slice(virest: Virest, tiny: Path, tmp_path: Path, frames: str, chosen: list[int]) -> None:
+    """Ends are clipped, negative indices count from the end; nothing chosen is a warning."""
+    result = virest("process", tiny, "--json", "--deblur", "none", "--frames", frames, "--jobs", 1, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert [json.loads(line)["frame"] for line in result.stdout.splitlines()] == chosen
+    assert ("selects no frame" in result.stderr) == (not chosen)
+
+
+# ── bad input ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def refuse(virest: Virest, tiny: Path, code: int, *says: str) -> None:
+    """Process the damaged capture: refused in one line, and nothing is written."""
+    result = virest("process", tiny, "--out", tiny.parent / "out", *FAST)
+    assert_refused(result, code, *says)
+    assert below(tiny.parent / "out") == set()
+
+
+def test_a_path_that_does_not_exist(virest: Virest, tmp_path: Path) -> None:
+    """Exit 4, and the path is named."""
+    refuse(virest, tmp_path / "tiny", 4, "no such folder")
+
+
+def test_an_empty_folder(virest: Virest, tmp_path: Path) -> None:
+    """Exit 4."""
+    (tmp_path / "tiny").mkdir()
+    refuse(virest, tmp_path / "tiny", 4, "tiny")
+
+
+def test_no_movie(virest: Virest, tiny: Path) -> None:
+    """Exit 4."""
+    (tiny / "movie.mp4").unlink()
+    refuse(virest, tiny, 4, "movie.mp4")
+
+
+def test_a_movie_without_moov(virest: Virest, tiny: Path) -> None:
+    """A recording that was not stopped has no index."""
+    movie = tiny / "movie.mp4"
+    data = movie.read_bytes()
+    movie.write_bytes(data[: data.index(b"moov") - 4])
+    refuse(virest, tiny, 4, "movie.mp4")
+
+
+def test_an_imu_that_does_not_cover_the_frames(virest: Virest, tiny: Path, edit_gyro: Edit) -> None:
+    """Nothing is left to process: exit 4."""
+    edit_gyro(lambda rows: rows[:40])
+    refuse(virest, tiny, 4, "gyro_accel.csv")
+
+
+def test_an_imu_that_covers_some_frames(virest: Virest, tiny: Path, edit_gyro: Edit) -> None:
+    """The frames outside are skipped with their reason, the others are done: exit 0."""
+    edit_gyro(lambda rows: rows[130:])
+    result = virest("process", tiny, "--json", *FAST, cwd=tiny.parent)
+    assert result.returncode == 0, result.stderr
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    skipped = [line for line in lines if line["status"] == "skipped"]
+    assert [line["frame"] for line in skipped] == list(range(len(skipped)))
+    assert 0 < len(skipped) < 24
+    assert all(line["output"] is None and line["warnings"] for line in skipped)
+
+
+@pytest.mark.parametrize("damage", ["gap", "nan"])
+def test_a_hole_in_the_imu_skips_the_frames_inside(virest: Virest, tiny: Path, edit_gyro: Edit, damage: str) -> None:
+    """A gap, or samples that are no numbers: exit 0, the frames inside are skipped."""
+
+    def hole(rows: list[str]) -> list[str]:
+        inside = range(150, 190)
+        if damage == "gap":
+            return [row for i, row in enumerate(rows) if i not in inside]
+        return [re.sub(r",[^,]*,", ",NaN,", row, count=1) if i in inside else row for i, row in enumerate(rows)]
+
+    edit_gyro(hole)
+    result = virest("process", tiny, "--json", *FAST, cwd=tiny.parent)
+    assert result.returncode == 0, result.stderr
+    statuses = [json.loads(line)["status"] for line in result.stdout.splitlines()]
+    assert 4 <= statuses.count("skipped") <= 12
+    assert statuses[0] != "skipped" != statuses[-1]
+
+
+def test_swapped_files(virest: Virest, tiny: Path) -> None:
+    """Headers tell the files apart."""
+    (tiny / "gyro_accel.csv").rename(tiny / "x")
+    (tiny / "movie_metadata.csv").rename(tiny / "gyro_accel.csv")
+    (tiny / "x").rename(tiny / "movie_metadata.csv")
+    refuse(virest, tiny, 4, "swapped")
+
+
+def test_an_unknown_key_in_the_profile(virest: Virest, tiny: Path) -> None:
+    """Exit 3, and the nearest known key."""
+    profile = tiny / "camera.yaml"
+    profile.write_text(profile.read_text().replace("readout_time_s", "readout_s"))
+    refuse(virest, tiny, 3, "readout_s", "readout_time_s")
+
+
+def test_a_profile_of_another_size(virest: Virest, tiny: Path) -> None:
+    """Exit 3, and both sizes."""
+    profile = tiny / "camera.yaml"
+    profile.write_text(profile.read_text().replace("160", "320"))
+    refuse(virest, tiny, 3, "320", "160")
+
+
+def test_settings_that_cannot_be_used(virest: Virest, tiny: Path) -> None:
+    """Exit 3, before any work."""
+    (tiny.parent / "s.yaml").write_text("strenght: 2\n")
+    result = virest("process", tiny, "--out", tiny.parent / "out", "--settings", tiny.parent / "s.yaml")
+    assert_refused(result, 3, "s.yaml", "strength")
+    assert not (tiny.parent / "out").exists()
+
+
+def test_a_profile_file_that_does_not_exist(virest: Virest, tiny: Path) -> None:
+    """Exit 3, before any work."""
+    assert_refused(virest("process", tiny, "--config", "none.yaml", cwd=tiny.parent), 3, "none.yaml")
+
+
+# ── output ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_an_existing_run_is_refused_kept_and_replaced(virest: Virest, tiny: Path) -> None:
+    """Without --overwrite nothing is touched; --resume of a finished run is done; --overwrite starts anew."""
+    arguments = ("process", tiny, "--out", tiny.parent / "out", *FAST, "--deblur", "none", "--frames")
+    run = tiny.parent / "out/tiny"
+    assert virest(*arguments, "0:3").returncode == 0
+    before = content(run)
+    assert_refused(virest(*arguments, "0:2"), 8, "--overwrite")
+    assert_refused(virest(*arguments, "0:2", "--resume"), 8, "frames")
+    assert virest(*arguments, "0:3", "--resume").returncode == 0
+    assert content(run) == before
+    assert virest(*arguments, "0:2", "--overwrite").returncode == 0
+    assert {name for name in below(run) if name.endswith(".png")} == {"frames/000000.png", "frames/000001.png"}
+
+
+def test_other_captures_in_the_output_folder_are_no_obstacle(virest: Virest, tiny: Path) -> None:
+    """A run is OUT/<capture>."""
+    (tiny.parent / "out/other/frames").mkdir(parents=True)
+    assert virest("process", tiny, "--out", tiny.parent / "out", *FAST, "--frames", "0:1").returncode == 0
+
+
+def test_an_output_below_a_file_is_refused(virest: Virest, tiny: Path) -> None:
+    """Whether OUT is a file or lies below one."""
+    (tiny.parent / "file").write_text("mine")
+    for out in ("file", "file/deeper"):
+        result = virest("process", tiny, "--out", tiny.parent / out, *FAST, "--frames", "0:1")
+        assert_refused(result, 8, "file")
+    assert (tiny.parent / "file").read_text() == "mine"
+
+
+INJECTED = """
+import errno, os, sys
+from virest.app import outputs
+from virest.app.cli import run
+honest, count = outputs._write_bytes, 0
+def injected(path, data):
+    global count
+    count += 1
+    if count > {after}:
+        path.write_bytes(data[: len(data) // 2])
+        raise OSError(errno.{code}, os.strerror(errno.{code}))
+    honest(path, data)
+outputs._write_bytes = injected
+sys.exit(run(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(("code", "after"), [("ENOSPC", 0), ("ENOSPC", 3), ("EDQUOT", 13), ("EROFS", 0)])
+def test_a_disk_that_takes_no_more(virest: Virest, tiny: Path, code: str, after: int) -> None:
+    """Full, over quota, read-only: exit 8, one line, no half-written file, and --resume goes on afterwards."""
+    arguments = ["process", str(tiny), "--out", str(tiny.parent / "out"), "--jobs", "1", "--deblur", "none"]
+    command = [sys.executable, "-c", INJECTED.format(code=code, after=after), *arguments]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert_refused(result, 8, os.strerror(getattr(__import__("errno"), code)))
+    assert not [name for name in below(tiny.parent / "out") if name.endswith((".part", ".lock", "run.json"))]
+    if after < 10:
+        assert not (tiny.parent / "out/tiny").exists()
+    assert virest(*arguments, "--resume").returncode == 0
+    undisturbed = [*arguments[:3], str(tiny.parent / "again"), *arguments[4:]]
+    assert virest(*undisturbed).returncode == 0
+    assert content(tiny.parent / "out/tiny") == content(tiny.parent / "again/tiny")
+
+
+# ── batches ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_two_captures_of_one_name_are_refused_before_any_work(virest: Virest, tiny: Path) -> None:
+    """Exit 8, nothing written."""
+    (tiny.parent / "b/tiny").mkdir(parents=True)
+    result = virest("process", tiny, tiny.parent / "b/tiny", cwd=tiny.parent)
+    assert_refused(result, 8, "'tiny'")
+    assert not (tiny.parent / "virest-out").exists()
+
+
+def test_a_batch_with_a_failure_does_the_rest_and_exits_9(virest: Virest, tiny: Path) -> None:
+    """The failure has its line; the other capture its row."""
+    result = virest("process", tiny.parent / "none", tiny, *FAST, "--frames", "0:1", cwd=tiny.parent)
+    assert result.returncode == 9
+    assert len([line for line in result.stderr.splitlines() if line.startswith("virest: error: ")]) == 1
+    assert [line.split()[0] for line in result.stdout.splitlines()] == ["capture", "tiny"]
+
+
+def test_an_undecodable_frame_fails_alone(virest: Virest, tiny: Path) -> None:
+    """Exit 9; the frames of the damaged group fail with their reason, the rest is done."""
+    data = bytearray((tiny / "movie.mp4").read_bytes())
+    begin = data.index(b"mdat") + 4
+    middle = begin + (data.index(b"moov") - begin if data.index(b"moov") > begin else len(data) - begin) // 2
+    data[middle : middle + 1500] = bytes(1500)
+    (tiny / "movie.mp4").write_bytes(data)
+    result = virest("process", tiny, "--json", "--jobs", 1, "--deblur", "none", cwd=tiny.parent)
+    statuses = [json.loads(line)["status"] for line in result.stdout.splitlines()]
+    assert result.returncode == 9, result.stderr
+    assert len(statuses) == 24
+    assert 0 < statuses.count("failed") < 20
+    assert "decoded" in next(json.loads(x)["warnings"][0] for x in result.stdout.splitlines() if '"failed"' in x)
+
+
+def test_no_name_on_standard_input_is_a_warning(virest: Virest) -> None:
+    """`find … | virest process -` that finds nothing has nothing to do."""
+    result = virest("process", "-", stdin="\n")
+    assert (result.returncode, result.stdout) == (0, "")
+    assert "standard input" in result.stderr
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_inspect_prints_what_it_can(virest: Virest, tiny: Path, *, as_json: bool) -> None:
+    """A good capture exits 0; without its movie 4, with what is left on standard output and one line of error."""
+    options = ["--json"] if as_json else []
+    good = virest("inspect", tiny, *options)
+    assert (good.returncode, good.stderr) == (0, "")
+    (tiny / "movie.mp4").unlink()
+    bad = virest("inspect", tiny, *options)
+    assert bad.returncode == 4
+    assert "tiny" in bad.stdout
+    assert len(bad.stderr.splitlines()) == 1
+    if as_json:
+        assert json.loads(good.stdout)
+        assert json.loads(bad.stdout)
+
+
+# ── being stopped ────────────────────────────────────────────────────────────────────────────────────────────────
+
+SLOW = ("--preset", "best")
+
+
+@pytest.mark.scenario
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
+    virest: Virest, start: Callable[..., Any], tiny: Path, tmp_path: Path, jobs: int, number: signal.Signals
+) -> None:
+    """Exit 130 (143 for SIGTERM), one line, no parts, no lock; --resume ends with the files of an undisturbed run."""
+    arguments = ("process", tiny, *SLOW, "--jobs", jobs, "--out")
+    with start(*arguments, tmp_path / "out") as process:
+        wait_for(lambda: len(below(tmp_path / "out/tiny/frames")) > 2, process)
+        os.killpg(process.pid, number)
+        output, errors = process.communicate(timeout=30)
+    assert process.returncode == (130 if number == signal.SIGINT else 143), errors
+    assert output == ""
+    assert "Traceback" not in errors
+    assert not [name for name in below(tmp_path / "out") if name.endswith((".part", ".lock", "run.json"))]
+    assert virest(*arguments, tmp_path / "out", "--resume").returncode == 0
+    assert virest(*arguments, tmp_path / "undisturbed").returncode == 0
+    assert content(tmp_path / "out/tiny") == content(tmp_path / "undisturbed/tiny")
+
+
+@pytest.mark.scenario
+def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
+    virest: Virest, start: Callable[..., Any], tiny: Path, tmp_path: Path
+) -> None:
+    """SIGKILL at any time; a finished segment is not done again; workers do not outlive their parent."""
+    arguments = ("process", tiny, *SLOW, "--jobs", 2, "--out")
+    run = tmp_path / "out/tiny"
+    with start(*arguments, tmp_path / "out") as process:
+        wait_for(lambda: any(name.startswith(".segments/") for name in below(run)), process)
+        process.kill()
+        process.communicate(timeout=30)  # returns when the last worker has let go of the pipes
+    log = next((run / ".segments").glob("*.jsonl"))
+    first = json.loads(log.read_text().splitlines()[0])["output"]
+    written_ns = (run / first).stat().st_mtime_ns
+    (run / "frames/000023.png.0123abcd.part").write_bytes(b"half")
+    assert_refused(virest(*arguments, tmp_path / "out"), 8, "unfinished", "--resume")
+    assert virest(*arguments, tmp_path / "out", "--resume").returncode == 0
+    assert (run / first).stat().st_mtime_ns == written_ns
+    assert virest(*arguments, tmp_path / "undisturbed").returncode == 0
+    assert content(run) == content(tmp_path / "undisturbed/tiny")
+
+
+@pytest.mark.scenario
+@pytest.mark.parametrize("preset", ["fast", "balanced", "best"])
+def test_the_bytes_do_not_depend_on_the_number_of_jobs(virest: Virest, tiny: Path, tmp_path: Path, preset: str) -> None:
+    """One process, two, three: the same files."""
+    for jobs in (1, 2, 3):
+        result = virest("process", tiny, "--out", tmp_path / str(jobs), "--preset", preset, "--jobs", jobs)
+        assert result.returncode == 0, result.stderr
+    assert content(tmp_path / "1/tiny") == content(tmp_path / "2/tiny") == content(tmp_path / "3/tiny")
+
+
+@pytest.mark.scenario
+def test_a_reader_that_goes_away_ends_the_run_quietly(start: Callable[..., Any], tiny: Path, tmp_path: Path) -> None:
+    """`virest process … --json | head -1`: no traceback, no half-written file."""
+    with start("process", tiny, *SLOW, "--jobs", 1, "--json", "-q", "--out", tmp_path / "out") as process:
+        assert json.loads(process.stdout.readline())["frame"] == 0
+        process.stdout.close()
+        errors = process.stderr.read()
+        process.wait(timeout=60)
+    assert (process.returncode, errors) == (141, "")
+    assert not [name for name in below(tmp_path / "out") if name.endswith((".part", ".lock"))]

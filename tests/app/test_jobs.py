@@ -1,0 +1,279 @@
+"""Segments: cut the same way for any number of jobs, idempotent, and each frame's fault its own."""
+
+import json
+import os
+import pickle
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from virest.restoration.capture import RestorationPlan
+
+from virest.app import jobs
+from virest.app.jobs import Segment, Workers, cut_frames, cut_imu, run_segment, run_segments
+from virest.app.outputs import RunFolder
+from virest.camera.profile import CameraProfile
+from virest.capture.folder import Frame
+from virest.capture.imu import ImuSamples
+from virest.capture.video import MovieIndex
+from virest.errors import OutputError, RestorationError, VideoError
+from virest.restoration.frame import RestoredFrame
+from virest.restoration.settings import RestorationSettings
+
+HEIGHT, WIDTH = 6, 10
+
+
+def frames_of(*indices: int) -> list[Frame]:
+    """Frames at 30 per second."""
+    return [Frame(i, 10**9 + i * 33_000_000, i * 0.033, 0.01) for i in indices]
+
+
+def grey(index: int) -> np.ndarray:
+    """The decoded picture of a frame: its index as grey level."""
+    return np.full((HEIGHT, WIDTH, 3), index, np.uint8)
+
+
+@pytest.fixture
+def segment(tmp_path: Path) -> Segment:
+    """Frames 4, 5, 6, 7 of which 6 is left out."""
+    frames = frames_of(4, 5, 7)
+    frames.insert(2, Frame(6, 10**9, 0.198, 0.01, skip_reason="inside an IMU gap"))
+    imu = ImuSamples(np.arange(0, 1, 0.01), np.zeros((100, 3)), np.zeros((100, 3)))
+    index = MovieIndex(WIDTH, HEIGHT, Fraction(1, 90000), np.arange(10) * 3000, (0,), (0,))
+    plan = RestorationPlan(CameraProfile(WIDTH, HEIGHT), RestorationSettings(), (), None)
+    run = RunFolder(tmp_path / "trip")
+    run.frames.mkdir(parents=True)
+    run.segments.mkdir()
+    return Segment("trip", tmp_path / "movie.mp4", index, tuple(frames), imu, plan, run)
+
+
+@pytest.fixture
+def decoder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Put a decoder in place that cannot decode certain frames, or ends early."""
+
+    def install(broken: tuple[int, ...] = (), ends_at: int | None = None) -> None:
+        def read(path: Path, index: MovieIndex, first: int, last: int) -> Iterator[tuple[int, Any]]:
+            for i in range(first, last + 1):
+                if i == ends_at:
+                    raise VideoError("movie.mp4: ends")
+                yield i, None if i in broken else grey(i)
+
+        monkeypatch.setattr(jobs, "read_frames", read)
+
+    install()
+    return install
+
+
+def restore_all(frames: Any, imu: ImuSamples, plan: RestorationPlan) -> Iterator[RestoredFrame]:
+    """Stand in for the restoration: brighter by 100."""
+    for frame, picture in frames:
+        yield RestoredFrame(frame, "restored", picture + 100, valid_px=(0, 0, WIDTH, HEIGHT), seconds={"deblur": 0.5})
+
+
+@pytest.fixture
+def restoration(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
+    """Put a restoration in place."""
+
+    def install(function: Any) -> None:
+        monkeypatch.setattr(jobs, "restore_frames", function)
+
+    install(restore_all)
+    return install
+
+
+def lines_of(segment: Segment) -> list[dict[str, Any]]:
+    """Read a segment's log."""
+    return [json.loads(line) for line in segment.log_path.read_text().splitlines()]
+
+
+def statuses(segment: Segment) -> list[str]:
+    """Give each frame's status."""
+    return [line["status"] for line in lines_of(segment)]
+
+
+def pictures(segment: Segment) -> set[str]:
+    """Give the names of the pictures written."""
+    return {path.name for path in segment.run.frames.iterdir()}
+
+
+# ── cutting ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_cuts_lie_at_key_frames_and_keep_segments_short() -> None:
+    """Every frame is in one segment, in order; none is longer than 16; key frames start segments where they can."""
+    frames = frames_of(*range(70))
+    parts = cut_frames(frames, (0, 12, 24, 60))
+    assert [frame.index for part in parts for frame in part] == list(range(70))
+    assert [part[0].index for part in parts] == [0, 12, 24, 40, 56]
+    assert max(map(len, parts)) <= 16
+
+
+def test_cuts_of_every_fifth_frame_fall_where_a_key_frame_was_passed() -> None:
+    """A key frame between two chosen frames is as good as one at the second."""
+    parts = cut_frames(frames_of(*range(0, 100, 5)), (0, 48))
+    assert [part[0].index for part in parts] == [0, 50]
+
+
+def test_no_frames_make_no_segments() -> None:
+    """An empty selection is no work."""
+    assert cut_frames([], (0,)) == []
+
+
+def test_imu_samples_cover_the_frames_on_the_imus_clock() -> None:
+    """The clock's offset is applied before samples are cut out, and a second is spared on both sides."""
+    imu = ImuSamples(np.arange(0, 100, 0.01), np.zeros((10000, 3)), np.zeros((10000, 3)))
+    plan = RestorationPlan(CameraProfile(64, 48, time_offset_s=50.0), RestorationSettings(), (), None)
+    cut = cut_imu(imu, frames_of(0, 30), plan)
+    assert 48.8 < cut.time_s[0] < 49.0
+    assert 51.9 < cut.time_s[-1] < 52.2
+
+
+def test_a_segment_is_plain_data(segment: Segment) -> None:
+    """It can go to a worker on another machine."""
+    again = pickle.loads(pickle.dumps(segment))
+    assert again.frames == segment.frames
+    assert again.plan == segment.plan
+
+
+# ── one segment ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.usefixtures("decoder", "restoration")
+def test_each_frame_of_a_segment_has_its_line(segment: Segment) -> None:
+    """In frame order, with all keys of the contract; only frames with a picture have an output."""
+    assert run_segment(segment) == {"restored": 3, "skipped": 1}
+    lines = lines_of(segment)
+    assert [line["frame"] for line in lines] == [4, 5, 6, 7]
+    assert [line["output"] for line in lines] == ["frames/000004.png", "frames/000005.png", None, "frames/000007.png"]
+    assert lines[2]["warnings"] == ["inside an IMU gap"]
+    for line in lines:
+        assert list(line) == [
+            "capture", "frame", "timestamp_ns", "exposure_s", "status", "output", "warnings", "valid_px", "motion",
+            "depth_m", "depth_source", "blur", "shutter", "response", "deblur", "seconds",
+        ]  # fmt: skip
+        assert set(line["seconds"]) == {"decode", "estimate", "deblur", "shutter", "write"}
+    assert pictures(segment) == {"000004.png", "000005.png", "000007.png"}
+
+
+@pytest.mark.usefixtures("decoder", "restoration")
+def test_a_segment_done_twice_gives_the_same_files(segment: Segment) -> None:
+    """A segment is idempotent."""
+    run_segment(segment)
+    before = {path.name: path.read_bytes() for path in segment.run.frames.iterdir()}
+    run_segment(segment)
+    assert {path.name: path.read_bytes() for path in segment.run.frames.iterdir()} == before
+
+
+@pytest.mark.usefixtures("restoration")
+def test_a_frame_that_cannot_be_decoded_fails_alone(segment: Segment, decoder: Callable[..., None]) -> None:
+    """Its line says so; the others are restored."""
+    decoder(broken=(5,))
+    assert run_segment(segment) == {"restored": 2, "skipped": 1, "failed": 1}
+    assert statuses(segment) == ["restored", "failed", "skipped", "restored"]
+    assert "decoded" in lines_of(segment)[1]["warnings"][0]
+
+
+@pytest.mark.usefixtures("restoration")
+def test_a_movie_that_ends_early_fails_its_last_frames(segment: Segment, decoder: Callable[..., None]) -> None:
+    """What could be read is kept."""
+    decoder(ends_at=7)
+    run_segment(segment)
+    assert statuses(segment) == ["restored", "restored", "skipped", "failed"]
+
+
+@pytest.mark.usefixtures("decoder")
+@pytest.mark.parametrize("look_ahead", [False, True])
+def test_a_frame_that_cannot_be_restored_fails_alone(
+    segment: Segment, restoration: Callable[[Any], None], *, look_ahead: bool
+) -> None:
+    """Even when the restoration had taken later frames already."""
+
+    def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan) -> Iterator[RestoredFrame]:
+        for frame, picture in list(frames) if look_ahead else frames:
+            if frame.index == 5:
+                raise RestorationError("kernel is singular")
+            yield from restore_all([(frame, picture)], imu, plan)
+
+    restoration(restore)
+    run_segment(segment)
+    assert statuses(segment) == ["restored", "failed", "skipped", "restored"]
+    assert lines_of(segment)[1]["warnings"] == ["kernel is singular"]
+    assert pictures(segment) == {"000004.png", "000007.png"}
+
+
+@pytest.mark.usefixtures("decoder", "restoration")
+def test_a_full_disk_ends_the_segment_and_leaves_no_log(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fault of the disk is no fault of a frame."""
+
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr("virest.app.outputs._write_bytes", full)
+    with pytest.raises(OutputError, match="No space left"):
+        run_segment(segment)
+    assert not segment.log_path.exists()
+    assert pictures(segment) == set()
+
+
+# ── many segments ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def one_frame_segments(segment: Segment, count: int) -> list[Segment]:
+    """Segments of one frame each."""
+    fields = {name: getattr(segment, name) for name in Segment.__slots__}
+    return [Segment(**{**fields, "frames": (frame,)}) for frame in frames_of(*range(count))]
+
+
+@pytest.mark.usefixtures("decoder", "restoration")
+def test_segments_are_made_only_as_they_are_needed(segment: Segment) -> None:
+    """Memory does not grow with the movie: no more segments are in flight than there are slots."""
+    made: list[int] = []
+
+    def make() -> Iterator[Segment]:
+        for part in one_frame_segments(segment, 6):
+            made.append(part.frames[0].index)
+            yield part
+
+    for count, _ in enumerate(run_segments(make(), Workers(1)), start=1):
+        assert len(made) <= count + 1
+    assert made == list(range(6))
+
+
+@pytest.mark.usefixtures("decoder")
+def test_a_fault_of_ours_fails_one_segment_and_the_rest_goes_on(
+    segment: Segment, restoration: Callable[[Any], None]
+) -> None:
+    """The frames' lines say what happened."""
+
+    def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan) -> Iterator[RestoredFrame]:
+        for frame, picture in frames:
+            yield from restore_all([(frame, picture)], imu, plan)
+            if frame.index == 1:
+                raise ZeroDivisionError("after the frame")
+
+    restoration(restore)
+    results = [counts for _, counts in run_segments(iter(one_frame_segments(segment, 3)), Workers(1))]
+    assert results == [{"restored": 1}, {"failed": 1}, {"restored": 1}]
+    assert pictures(segment) == {"000000.png", "000002.png"}
+
+
+def _die_on_second(segment: Segment) -> dict[str, int]:
+    if segment.frames[0].index == 2:
+        os._exit(1)
+    return jobs.fail_segment(segment, "stand-in for work")
+
+
+@pytest.mark.scenario
+def test_a_worker_that_dies_takes_only_its_own_segment(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lost segments are tried again, each alone; the one that kills its worker again fails, the others are done."""
+    monkeypatch.setattr(jobs, "run_segment", _die_on_second)
+    workers = Workers(2)
+    parts = one_frame_segments(segment, 5)
+    done = {part.frames[0].index: counts for part, counts in run_segments(iter(parts), workers)}
+    workers.kill()
+    assert done == {i: {"failed": 1} for i in range(5)}
+    reasons = [json.loads(part.log_path.read_text())["warnings"][0] for part in parts]
+    assert ["died" in reason for reason in reasons] == [False, False, True, False, False]

@@ -1,0 +1,14 @@
+"""Tiny captures with known content."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from capture_writing import CaptureWriter
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> CaptureWriter:
+    """A sound capture of 30 frames, 64x96, not yet written."""
+    return CaptureWriter(tmp_path / "2022_09_17_10_00_00")

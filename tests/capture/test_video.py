@@ -1,0 +1,227 @@
+"""The movie: index, order, seeking, colour, damage."""
+
+from __future__ import annotations
+
+import os
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from capture_writing import moving_pictures, write_movie
+
+from virest.capture import video
+from virest.capture.video import probe_movie, read_frames, read_gray, to_gray, to_rgb
+from virest.errors import VideoError
+
+STEPS = [i * 33_400_000 for i in range(24)]
+
+
+@pytest.fixture
+def movie(tmp_path: Path) -> Path:
+    """24 frames, key frame every ten."""
+    write_movie(tmp_path / "movie.mp4", moving_pictures(24), STEPS)
+    return tmp_path / "movie.mp4"
+
+
+def uniform_frame(y: int, u: int = 128, v: int = 128, pixel_format: str = "yuv420p") -> av.VideoFrame:
+    """One colour all over, 32x16."""
+    frame = av.VideoFrame(32, 16, pixel_format)
+    for plane, value in zip(frame.planes, (y, u, v), strict=True):
+        plane.update(bytes([value]) * plane.buffer_size)
+    return frame
+
+
+def test_index_holds_size_times_and_key_frames(movie):
+    """The index has one entry a frame with its exact time, without decoding."""
+    index = probe_movie(movie)
+    assert (index.width, index.height, len(index)) == (64, 96, 24)
+    assert index.keyframes == (0, 10, 20)
+    np.testing.assert_array_equal(index.pts_ns, STEPS)
+
+
+def test_b_frames_come_in_presentation_order(tmp_path):
+    """With B-frames the index is sorted by time and each frame is still the one of its time."""
+    pictures = moving_pictures(24)
+    write_movie(tmp_path / "movie.mp4", pictures, STEPS, bf="3", preset="veryfast", **{"b-adapt": "0"})
+    index = probe_movie(tmp_path / "movie.mp4")
+    np.testing.assert_array_equal(index.pts_ns, STEPS)
+    for number, gray in read_gray(tmp_path / "movie.mp4", index, range(24)):
+        assert gray is not None
+        errors = [np.abs(gray.astype(int) - picture).mean() for picture in pictures]
+        assert int(np.argmin(errors)) == number
+
+
+def test_seeking_gives_the_same_pictures(movie):
+    """A frame is the same whether reached from the start or by seeking, in runs or alone."""
+    index = probe_movie(movie)
+    whole = dict(read_frames(movie, index, 0, 23))
+    assert list(whole) == list(range(24))
+    part = dict(read_frames(movie, index, 13, 22))
+    assert list(part) == list(range(13, 23))
+    sparse = dict(read_gray(movie, index, [2, 3, 15, 23]))
+    assert list(sparse) == [2, 3, 15, 23]
+    for number, picture in part.items():
+        np.testing.assert_array_equal(picture, whole[number])
+    grays = dict(read_gray(movie, index, range(24)))
+    for number, picture in sparse.items():
+        np.testing.assert_array_equal(picture, grays[number])
+
+
+def test_ends_are_clipped(movie):
+    """Frames beyond the movie are not asked for."""
+    index = probe_movie(movie)
+    assert [number for number, _ in read_frames(movie, index, -3, 2)] == [0, 1, 2]
+    assert [number for number, _ in read_frames(movie, index, 22, 99)] == [22, 23]
+    assert not list(read_frames(movie, index, 30, 40))
+
+
+def test_damaged_frame_loses_itself_and_its_followers_only(movie):
+    """After a damaged packet frames are None up to the next key frame, then right again."""
+    index = probe_movie(movie)
+    good = dict(read_frames(movie, index, 0, 23))
+    with av.open(str(movie)) as container:
+        places = sorted((p.pts, p.pos, p.size) for p in container.demux(video=0) if p.size)
+    raw = bytearray(movie.read_bytes())
+    _, position, size = places[13]
+    raw[position : position + size] = bytes(size)
+    movie.write_bytes(raw)
+    seen = dict(read_frames(movie, index, 0, 23))
+    assert list(seen) == list(range(24))
+    assert [number for number, picture in seen.items() if picture is None] == list(range(13, 20))
+    np.testing.assert_array_equal(seen[21], good[21])
+
+
+def test_cut_movie_keeps_what_is_there(tmp_path):
+    """A movie whose index is whole but whose data end early gives its first frames, then None."""
+    path = tmp_path / "movie.mp4"
+    with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 96, "yuv420p"
+        for picture in moving_pictures(24):
+            picture = np.ascontiguousarray(picture)
+            frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format="yuv420p")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    index = probe_movie(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    seen = dict(read_frames(path, index, 0, 23))
+    assert list(seen) == list(range(24))
+    assert seen[0] is not None
+    assert seen[23] is None
+    assert len(probe_movie(path)) < probe_movie(path).declared_frames == 24
+
+
+@pytest.mark.parametrize("grey", [16, 17, 63, 126, 200, 235])
+def test_known_grey_has_no_bias(grey):
+    """A uniform limited-range grey comes out as its rounded full-range value in all three channels."""
+    frame = uniform_frame(grey)
+    expected = round((grey - 16) * 255 / 219)
+    assert set(np.unique(to_rgb(frame))) == {expected}
+    assert set(np.unique(to_gray(frame))) == {expected}
+
+
+def test_mean_bias_over_all_greys_is_below_a_twentieth():
+    """Rounding, not truncation: over every code the mean error against exact arithmetic vanishes."""
+    codes = range(16, 236)
+    errors = [to_rgb(uniform_frame(code)).mean() - (code - 16) * 255 / 219 for code in codes]
+    assert abs(np.mean(errors)) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("matrix", "kr", "kb"), [(1, 0.2126, 0.0722), (2, 0.299, 0.114), (6, 0.299, 0.114), (9, 0.2627, 0.0593)]
+)
+@pytest.mark.parametrize("full_range", [False, True])
+def test_matrix_and_range_of_the_stream_are_used(matrix, kr, kb, full_range):
+    """Each matrix and range gives the colours of its defining equations; untagged is BT.601 limited."""
+    frame = uniform_frame(120, 90, 160)
+    frame.colorspace = matrix
+    frame.color_range = 2 if full_range else 1
+    y = 120.0 if full_range else (120 - 16) * 255 / 219
+    scale = 1.0 if full_range else 255 / 224
+    red = y + 2 * (1 - kr) * (160 - 128) * scale
+    blue = y + 2 * (1 - kb) * (90 - 128) * scale
+    green = (y - kr * red - kb * blue) / (1 - kr - kb)
+    np.testing.assert_allclose(to_rgb(frame)[5, 7], np.clip([red, green, blue], 0, 255), atol=0.53)
+
+
+def test_colour_picture_survives_the_movie(tmp_path):
+    """A smooth colour picture comes back through 4:2:0 at better than 45 dB: chroma lies where it was put."""
+    y, x = np.mgrid[:128, :160]
+    channels = [128 + 100 * np.sin(x / 6), 128 + 100 * np.sin(y / 7 + 1), 128 + 90 * np.sin((x + y) / 9)]
+    picture = np.stack(channels, -1).round().astype(np.uint8)
+    frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p", dst_colorspace="ITU601")
+    error = to_rgb(frame).astype(float) - picture
+    assert 10 * np.log10(255**2 / np.mean(error**2)) > 45
+    assert abs(error.mean()) < 0.1
+
+
+def test_odd_sizes_keep_their_shape():
+    """An odd side has a chroma sample of its own, cut after doubling."""
+    frame = av.VideoFrame.from_ndarray(np.full((15, 33, 3), 77, np.uint8), format="rgb24").reformat(format="yuv420p")
+    assert to_rgb(frame).shape == (15, 33, 3)
+    assert to_gray(frame).shape == (15, 33)
+
+
+def test_display_rotation_is_ignored(tmp_path):
+    """Pictures come as stored."""
+    write_movie(tmp_path / "movie.mp4", moving_pictures(3), STEPS[:3])
+    index = probe_movie(tmp_path / "movie.mp4")
+    (_, picture), *_ = read_frames(tmp_path / "movie.mp4", index, 0, 0)
+    assert picture is not None
+    assert picture.shape == (96, 64, 3)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a movie", b"#EXTM3U\nhttp://localhost/x\n", bytes(5000)])
+def test_what_is_no_movie_is_refused(tmp_path, content):
+    """Empty files, text, playlists and zeros get one clear line."""
+    path = tmp_path / "movie.mp4"
+    path.write_bytes(content)
+    with pytest.raises(VideoError, match=r"movie\.mp4"):
+        probe_movie(path)
+
+
+def test_movie_without_its_index_is_refused(movie):
+    """A movie cut before its moov box says what that means."""
+    movie.write_bytes(movie.read_bytes()[:2000])
+    with pytest.raises(VideoError, match="stopped cleanly"):
+        probe_movie(movie)
+
+
+def test_sound_without_pictures_is_refused(tmp_path):
+    """A file with an audio stream alone has no video."""
+    path = tmp_path / "movie.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=48_000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate, frame.pts, frame.time_base = 48_000, 0, Fraction(1, 48_000)
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    with pytest.raises(VideoError, match="no video stream"):
+        probe_movie(path)
+
+
+def test_absurd_size_is_refused(movie, monkeypatch):
+    """A picture larger than any camera's is refused before memory is asked for."""
+    monkeypatch.setattr(video, "MAX_SIDE_PX", 90)
+    with pytest.raises(VideoError, match="64x96"):
+        probe_movie(movie)
+
+
+def test_pipe_and_folder_do_not_hang(tmp_path):
+    """A named pipe or a folder in the movie's place is refused at once."""
+    os.mkfifo(tmp_path / "movie.mp4")
+    with pytest.raises(VideoError, match="no regular file"):
+        probe_movie(tmp_path / "movie.mp4")
+    with pytest.raises(VideoError, match="is a folder"):
+        probe_movie(tmp_path)
+
+
+def test_mpeg4_part_2(realdata):
+    """The older codec is indexed and decoded like H.264."""
+    path = realdata / "nexus5_162941" / "movie.mp4"
+    index = probe_movie(path)
+    assert (index.codec, len(index)) == ("mpeg4", 152)
+    pictures = dict(read_frames(path, index, 60, 63))
+    assert all(picture is not None and picture.shape == (768, 1280, 3) for picture in pictures.values())

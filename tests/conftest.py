@@ -1,0 +1,47 @@
+"""What all tests share: real captures where there are any, the program as a process, fast tests first."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+RunVirest = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the fast tests first, then the scenarios."""
+    items.sort(key=lambda item: item.get_closest_marker("scenario") is not None)
+
+
+@pytest.fixture(scope="session")
+def realdata() -> Path:
+    """Folder of the real captures; tests that need it are skipped without it."""
+    folder = os.environ.get("VIREST_REALDATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("VIREST_REALDATA names no folder of real captures")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def virest() -> RunVirest:
+    """The program as its users run it: ``virest("process", folder)`` gives returncode, stdout, stderr."""
+
+    def run(*arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 120, **environment: str):
+        return subprocess.run(
+            [sys.executable, "-m", "virest", *map(str, arguments)],
+            cwd=cwd, input=stdin, capture_output=True, text=True, timeout=timeout, check=False,
+            env={**os.environ, **environment},
+        )  # fmt: skip
+
+    return run
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator with a fixed seed."""
+    return np.random.default_rng(20221109)

@@ -1,0 +1,309 @@
+"""The command line. Heavy imports happen inside the commands; ``main`` is the one exit door."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+import shlex
+import signal
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from virest import __version__
+from virest.app import console
+from virest.errors import OutputError, VirestError
+from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS
+
+log = logging.getLogger(__name__)
+
+USAGE = 2
+INTERRUPTED = 130
+TERMINATED = 143
+CLOSED_PIPE = 141
+PARTLY_FAILED = 9
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    help="Deblur and straighten phone captures with the phone's own gyroscope.",
+)
+_ClickException: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end (SIGTERM, SIGHUP): leave as tidily as after Ctrl-C."""
+
+
+# ── options that several commands share ──────────────────────────────────────────────────────────────────────────
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        console.emit(f"virest {__version__}")
+        raise typer.Exit
+
+
+def _one_of(names: tuple[str, ...]) -> Callable[[str | None], str | None]:
+    def check(value: str | None) -> str | None:
+        if value is not None and value not in names:
+            raise typer.BadParameter(f"{value!r} is none of {', '.join(names)}")
+        return value
+
+    return check
+
+
+Captures = Annotated[list[str], typer.Argument(metavar="CAPTURE", help="Capture folders; - reads names from stdin.")]
+Json = Annotated[bool, typer.Option("--json", help="Machine-readable results on standard output, nothing else.")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Errors only.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say more; tracebacks for errors.")]
+Version = Annotated[
+    bool, typer.Option("--version", help="Print the version and leave.", is_eager=True, callback=_show_version)
+]
+Config = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="Camera profile, or a Kalibr camchain.")]
+
+
+@app.callback()
+def _virest(version: Version = False) -> None:
+    pass
+
+
+def _parse_frames(text: str | None) -> slice:
+    """A Python slice of frame indices, ``A:B`` or ``A:B:STEP``."""
+    if text is None:
+        return slice(None)
+    parts = text.split(":")
+    if len(parts) not in (2, 3) or not all(re.fullmatch(r"\s*([+-]?\d{1,18})?\s*", part, re.ASCII) for part in parts):
+        raise typer.BadParameter(f"{text!r} is no slice; write A:B or A:B:STEP, such as 10:50, :100 or ::5")
+    bounds = [int(part) if part.strip() else None for part in parts]
+    if len(bounds) == 3 and bounds[2] == 0:
+        raise typer.BadParameter(f"{text!r}: the step cannot be 0")
+    return slice(*bounds)
+
+
+# ── commands ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@app.command()
+def process(
+    captures: Captures,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="One folder a capture goes in here.")] = Path(
+        "virest-out"
+    ),
+    config: Config = None,
+    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings, as configs/balanced.yaml.")] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's indices.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option(metavar="|".join(PRESETS), callback=_one_of(tuple(PRESETS)), help="[balanced]")
+    ] = None,
+    deblur: Annotated[
+        str | None,
+        typer.Option(metavar="METHOD", callback=_one_of(DEBLUR_METHODS), help=f"One of {', '.join(DEBLUR_METHODS)}."),
+    ] = None,
+    shutter: Annotated[
+        str | None,
+        typer.Option(metavar="|".join(SHUTTER_METHODS), callback=_one_of(SHUTTER_METHODS), help="[rowwise]"),
+    ] = None,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="|".join(REFERENCES), callback=_one_of(REFERENCES), help="Time of the picture. [exposure-start]"
+        ),
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes. [the cores]")] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler does the work.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
+    keep_start_up: Annotated[
+        bool, typer.Option("--keep-start-up", help="Process the frames of the recorder's start-up too.")
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Deblur and straighten captures: PNGs, parameters.jsonl and run.json in OUT/<capture>.
+
+    \b
+    $ virest process 2022_03_09_15_21_07 --frames 30:90
+    virest: 2022_03_09_15_21_07: camera profile from the capture's metadata
+    capture              restored  copied  skipped  failed  frames/s  verdict   output
+    2022_03_09_15_21_07        58       2        0       0       4.3  restored  virest-out/2022_03_09_15_21_07
+
+    \b
+    $ find /data -name movie.mp4 -printf '%h\\n' | virest process - --json | jq .blur.length_px
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    if resume and overwrite:
+        raise typer.BadParameter("choose one of --resume and --overwrite")
+    if scheduler is not None and find_spec("distributed") is None:
+        raise typer.BadParameter("--scheduler needs the extra [cluster]: pip install 'virest[cluster]'")
+    chosen = _parse_frames(frames)
+    paths = _capture_paths(captures)
+    if not paths:
+        return 0
+    _one_thread_each()
+    from virest.app.process import ProcessOptions, process_captures
+    from virest.app.settings import compose_settings
+
+    composed = compose_settings(
+        settings,
+        preset=preset,
+        deblur=deblur,
+        shutter=shutter,
+        reference=reference,
+        keep_start_up=keep_start_up or None,
+    )
+    options = ProcessOptions(
+        out,
+        composed,
+        config,
+        chosen,
+        jobs or _cores(),
+        scheduler,
+        "resume" if resume else "overwrite" if overwrite else "new",
+        shlex.join(["virest", *sys.argv[1:]]),
+        json,
+        quiet,
+        verbose,
+    )
+    return process_captures(paths, options)
+
+
+@app.command()
+def inspect(
+    captures: Captures,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Say what is in a capture and what is wrong with it, before any work.
+
+    \b
+    $ virest inspect honor_v10
+    $ virest inspect honor_v10 --json | jq .frames
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    paths = _capture_paths(captures)
+    from virest.app.inspect import inspect_capture
+
+    codes = []
+    for path in paths:
+        try:
+            facts, text, code = inspect_capture(Path(path))
+            if json:
+                from virest.app.outputs import json_line
+
+                console.emit(json_line(facts))
+            else:
+                console.emit(text)
+            if code:
+                console.CONSOLE.line(f"error: {_first_error(facts)}")
+        except VirestError as error:
+            code = console.report_error(error)
+        codes.append(code)
+    return _batch_code(codes)
+
+
+def _first_error(facts: dict[str, Any]) -> str:
+    """What makes a capture unusable, of all that was noted."""
+    errors = [note["text"] for note in facts["notes"] if note["severity"] == "error"]
+    return errors[0] if errors else f"{facts['capture']}: cannot be used"
+
+
+# ── help for the commands ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _capture_paths(captures: list[str]) -> list[str]:
+    paths = console.expand_dash(captures)
+    if not paths:
+        log.warning("no capture: standard input names none")
+    return paths
+
+
+def _batch_code(codes: list[int]) -> int:
+    failures = [code for code in codes if code]
+    return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _one_thread_each() -> None:
+    """One thread in each process's linear algebra: the same sums on every machine, and no more threads than cores."""
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"
+
+
+# ── the exit door ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _terminate(number: int, _frame: Any) -> NoReturn:
+    raise _Terminated(number)
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run one command and turn whatever happens into an exit code."""
+    command = typer.main.get_command(app)
+    try:
+        with command.make_context("virest", list(sys.argv[1:] if arguments is None else arguments)) as context:
+            code = command.invoke(context)
+        return code if isinstance(code, int) else 0
+    except typer.Exit as leaving:
+        return leaving.exit_code
+    except _ClickException as error:
+        _report_usage(error)
+        return USAGE
+    except _Terminated:
+        console.CONSOLE.line("terminated; what is done stays, --resume goes on from there")
+        return TERMINATED
+    except (KeyboardInterrupt, typer.Abort):
+        console.CONSOLE.line("interrupted; what is done stays, --resume goes on from there")
+        return INTERRUPTED
+    except BrokenPipeError:
+        console.silence_stdout()
+        return CLOSED_PIPE
+    except Exception as error:
+        return console.report_error(_disk_full(error) or error)
+
+
+def _disk_full(error: Exception) -> OutputError | None:
+    """The error of an output that takes nothing more, wherever it was met."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return OutputError(f"{error.filename or 'output'}: {error.strerror}", hint="free some space there")
+    return None
+
+
+def _report_usage(error: Any) -> None:
+    """One line for a wrong call; the help where nothing was asked for."""
+    if type(error).__name__ == "NoArgsIsHelpError":
+        console.CONSOLE.block(error.format_message() + "\n")
+        return
+    name = error.ctx.command_path if getattr(error, "ctx", None) else "virest"
+    console.CONSOLE.line(f"error: {error.format_message().rstrip('.')}; see {name} --help")
+
+
+def main() -> NoReturn:
+    """The console script."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _terminate)
+    code = run()
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        console.silence_stdout()
+    sys.exit(code)

@@ -1,0 +1,154 @@
+"""Talking to the user: results on standard output, everything else on standard error, one line an error."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+from virest.errors import OutputError, VirestError
+
+OUR_FAULT = "this is a fault of virest, not of your input; please report it with the lines above"
+
+
+class Bar(Protocol):
+    """What the program needs of a progress bar."""
+
+    def update(self, count: int) -> Any:
+        """Move the bar on."""
+
+    def clear(self) -> Any:
+        """Take the bar off the screen."""
+
+    def refresh(self) -> Any:
+        """Put the bar back."""
+
+
+class _Console(logging.Handler):
+    """Log lines on standard error, above the progress bar if there is one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bar: Bar | None = None
+        self.verbose = False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one record as one line; a traceback only with -v."""
+        self.line(
+            f"{record.levelname.lower()}: {record.getMessage()}"
+            if record.levelno != logging.INFO
+            else record.getMessage()
+        )
+        if record.exc_info and self.verbose:
+            self.block("".join(traceback.format_exception(*record.exc_info)))
+
+    def line(self, text: str) -> None:
+        """Write one line, whatever the text holds."""
+        self.block("virest: " + " ".join(text.split()) + "\n")
+
+    def block(self, text: str) -> None:
+        """Write text as it is; a closed standard error is no reason to fail."""
+        if sys.stderr is None:
+            return
+        if self.bar:
+            self.bar.clear()
+        try:
+            sys.stderr.write(text.encode(sys.stderr.encoding or "utf-8", "backslashreplace").decode("utf-8", "replace"))
+            sys.stderr.flush()
+        except (OSError, ValueError):
+            return
+        if self.bar:
+            self.bar.refresh()
+
+
+CONSOLE = _Console()
+
+
+def configure(*, quiet: bool, verbose: bool) -> None:
+    """Show warnings and what was found; with ``quiet`` errors only, with ``verbose`` everything and tracebacks."""
+    root = logging.getLogger("virest")
+    root.handlers = [CONSOLE]
+    root.propagate = False
+    root.setLevel(logging.DEBUG if verbose else logging.ERROR if quiet else logging.INFO)
+    CONSOLE.verbose = verbose
+
+
+def report_error(error: BaseException, about: str = "") -> int:
+    """One line for a known error, a traceback for a fault of ours (or with -v). Returns the exit code."""
+    known = isinstance(error, VirestError)
+    if CONSOLE.verbose or not known:
+        CONSOLE.block("".join(traceback.format_exception(error)))
+    text = str(error) if known else f"{type(error).__name__}: {error}; {OUR_FAULT}"
+    CONSOLE.line(f"error: {about}: {text}" if about and about not in text else f"error: {text}")
+    return error.exit_code if isinstance(error, VirestError) else 1
+
+
+def emit(text: str) -> None:
+    """Write a result to standard output at once. A closed pipe raises BrokenPipeError, a full disk OutputError."""
+    if sys.stdout is None:
+        return
+    try:
+        sys.stdout.buffer.write((text + "\n").encode("utf-8", "backslashreplace"))
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        silence_stdout()
+        raise OutputError(f"standard output: {error.strerror}", hint="make room there, or write elsewhere") from error
+
+
+def emit_json(value: Any) -> None:
+    """Write one JSON object on one line."""
+    emit(json.dumps(value, allow_nan=False))
+
+
+def silence_stdout() -> None:
+    """Point standard output at nothing, so that the interpreter's last flush cannot fail."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.__stdout__.fileno() if sys.__stdout__ else 1)
+    os.close(null)
+
+
+@contextmanager
+def progress_bar(total: int, label: str, *, quiet: bool) -> Iterator[Bar | None]:
+    """A bar on standard error, only where that is a terminal."""
+    if quiet or sys.stderr is None or not sys.stderr.isatty():
+        yield None
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=total, desc=label, unit="frame", file=sys.stderr, leave=False) as bar:
+        CONSOLE.bar = bar
+        try:
+            yield bar
+        finally:
+            CONSOLE.bar = None
+
+
+def expand_dash(captures: Iterable[str]) -> list[str]:
+    """Replace ``-`` by the folder names on standard input, one a line."""
+    names: list[str] = []
+    for capture in captures:
+        if capture != "-":
+            names.append(capture)
+        elif sys.stdin is not None:
+            lines = sys.stdin.buffer.read().split(b"\n")
+            names += [os.fsdecode(line.removesuffix(b"\r")) for line in lines if line.strip()]
+    return names
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """Columns under their heads, the first and the last two to the left, numbers to the right."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    left = {0, len(header) - 1, len(header) - 2}
+
+    def line(row: list[str]) -> str:
+        cells = [c.ljust(w) if i in left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        return "  ".join(cells).rstrip()
+
+    return "\n".join(line(row) for row in [header, *rows])

@@ -1,0 +1,277 @@
+"""What is in a capture and what is wrong with it, before any work: the command `virest inspect`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from virest.capture.folder import (
+    EPOCHS,
+    GYRO,
+    METADATA,
+    MOVIE,
+    STAMPS,
+    Capture,
+    Frame,
+    Note,
+    read_capture,
+    resolve_profile,
+)
+from virest.capture.join import median_period_s
+from virest.capture.marslogger_android import (
+    read_edge_epochs,
+    read_frame_timestamps,
+    read_gyro_accel,
+    read_movie_metadata,
+)
+from virest.capture.video import probe_movie
+from virest.errors import CaptureError, VirestError
+
+DROPPED = " dropped: "
+
+
+def inspect_capture(path: Path) -> tuple[dict[str, Any], str, int]:
+    """(JSON mapping, table for people, exit code) of one folder; faults become notes, 4 where it cannot be used."""
+    try:
+        capture = read_capture(path)
+    except CaptureError as fault:
+        facts = _partial(Path(path), fault)
+        return facts, _describe_facts(facts), fault.exit_code
+    facts = as_json(capture)
+    return facts, _describe_facts(facts), 0
+
+
+def describe(capture: Capture) -> str:
+    """Tabulate a capture for people."""
+    return _describe_facts(as_json(capture))
+
+
+def as_json(capture: Capture) -> dict[str, Any]:
+    """List a capture's facts, times in seconds from stamp_0, None for unknown; plain JSON without NaN."""
+    frame_s = np.array([frame.time_s for frame in capture.frames])
+    frame_period, imu_period = median_period_s(frame_s), median_period_s(capture.imu.time_s)
+    logged = capture.metadata
+    return {
+        "capture": capture.name,
+        "folder": str(capture.folder),
+        "usable": True,
+        "exit_code": 0,
+        "movie": {
+            "width": capture.width,
+            "height": capture.height,
+            "frames": len(capture.frames),
+            "keyframes": len(capture.keyframes),
+        },
+        "counts": {key: value for key, value in capture.counts.items() if DROPPED not in key},
+        "dropped": _dropped(capture.counts),
+        "clock": {"source": capture.clock_source, "shift_s": capture.clock_shift_ns / 1e9},
+        "span_s": {
+            "frames": [float(frame_s[0]), float(frame_s[-1])],
+            "imu": [float(capture.imu.time_s[0]), float(capture.imu.time_s[-1])],
+        },
+        "rate_hz": {
+            "frames": 1 / frame_period if frame_period else None,
+            "imu": 1 / imu_period if imu_period else None,
+        },
+        "frame_gaps": _frame_gaps(capture.frames, frame_s, frame_period),
+        "imu_gaps_s": [list(gap) for gap in capture.imu_gaps_s],
+        "repeats": list(capture.repeats),
+        "startup_lag_s": capture.startup_lag_s,
+        "skipped": _skipped(capture.frames),
+        "exposure_s": _range([frame.exposure_s for frame in capture.frames]),
+        "iso": _range([frame.iso for frame in capture.frames]),
+        "fx_px": logged.fx_px,
+        "fy_px": logged.fy_px,
+        "readout_time_s": logged.readout_time_s,
+        "focal_length_mm": logged.focal_length_mm,
+        "accelerometer": capture.imu.has_accelerometer,
+        "peak_rate_rad_s": float(np.linalg.norm(capture.imu.gyro_rad_s, axis=1).max()),
+        "profile": _profile_source(capture),
+        "notes": [_note(note) for note in (*capture.notes, *_profile_notes(capture))],
+    }
+
+
+# ── facts ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _note(note: Note) -> dict[str, str]:
+    return {"severity": note.severity, "code": note.code, "text": note.text}
+
+
+def _range(values: list[float | None]) -> list[float] | None:
+    known = [value for value in values if value is not None]
+    return [min(known), max(known)] if known else None
+
+
+def _dropped(counts: dict[str, int]) -> dict[str, dict[str, int]]:
+    """Dropped rows by file and reason."""
+    found: dict[str, dict[str, int]] = {}
+    for key, number in counts.items():
+        name, mark, reason = key.partition(DROPPED)
+        if mark:
+            found.setdefault(name, {})[reason] = number
+    return found
+
+
+def _frame_gaps(frames: tuple[Frame, ...], frame_s: Any, period_s: float) -> list[dict[str, float]]:
+    """Where frames lie more than one and a half periods apart."""
+    steps = np.diff(frame_s)
+    return [{"frame": frames[i + 1].index, "gap_s": float(steps[i])} for i in np.flatnonzero(steps > 1.5 * period_s)]
+
+
+def _skipped(frames: tuple[Frame, ...]) -> list[dict[str, Any]]:
+    """Runs of neighbouring frames that are left out for the same causes, with the first one's reason."""
+    runs: list[dict[str, Any]] = []
+    for frame in frames:
+        if frame.skip_reason is None:
+            continue
+        codes = list(frame.skip_codes)
+        if runs and runs[-1]["last"] == frame.index - 1 and runs[-1]["codes"] == codes:
+            runs[-1]["last"] = frame.index
+        else:
+            runs.append({"first": frame.index, "last": frame.index, "codes": codes, "reason": frame.skip_reason})
+    return runs
+
+
+def _profile_source(capture: Capture) -> str | None:
+    try:
+        return resolve_profile(capture)[1]
+    except VirestError:
+        return None
+
+
+def _profile_notes(capture: Capture) -> list[Note]:
+    try:
+        resolve_profile(capture)
+    except VirestError as fault:
+        return [Note("warning", "profile", str(fault))]
+    return []
+
+
+def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
+    """What can still be said of a capture that cannot be used: each file on its own."""
+    folder = path.absolute()
+    facts: dict[str, Any] = {
+        "capture": folder.resolve().name if _is_folder(folder) else folder.name,
+        "folder": str(folder),
+        "usable": False,
+        "exit_code": fault.exit_code,
+        "counts": {},
+        "dropped": {},
+    }
+    notes = [Note("error", _code(fault), str(fault))]
+    if _is_folder(folder):
+        readers: dict[str, Callable[[Path], Any]] = {
+            MOVIE: probe_movie,
+            STAMPS: read_frame_timestamps,
+            METADATA: read_movie_metadata,
+            GYRO: read_gyro_accel,
+            EPOCHS: read_edge_epochs,
+        }
+        for name, reader in readers.items():
+            _look_at(folder / name, reader, facts, notes)
+    facts["notes"] = [_note(note) for note in notes]
+    return facts
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def _code(fault: CaptureError) -> str:
+    return type(fault).__name__.removesuffix("Error").lower()
+
+
+def _look_at(path: Path, reader: Callable[[Path], Any], facts: dict[str, Any], notes: list[Note]) -> None:
+    """Add what one file holds, or why it cannot be read."""
+    try:
+        found = reader(path)
+    except CaptureError as fault:
+        if path.name != EPOCHS and str(fault) not in [note.text for note in notes]:
+            notes.append(Note("error", _code(fault), str(fault)))
+        return
+    match path.name:
+        case "movie.mp4":
+            facts["movie"] = {
+                "width": found.width,
+                "height": found.height,
+                "frames": len(found),
+                "keyframes": len(found.keyframes),
+            }
+        case "edge_epochs.txt":
+            facts["clock"] = {"source": found.source, "shift_s": (found.mean_difference_ns or 0) / 1e9}
+        case _:
+            facts["counts"][f"{path.name} rows"] = found.rows
+            if found.dropped:
+                facts["dropped"][path.name] = dict(found.dropped)
+            if len(found.time_ns):
+                span = [int(found.time_ns[0]) / 1e9, int(found.time_ns[-1]) / 1e9]
+                facts.setdefault("logged_span_s", {})[path.name] = span
+
+
+# ── the table ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _describe_facts(facts: dict[str, Any]) -> str:
+    lines = [f"{facts['capture']}: {'usable' if facts['usable'] else 'NOT usable'}"]
+    for title, text in _rows(facts):
+        lines.append(f"  {title:<14}{text}")
+    for note in facts["notes"]:
+        lines.append(f"  {note['severity']:<9}{note['code']}: {note['text']}")
+    return "\n".join(lines)
+
+
+def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """(title, text) of each line that has something to say."""
+    rows: list[tuple[str, str]] = []
+    if movie := facts.get("movie"):
+        size = f"{movie['width']}x{movie['height']}"
+        rows.append(("movie", f"{size}, {movie['frames']} frames, {movie['keyframes']} key frames"))
+    rows += [("counts", text) for text in _wrapped(facts["counts"])]
+    for name, reasons in facts["dropped"].items():
+        rows.append(("dropped", f"{name}: " + ", ".join(f"{n} {reason}" for reason, n in reasons.items())))
+    if clock := facts.get("clock"):
+        rows.append(("clock", f"source {clock['source']}, camera stamps shifted by {clock['shift_s']:.6f} s"))
+    for name, span in (facts.get("span_s") or facts.get("logged_span_s") or {}).items():
+        rows.append(("span", f"{name} {span[0]:.3f} to {span[1]:.3f} s"))
+    if not facts["usable"]:
+        return rows
+    return rows + _camera_rows(facts)
+
+
+def _camera_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    rate = facts["rate_hz"]
+    rows = [("rate", f"frames {_shown(rate['frames'], '.2f')} Hz, IMU {_shown(rate['imu'], '.1f')} Hz")]
+    gaps = facts["imu_gaps_s"]
+    rows.append(("gaps", f"IMU {len(gaps)}, frames {len(facts['frame_gaps'])}"))
+    rows += [("imu gap", f"{start:.3f} to {end:.3f} s ({(end - start) * 1e3:.0f} ms)") for start, end in gaps[:8]]
+    repeats = facts["repeats"]
+    rows.append(("repeats", f"frames {', '.join(map(str, repeats))}" if repeats else "none seen in the first 2 s"))
+    rows.append(("start-up lag", f"{_shown(facts['startup_lag_s'], '.2f')} s" if facts["startup_lag_s"] else "none"))
+    for run in facts["skipped"][:8]:
+        rows.append(("left out", f"frames {run['first']}–{run['last']}: {run['reason']}"))
+    exposure, iso = facts["exposure_s"], facts["iso"]
+    rows.append(("exposure", f"{exposure[0] * 1e3:.3f} to {exposure[1] * 1e3:.3f} ms" if exposure else "unknown"))
+    rows.append(("ISO", f"{iso[0]:.0f} to {iso[1]:.0f}" if iso else "unknown"))
+    rows.append(("focal length", f"fx {_shown(facts['fx_px'], '.2f')}, fy {_shown(facts['fy_px'], '.2f')} px"))
+    readout = facts["readout_time_s"]
+    rows.append(("readout", f"{readout * 1e3:.3f} ms" if readout else "unknown"))
+    rows.append(("accelerometer", "yes" if facts["accelerometer"] else "no"))
+    rows.append(("peak rate", f"{facts['peak_rate_rad_s']:.2f} rad/s"))
+    rows.append(("profile", facts["profile"] or "cannot be used"))
+    return rows
+
+
+def _shown(value: float | None, form: str) -> str:
+    return "unknown" if value is None else format(value, form)
+
+
+def _wrapped(counts: dict[str, int], per_line: int = 4) -> list[str]:
+    parts = [f"{key} {value}" for key, value in counts.items() if value or not key.endswith("pts")]
+    return [", ".join(parts[i : i + per_line]) for i in range(0, len(parts), per_line)]

@@ -1,0 +1,422 @@
+"""A run as a list of segments: small, picklable, idempotent pieces of work for any concurrent.futures.Executor.
+
+The cuts depend on the movie and on the chosen frames only, never on the number of jobs; so the bytes do not either.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from itertools import chain, islice
+from multiprocessing.connection import wait as wait_for_handles
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.app.outputs import RunFolder, json_line, write_picture, write_whole
+from virest.capture.folder import Capture, Frame
+from virest.capture.imu import ImuSamples
+from virest.capture.video import MovieIndex, read_frames
+from virest.errors import OutputError, SettingsError, VirestError
+from virest.restoration.capture import RestorationPlan, restore_frames
+from virest.restoration.frame import RestoredFrame
+
+log = logging.getLogger(__name__)
+
+MIN_SEGMENT_FRAMES = 8
+MAX_SEGMENT_FRAMES = 16
+IMU_MARGIN_S = 1.0
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A few neighbouring frames and everything that a worker needs for them."""
+
+    capture_name: str
+    movie: Path
+    index: MovieIndex
+    frames: tuple[Frame, ...]
+    imu: ImuSamples
+    """The samples that cover the frames, with a margin."""
+    plan: RestorationPlan
+    run: RunFolder
+
+    @property
+    def log_path(self) -> Path:
+        """Where the lines of this segment go."""
+        return self.run.segment_log(self.frames[0].index, self.frames[-1].index)
+
+
+# ── cutting ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def cut_frames(frames: Sequence[Frame], keyframes: Iterable[int]) -> list[tuple[Frame, ...]]:
+    """Cut frames into runs of 8 to 16, at frames that the decoder can start from where there are some."""
+    starts = sorted(keyframes)
+    parts: list[list[Frame]] = []
+    for frame in frames:
+        if not parts or len(parts[-1]) >= MAX_SEGMENT_FRAMES or _cut_before(frame, parts[-1], starts):
+            parts.append([])
+        parts[-1].append(frame)
+    return [tuple(part) for part in parts]
+
+
+def _cut_before(frame: Frame, part: list[Frame], starts: list[int]) -> bool:
+    """Whether a key frame lies between the part's last frame and this one, and the part is long enough."""
+    at = int(np.searchsorted(starts, part[-1].index, side="right"))
+    return len(part) >= MIN_SEGMENT_FRAMES and at < len(starts) and starts[at] <= frame.index
+
+
+def cut_imu(imu: ImuSamples, frames: Sequence[Frame], plan: RestorationPlan) -> ImuSamples:
+    """The samples that cover these frames' exposures, with a second to spare on both sides."""
+    profile = plan.profile
+    rate, offset_s = 1.0 + profile.clock_skew, profile.time_offset_s or 0.0
+    longest_s = max((frame.exposure_s or 0.0) for frame in frames) * profile.shutter.exposure_scale
+    spare_s = IMU_MARGIN_S + longest_s + profile.shutter.readout_time_s + profile.extensions.frame_lag_s
+    start_s, end_s = (frames[i].time_s * rate + offset_s for i in (0, -1))
+    return imu.between(start_s - spare_s, end_s + spare_s)
+
+
+def make_segment(
+    frames: tuple[Frame, ...], capture: Capture, name: str, index: MovieIndex, plan: RestorationPlan, run: RunFolder
+) -> Segment:
+    """One segment as a worker takes it."""
+    return Segment(name, capture.movie, index, frames, cut_imu(capture.imu, frames, plan), plan, run)
+
+
+# ── the work on one segment ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def run_segment(segment: Segment) -> dict[str, int]:
+    """Restore a segment's frames, write their pictures and, last, the segment's log. Returns counts by status.
+
+    Doing it again gives the same files. A frame that fails gets its line, and the others go on. Raises OutputError.
+    """
+    prepare_worker()
+    lines: dict[int, dict[str, Any]] = {}
+    decode_s: dict[int, float] = {}
+    for restored in chain(_skipped(segment), _restored(segment, decode_s)):
+        lines[restored.frame.index] = _write_frame(segment, restored, decode_s.get(restored.frame.index, 0.0))
+    return _write_log(segment, lines)
+
+
+def fail_segment(segment: Segment, reason: str) -> dict[str, int]:
+    """Write the log of a segment that could not be worked on: its frames failed, those left out stay left out."""
+    failed = (_without_picture(f, "failed", reason) for f in segment.frames if f.skip_reason is None)
+    lines = {r.frame.index: _write_frame(segment, r, 0.0) for r in chain(_skipped(segment), failed)}
+    return _write_log(segment, lines)
+
+
+def _write_log(segment: Segment, lines: dict[int, dict[str, Any]]) -> dict[str, int]:
+    ordered = [lines[frame.index] for frame in segment.frames]
+    write_whole(segment.log_path, "".join(json_line(line) + "\n" for line in ordered).encode())
+    counts: dict[str, int] = {}
+    for line in ordered:
+        counts[line["status"]] = counts.get(line["status"], 0) + 1
+    return counts
+
+
+def _skipped(segment: Segment) -> Iterator[RestoredFrame]:
+    for frame in segment.frames:
+        if frame.skip_reason is not None:
+            yield _without_picture(frame, "skipped", frame.skip_reason)
+
+
+def _without_picture(frame: Frame, status: str, reason: str) -> RestoredFrame:
+    return RestoredFrame(frame, status, None, warnings=(reason,), valid_px=(0, 0, 0, 0), parameters={}, seconds={})
+
+
+def _decoded(segment: Segment, seconds: dict[int, float]) -> Iterator[tuple[Frame, Picture | None]]:
+    """The segment's usable frames in order, each with its picture, or None where it could not be decoded."""
+    wanted = deque(frame for frame in segment.frames if frame.skip_reason is None)
+    if not wanted:
+        return
+    source = read_frames(segment.movie, segment.index, wanted[0].index, wanted[-1].index)
+    began = time.perf_counter()
+    try:
+        for index, picture in source:
+            while wanted and wanted[0].index < index:
+                yield wanted.popleft(), None
+            if wanted and wanted[0].index == index:
+                seconds[index] = time.perf_counter() - began
+                yield wanted.popleft(), picture
+                began = time.perf_counter()
+    except VirestError as error:
+        log.warning("%s: %s", segment.capture_name, error)
+    while wanted:
+        yield wanted.popleft(), None
+
+
+def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[RestoredFrame]:
+    """Restored frames, and a failed one for each frame that cannot be decoded or restored."""
+    fed: deque[tuple[Frame, Picture]] = deque()
+    undecodable: list[Frame] = []
+
+    def feed(source: Iterable[tuple[Frame, Picture | None]]) -> Iterator[tuple[Frame, Picture | None]]:
+        for frame, picture in source:
+            if picture is None:
+                undecodable.append(frame)
+            else:
+                fed.append((frame, picture))
+                yield frame, picture
+
+    source: Iterator[tuple[Frame, Picture | None]] = _decoded(segment, decode_s)
+    while True:
+        try:
+            for restored in restore_frames(feed(source), segment.imu, segment.plan):
+                while fed and fed[0][0].index <= restored.frame.index:
+                    fed.popleft()
+                yield restored
+            break
+        except OutputError:
+            raise
+        except Exception as error:  # one frame's fault must not take the others along
+            if not fed:
+                raise
+            log.debug("frame %d", fed[0][0].index, exc_info=True)
+            frame, _ = fed.popleft()
+            yield _without_picture(frame, "failed", _reason(error))
+            source = chain(list(fed), source)
+            fed.clear()
+    lost = [frame for frame, _ in fed]
+    yield from (_without_picture(frame, "failed", "no result came from the restoration") for frame in lost)
+    yield from (_without_picture(frame, "failed", "the frame cannot be decoded") for frame in undecodable)
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, VirestError) else f"{type(error).__name__}: {error} (a fault of virest)"
+
+
+def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> dict[str, Any]:
+    """Write the frame's picture, if there is one, and give its line."""
+    path = segment.run.picture(restored.frame.index)
+    began = time.perf_counter()
+    if restored.picture is None:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path}: {error.strerror}", hint="check the output folder") from error
+    else:
+        write_picture(path, restored.picture)
+    write_s = time.perf_counter() - began if restored.picture is not None else 0.0
+    seconds = {"decode": decode_s, "estimate": 0.0, "deblur": 0.0, "shutter": 0.0, "write": write_s, **restored.seconds}
+    return frame_line(segment, restored, seconds)
+
+
+def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, float]) -> dict[str, Any]:
+    """One line of parameters.jsonl."""
+    frame, profile = restored.frame, segment.plan.profile
+    scale = profile.shutter.exposure_scale
+    curve = profile.response.kind if profile.response else "srgb"
+    line: dict[str, Any] = {
+        "capture": segment.capture_name,
+        "frame": frame.index,
+        "timestamp_ns": frame.timestamp_ns,
+        "exposure_s": None if frame.exposure_s is None else frame.exposure_s * scale,
+        "status": restored.status,
+        "output": None if restored.picture is None else f"frames/{segment.run.picture(frame.index).name}",
+        "warnings": list(restored.warnings),
+        "valid_px": list(restored.valid_px),
+        "motion": None,
+        "depth_m": None,
+        "depth_source": "none",
+        "blur": None,
+        "shutter": None,
+        "response": curve,
+        "deblur": {"method": "none"},
+    }
+    return {**line, **restored.parameters, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
+
+
+# ── workers ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+Running = dict[Future[dict[str, int]], Segment]
+
+_prepared: list[int] = []
+
+
+def prepare_worker() -> None:
+    """One thread a process: the pool is the parallelism, and sums do not depend on the number of cores."""
+    if os.getpid() not in _prepared:
+        cv2.setNumThreads(1)
+        _prepared.append(os.getpid())
+
+
+def _start_worker(verbose: bool) -> None:
+    """Set up a worker process: no Ctrl-C of its own (the parent decides), and no life after the parent's."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    logger = logging.getLogger("virest")
+    logger.setLevel(logging.DEBUG if verbose else logging.CRITICAL)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_die_with, args=(parent.sentinel,), daemon=True).start()
+    prepare_worker()
+
+
+def _die_with(sentinel: int) -> None:
+    wait_for_handles([sentinel])
+    os._exit(1)
+
+
+class SerialExecutor(Executor):
+    """Does the work at once, in this process."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call the function and hand back its result as a finished future."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:  # handed over with the future, as an executor does
+            future.set_exception(error)
+        return future
+
+
+class Workers:
+    """An executor that can be started again, and the number of segments that may be in flight."""
+
+    def __init__(self, jobs: int, scheduler: str | None = None, *, verbose: bool = False) -> None:
+        self.jobs = jobs
+        self.scheduler = scheduler
+        self.verbose = verbose
+        self._executor: Executor | None = None
+
+    @property
+    def slots(self) -> int:
+        """Segments in flight at once: enough to keep every worker busy, few enough to keep memory flat."""
+        return 1 if self.jobs == 1 and self.scheduler is None else self.jobs + 1
+
+    def submit(self, segment: Segment) -> Future[dict[str, int]]:
+        """Hand a segment to the executor."""
+        if self._executor is None:
+            self._executor = self._start()
+        if not isinstance(self._executor, ProcessPoolExecutor):
+            return self._executor.submit(run_segment, segment)
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
+        try:
+            return self._executor.submit(run_segment, segment)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+    def _start(self) -> Executor:
+        if self.scheduler is not None:
+            return _dask_executor(self.scheduler)
+        if self.jobs == 1:
+            return SerialExecutor()
+        for variable in THREAD_VARIABLES:
+            os.environ[variable] = "1"
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(self.jobs, context, initializer=_start_worker, initargs=(self.verbose,))
+
+    def kill(self) -> None:
+        """Stop all work now; the next submit starts anew."""
+        executor, self._executor = self._executor, None
+        if executor is None:
+            return
+        if isinstance(executor, ProcessPoolExecutor):
+            for process in multiprocessing.active_children():
+                process.kill()
+                process.join()
+        executor.shutdown(wait=False, cancel_futures=True)
+
+    def close(self) -> None:
+        """Let the workers go, once they are idle."""
+        if self._executor is not None:
+            self._executor.shutdown()
+            self._executor = None
+
+
+def _dask_executor(address: str) -> Executor:
+    from dask.distributed import Client
+
+    try:
+        return Client(address, timeout="10s").get_executor()
+    except (OSError, ValueError) as error:
+        raise SettingsError(
+            f"--scheduler {address}: {error}", hint="start `dask scheduler`, or leave it out"
+        ) from error
+
+
+def run_segments(segments: Iterable[Segment], workers: Workers) -> Iterator[tuple[Segment, dict[str, int]]]:
+    """Run segments, a bounded number at a time; yields each as it is done, with its counts by status.
+
+    A segment that was lost with its worker is tried once more, alone; lost again, its frames fail.
+    """
+    waiting = iter(segments)
+    running: Running = {}
+    while True:
+        lost = _fill(running, waiting, workers)
+        if not running and not lost:
+            return
+        done = wait(running, return_when=FIRST_COMPLETED).done if running else set()
+        for future in done:
+            segment = running.pop(future)
+            counts = _collect(future, segment)
+            if counts is None:
+                lost.append(segment)
+            else:
+                yield segment, counts
+        if lost:
+            yield from _rescue(lost, running, workers)
+
+
+def _fill(
+    running: dict[Future[dict[str, int]], Segment], waiting: Iterator[Segment], workers: Workers
+) -> list[Segment]:
+    """Submit until the slots are full; gives back the segment that a broken pool would not take."""
+    for segment in islice(waiting, max(workers.slots - len(running), 0)):
+        try:
+            running[workers.submit(segment)] = segment
+        except BrokenExecutor:
+            return [segment]
+    return []
+
+
+def _collect(future: Future[dict[str, int]], segment: Segment) -> dict[str, int] | None:
+    """The counts of a finished segment; None where its worker died."""
+    try:
+        return future.result()
+    except OutputError:
+        raise
+    except BrokenExecutor:
+        return None
+    except Exception as error:  # explained in the frames' lines; the other segments go on
+        if type(error).__name__ == "KilledWorker":
+            return None
+        log.debug("segment %s", segment.log_path.stem, exc_info=True)
+        return fail_segment(segment, _reason(error))
+
+
+def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator[tuple[Segment, dict[str, int]]]:
+    """Collect what a broken pool still holds, then try each lost segment alone in a new one."""
+    for future, segment in list(running.items()):
+        counts = _collect(future, segment)
+        if counts is None:
+            lost.append(segment)
+        else:
+            yield segment, counts
+    running.clear()
+    for segment in sorted(lost, key=lambda s: s.frames[0].index):
+        frames = f"frames {segment.frames[0].index}-{segment.frames[-1].index}"
+        log.warning("%s: a worker died on %s or its neighbours; trying again", segment.capture_name, frames)
+        workers.kill()
+        counts = _collect(workers.submit(segment), segment)
+        yield (
+            segment,
+            fail_segment(segment, "the worker process died twice on this segment") if counts is None else counts,
+        )
+    workers.kill()

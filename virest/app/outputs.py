@@ -1,0 +1,414 @@
+"""What a run writes: OUT/<capture>/frames/*.png, parameters.jsonl, run.json; each appears whole or not at all.
+
+A run's folder tells its own state::
+
+    run.json          the run is finished
+    .run              it is not: the request it was started with; --resume continues it
+    .segments/        logs of the finished segments of an unfinished run
+    .lock             held (flock) by the process that works here; the system lets go of it when that dies
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import math
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.errors import OutputError, RestorationError
+
+PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
+PART = re.compile(r".*\.[0-9a-f]{8}\.part")
+REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs")
+SIGNIFICANT_DIGITS = 10
+
+Mode = Literal["new", "resume", "overwrite"]
+Found = Literal["nothing", "unfinished", "finished"]
+
+_HINTS = {
+    errno.ENOSPC: "free some space there, then go on with --resume",
+    errno.EDQUOT: "your quota is used up; free some space, then go on with --resume",
+    errno.EROFS: "choose a folder that can be written with --out",
+    errno.EACCES: "choose a folder that you may write with --out",
+    errno.EPERM: "choose a folder that you may write with --out",
+    errno.ENOTDIR: "a part of this path is a file; choose another folder with --out",
+    errno.EEXIST: "this path is a file; choose another folder with --out",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+# ── single files ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def output_error(path: Path, error: OSError) -> OutputError:
+    """The system's complaint as one of ours, with what to do next."""
+    hint = _HINTS.get(error.errno or 0, "check the folder given to --out")
+    return OutputError(f"{path}: cannot be written: {error.strerror or error}", hint=hint)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file so that it appears whole or not at all. Raises OutputError."""
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        _write_bytes(part, data)
+        os.replace(part, path)
+    except BaseException as error:
+        with suppress(OSError):
+            part.unlink()
+        if isinstance(error, OSError):
+            raise output_error(path, error) from error
+        raise
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    with path.open("xb") as file:
+        file.write(data)
+
+
+def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write an RGB picture as PNG."""
+    done, data = cv2.imencode(".png", picture[..., ::-1], PNG_OPTIONS)
+    if not done:
+        raise RestorationError(f"{path.name}: the picture {picture.shape} cannot be encoded")
+    write_whole(path, data.tobytes())
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON takes it: no NaN (null), no infinity (``"inf"``), floats to ten digits, arrays as lists."""
+    match value:
+        case bool() | str() | int() | None:
+            return value
+        case dict():
+            return {str(key): plain(item) for key, item in value.items()}
+        case list() | tuple() | set():
+            return [plain(item) for item in value]
+        case float():
+            return _plain_float(value)
+        case np.ndarray() | np.generic():
+            return plain(value.tolist())
+        case _:
+            return str(value)
+
+
+def _plain_float(value: float) -> float | str | None:
+    if math.isnan(value):
+        return None
+    if math.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+
+
+def json_line(value: dict[str, Any]) -> str:
+    """One record on one line."""
+    return json.dumps(plain(value), allow_nan=False)
+
+
+def file_facts(path: Path) -> dict[str, Any]:
+    """Name, size and sha256 of an input file."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}
+
+
+def capture_name(path: str) -> str:
+    """The name of a capture's output folder: the last part of its path, ``.`` and ``..`` resolved.
+
+    Raises OutputError for a name that could not be a plain folder name.
+    """
+    name = os.path.basename(os.path.abspath(path))
+    if not name or name in (".", "..") or any(ord(c) < 32 or ord(c) == 127 for c in name) or "/" in name:
+        raise OutputError(
+            f"{path!r}: no usable name for an output folder: {name!r}", hint="rename the capture's folder"
+        )
+    return name
+
+
+# ── a run's folder ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """The places of one run, below OUT/<capture>."""
+
+    path: Path
+
+    @property
+    def frames(self) -> Path:
+        """Folder of the pictures."""
+        return self.path / "frames"
+
+    @property
+    def segments(self) -> Path:
+        """Folder of the finished segments' logs."""
+        return self.path / ".segments"
+
+    @property
+    def state(self) -> Path:
+        """The request of an unfinished run."""
+        return self.path / ".run"
+
+    @property
+    def lock(self) -> Path:
+        """Held while a process works here."""
+        return self.path / ".lock"
+
+    @property
+    def parameters(self) -> Path:
+        """One line a frame."""
+        return self.path / "parameters.jsonl"
+
+    @property
+    def run_json(self) -> Path:
+        """The finished run's account."""
+        return self.path / "run.json"
+
+    def picture(self, frame: int) -> Path:
+        """Where a frame's picture goes."""
+        return self.frames / f"{frame:06d}.png"
+
+    def segment_log(self, first: int, last: int) -> Path:
+        """Where a segment's lines go."""
+        return self.segments / f"{first}-{last}.jsonl"
+
+
+def check_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Found:
+    """What stands in a run's folder; raises OutputError where that is in the way. Changes nothing."""
+    found, old = find_run(run)
+    if found == "nothing":
+        return found
+    if mode == "new":
+        raise OutputError(
+            f"{run.path}: holds {'an unfinished' if found == 'unfinished' else 'a finished'} run",
+            hint=(
+                "--resume continues it, --overwrite replaces it"
+                if found == "unfinished"
+                else "--overwrite replaces it, --out chooses another folder"
+            ),
+        )
+    if mode == "resume" and (differences := _differences(old, request)):
+        raise OutputError(
+            f"{run.path}: --resume, but this run was started with other {'; '.join(differences)}",
+            hint="repeat that command, or start anew with --overwrite",
+        )
+    return found
+
+
+def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
+    """Whether a run stands here, and its request. Raises OutputError for a folder or file that is none of ours."""
+    if run.path.exists() and not run.path.is_dir():
+        raise OutputError(f"{run.path}: is a file", hint="choose another folder with --out")
+    if run.frames.is_symlink() or run.segments.is_symlink():
+        raise OutputError(f"{run.path}: its frames folder is a link", hint="choose another folder with --out")
+    for file, found in ((run.state, "unfinished"), (run.run_json, "finished")):
+        old = _read_request(file)
+        if old is not None:
+            return found, old  # type: ignore[return-value]
+    try:
+        foreign = [p.name for p in run.path.iterdir() if p != run.lock] if run.path.is_dir() else []
+    except OSError as error:
+        raise output_error(run.path, error) from error
+    if foreign:
+        raise OutputError(
+            f"{run.path}: holds {len(foreign)} files or folders that are no run of virest ({sorted(foreign)[0]!r}, …)",
+            hint="choose another folder with --out",
+        )
+    return "nothing", {}
+
+
+def _read_request(path: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_bytes())
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) and "profile_sha256" in content else None
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Which parts of two requests differ, in words."""
+    names = []
+    for key in REQUEST_KEYS:
+        before, now = old.get(key), new.get(key)
+        if before == now:
+            continue
+        if key == "settings" and isinstance(before, dict) and isinstance(now, dict):
+            fields = [f for f in now if before.get(f) != now[f]] or sorted(set(before) - set(now))
+            names.append("settings (" + ", ".join(f"{f} {before.get(f)}, now {now.get(f)}" for f in fields) + ")")
+        elif key == "inputs":
+            names.append(f"input files ({', '.join(_changed_files(before, now))})")
+        else:
+            words = {"profile_sha256": "camera profile", "frames": f"frames ({before}, now {now})"}
+            names.append(words.get(key, f"{key} ({before}, now {now})"))
+    return names
+
+
+def _changed_files(before: Any, now: Any) -> list[str]:
+    def by_name(facts: Any) -> dict[str, Any]:
+        return {f["file"]: f for f in facts if isinstance(f, dict) and "file" in f} if isinstance(facts, list) else {}
+
+    old, new = by_name(before), by_name(now)
+    return sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
+
+
+@contextmanager
+def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[Found]:
+    """Hold a run's folder: locked, checked, and made ready; yields what was found there.
+
+    When the body fails, no half-written file stays; a run of which no segment was finished leaves nothing at all.
+    """
+    fresh = not run.path.exists()
+    try:
+        run.path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise output_error(run.path, error) from error
+    try:
+        with _locked(run):
+            found = check_run(run, request, mode)
+            try:
+                if found != "finished" or mode == "overwrite":
+                    _make_ready(run, request, mode)
+                yield found if mode == "resume" else "nothing"
+            except BaseException:
+                _leave(run)
+                raise
+    finally:
+        if fresh:
+            with suppress(OSError):
+                run.path.rmdir()
+
+
+@contextmanager
+def _locked(run: RunFolder) -> Iterator[None]:
+    while True:
+        try:
+            handle = os.open(run.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise output_error(run.path, error) from error
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(handle)
+            raise OutputError(
+                f"{run.path}: another virest process works here",
+                hint="wait for it, or choose another folder with --out",
+            ) from None
+        with suppress(OSError):
+            if os.stat(run.lock).st_ino == os.fstat(handle).st_ino:
+                break
+        os.close(handle)  # the holder before us took the file away as it finished
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            run.lock.unlink()
+        os.close(handle)
+
+
+def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
+    """Bring the folder to the state from which segments can be written, whatever a killed run left."""
+    try:
+        if mode == "overwrite":
+            shutil.rmtree(run.segments, ignore_errors=True)
+        if mode == "overwrite" or not run.state.exists():
+            write_whole(run.state, json.dumps(plain(request), allow_nan=False, indent=1).encode())
+        run.frames.mkdir(exist_ok=True)
+        run.segments.mkdir(exist_ok=True)
+        if mode == "overwrite":
+            _remove_own(run)
+        remove_parts(run)
+    except OSError as error:
+        raise output_error(run.path, error) from error
+
+
+def _remove_own(run: RunFolder) -> None:
+    """Remove what a run made, except its state, and nothing else."""
+    for folder in (run.path, run.frames):
+        for file in folder.iterdir():
+            if OWN_FILES.fullmatch(file.name) and file != run.state and not file.is_dir():
+                file.unlink(missing_ok=True)
+
+
+def remove_parts(run: RunFolder) -> None:
+    """Remove the half-written files of writers that were killed."""
+    for folder in (run.path, run.frames, run.segments):
+        for file in folder.iterdir() if folder.is_dir() else ():
+            if PART.fullmatch(file.name):
+                file.unlink(missing_ok=True)
+
+
+def _leave(run: RunFolder) -> None:
+    """Tidy up after a failure: no parts; and where nothing was finished, nothing at all."""
+    with suppress(OSError):
+        remove_parts(run)
+        if run.run_json.exists() or (run.segments.is_dir() and any(run.segments.iterdir())):
+            return
+        if run.frames.is_dir():
+            _remove_own(run)
+        for folder in (run.segments, run.frames):
+            with suppress(FileNotFoundError):
+                folder.rmdir()
+        run.state.unlink(missing_ok=True)
+
+
+def remove_stray_pictures(run: RunFolder, keep: Iterable[int]) -> None:
+    """Remove pictures of segments that were not finished."""
+    kept = {run.picture(frame).name for frame in keep}
+    for file in run.frames.iterdir():
+        if OWN_FILES.fullmatch(file.name) and file.name not in kept:
+            file.unlink(missing_ok=True)
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The records of a JSON-lines file."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+
+
+def read_segment_log(run: RunFolder, frames: tuple[int, ...]) -> list[dict[str, Any]] | None:
+    """The lines of a finished segment; None where it is not finished, or its pictures are gone."""
+    try:
+        lines = read_lines(run.segment_log(frames[0], frames[-1]))
+    except (OSError, ValueError):
+        return None
+    if tuple(line.get("frame") for line in lines) != frames:
+        return None
+    return lines if all((run.path / line["output"]).is_file() for line in lines if line["output"]) else None
+
+
+def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any]) -> None:
+    """Join the segments' lines in frame order, write run.json last, and take away the scaffolding."""
+    try:
+        _join(run.parameters, logs)
+        write_whole(run.run_json, (json.dumps(plain(account), allow_nan=False, indent=2) + "\n").encode())
+        run.state.unlink(missing_ok=True)
+        shutil.rmtree(run.segments, ignore_errors=True)
+    except OSError as error:
+        raise output_error(run.path, error) from error
+
+
+def _join(path: Path, logs: Iterable[Path]) -> None:
+    """Copy the logs one after the other into one file, without holding them all."""
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with part.open("xb") as file:
+            for log in logs:
+                file.write(log.read_bytes())
+        os.replace(part, path)
+    finally:
+        with suppress(OSError):
+            part.unlink()

@@ -1,0 +1,110 @@
+"""Opening what a stranger's phone left behind: regular files only, bounded reads, never a hang on a pipe."""
+
+from __future__ import annotations
+
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from virest.errors import CaptureError
+
+CHUNK_BYTES = 1 << 20
+MAX_LINE_BYTES = 1 << 16
+"""The longest honest row has some 200 bytes; a longer one than this is damage, or an attack on the memory."""
+MAX_TABLE_BYTES = 4 << 30
+"""Four days of 500 Hz samples."""
+
+
+@dataclass(frozen=True, slots=True)
+class TextScan:
+    """What a cheap look over a text file found."""
+
+    size_bytes: int
+    lines: int
+    """Line ends, plus one for a last line without."""
+    head: str
+    """The first lines, at most MAX_LINE_BYTES, undecodable bytes replaced."""
+    ends_with_newline: bool
+
+
+def label(path: Path) -> str:
+    """Name a file in messages: its folder and its name."""
+    return f"{path.parent.name}/{path.name}"
+
+
+def require_regular_file(path: Path, error: type[CaptureError] = CaptureError, hint: str = "") -> int:
+    """Size in bytes of a regular file. Raises ``error`` for what is missing, a folder, a pipe or a loop of links."""
+    name = label(path)
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        raise error(f"{name}: no such file", hint=hint or "copy it from the phone") from None
+    except (OSError, ValueError) as fault:
+        reason = getattr(fault, "strerror", None) or str(fault)
+        raise error(f"{name}: {reason}", hint="check the path, its links and its permissions") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        raise error(f"{name}: is {kind}", hint="a capture consists of plain files")
+    return status.st_size
+
+
+def is_present(path: Path) -> bool:
+    """Whether anything stands under this name, be it usable or not."""
+    try:
+        path.lstat()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def scan_text(path: Path, error: type[CaptureError] = CaptureError, hint: str = "") -> TextScan:
+    """Look over a text file in bounded chunks, before anything reads it by lines.
+
+    Raises ``error`` for no regular file, too many bytes, a line longer than MAX_LINE_BYTES, or bytes that are no text.
+    """
+    size = require_regular_file(path, error, hint)
+    name = label(path)
+    if size > MAX_TABLE_BYTES:
+        raise error(f"{name}: {size} bytes, more than {MAX_TABLE_BYTES}", hint="is it the logger's file?")
+    head, lines, run, last = b"", 0, 0, b""
+    try:
+        with path.open("rb") as stream:
+            while chunk := stream.read(CHUNK_BYTES):
+                head = head or chunk[:MAX_LINE_BYTES]
+                run = _check_chunk(chunk, run, name, error)
+                lines += chunk.count(b"\n")
+                last = chunk[-1:]
+    except OSError as fault:
+        raise error(f"{name}: {fault.strerror}", hint="check its permissions and the disk") from None
+    text = head.decode("utf-8-sig", errors="replace")
+    return TextScan(size, lines + (last not in (b"\n", b"")), text, last == b"\n")
+
+
+def _check_chunk(chunk: bytes, run: int, name: str, error: type[CaptureError]) -> int:
+    """Length of the unfinished line at the chunk's end; refuses NUL bytes and endless lines."""
+    if b"\0" in chunk:
+        raise error(f"{name}: has NUL bytes, it is no plain text", hint="copy the original from the phone again")
+    start = 0
+    while (end := chunk.find(b"\n", start)) >= 0:
+        if run + end - start > MAX_LINE_BYTES:
+            break
+        run, start = 0, end + 1
+        if len(chunk) - start <= MAX_LINE_BYTES:
+            cut = chunk.rfind(b"\n")
+            return len(chunk) - cut - 1
+        start = max(start, chunk.rfind(b"\n", start, start + MAX_LINE_BYTES) + 1)
+    run += len(chunk) - start if end < 0 else end - start
+    if run > MAX_LINE_BYTES:
+        raise error(f"{name}: a line has more than {MAX_LINE_BYTES} bytes", hint="copy the logger's file again")
+    return run
+
+
+def read_small_text(path: Path, max_bytes: int = 1 << 20, error: type[CaptureError] = CaptureError) -> str:
+    """A small text file whole, undecodable bytes replaced. Raises ``error`` if it is no regular file or too large."""
+    size = require_regular_file(path, error)
+    if size > max_bytes:
+        raise error(f"{label(path)}: {size} bytes, more than {max_bytes}", hint="is it the logger's file?")
+    try:
+        return path.read_bytes().decode("utf-8-sig", errors="replace")
+    except OSError as fault:
+        raise error(f"{label(path)}: {fault.strerror}", hint="check its permissions") from None

@@ -1,0 +1,188 @@
+"""Join what was recorded apart, movie frames, stamps, metadata and inertial samples, by time and never by index."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.capture.marslogger_android import EdgeEpochs
+from virest.errors import ClockError
+
+TICK_90KHZ_NS = 1e9 / 90_000
+STAMP_STEP_NS = 1000
+"""Stamps are cut to whole microseconds."""
+COARSEST_TICK_NS = 1e6
+"""A movie clock coarser than this says nothing about which stamp is meant."""
+MIN_MATCHED_FRACTION = 0.8
+"""Below this share of frames with a stamp, movie and stamps are taken as different recordings."""
+MAX_CANDIDATES = 20_000
+SCORED_FRAMES = 500
+GAP_PERIODS = 5.0
+GAP_FLOOR_S = 0.030
+"""Hand motion has little power above 10 Hz: interpolation still follows it over 30 ms, a third of that period."""
+
+Int64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Which stamp belongs to which frame."""
+
+    rows: Int64
+    """(n,) row of the stamps for each movie frame, −1 for none."""
+    offset_ns: int
+    """Stamp of the movie's PTS 0."""
+    slid: bool
+    """False: row i is frame i, as the logger writes it."""
+    rivals: int = 0
+    """Other offsets that fit as well."""
+    worst_ns: float = 0.0
+    """Largest difference between PTS and stamp among the joined."""
+
+
+def pts_tolerance_ns(tick_ns: float) -> float:
+    """How far PTS and stamps may differ: a tick of 90 kHz, or of the movie's own coarser clock, and a microsecond."""
+    return max(TICK_90KHZ_NS, min(tick_ns, COARSEST_TICK_NS)) + STAMP_STEP_NS
+
+
+def match_times(wanted_ns: Int64, rows_ns: Int64, tolerance_ns: float) -> Int64:
+    """Row of the nearest of the rising ``rows_ns`` for each wanted time, −1 where none lies within the tolerance."""
+    if not len(rows_ns):
+        return np.full(len(wanted_ns), -1, np.int64)
+    after = np.clip(np.searchsorted(rows_ns, wanted_ns), 0, len(rows_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(rows_ns[before] - wanted_ns) <= np.abs(rows_ns[after] - wanted_ns), before, after)
+    return np.where(np.abs(rows_ns[nearest] - wanted_ns) <= tolerance_ns, nearest, -1)
+
+
+def floor_us(times_ns: Int64) -> Int64:
+    """Nanoseconds cut to whole microseconds, as the encoder's time stamps are."""
+    return times_ns // STAMP_STEP_NS * STAMP_STEP_NS
+
+
+def join_metadata(stamps_ns: Int64, metadata_ns: Int64) -> Int64:
+    """Metadata row of each stamp, −1 for none: floored microseconds agree within one."""
+    return match_times(floor_us(stamps_ns), floor_us(metadata_ns), STAMP_STEP_NS)
+
+
+def align_frames(
+    pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float, witness_ns: Int64 | None = None, what: str = "stamps"
+) -> Alignment:
+    """Find the stamp of each movie frame: row by row if all agree, else the shift of PTS that matches most frames.
+
+    pts_ns (n,) from 0, stamps_ns (m,), both rising.  ``witness_ns``: further times (metadata rows) that decide between
+    shifts that match as many stamps.  Raises ClockError if no shift finds stamps for MIN_MATCHED_FRACTION of frames.
+    """
+    if len(pts_ns) == len(stamps_ns):
+        difference = stamps_ns - stamps_ns[0] - pts_ns
+        if np.abs(difference).max() <= tolerance_ns:
+            return Alignment(np.arange(len(pts_ns)), int(stamps_ns[0]), False, 0, float(np.abs(difference).max()))
+    offsets, scores = _best_offsets(pts_ns, stamps_ns, tolerance_ns)
+    if not len(offsets) or scores[0] < max(1, MIN_MATCHED_FRACTION * len(pts_ns)):
+        raise _misfit(pts_ns, stamps_ns, tolerance_ns, int(scores[0]) if len(scores) else 0, what)
+    if len(offsets) > 1 and witness_ns is not None and len(witness_ns):
+        seen = np.array([np.sum(match_times(pts_ns + o, floor_us(witness_ns), tolerance_ns) >= 0) for o in offsets])
+        offsets = offsets[seen == seen.max()]
+    direct = np.abs(offsets - stamps_ns[0]) <= tolerance_ns
+    offset = int(offsets[direct][0] if direct.any() else offsets[0])
+    rows = match_times(pts_ns + offset, stamps_ns, tolerance_ns)
+    found = rows >= 0
+    worst = float(np.abs(stamps_ns[rows[found]] - pts_ns[found] - offset).max())
+    return Alignment(rows, offset, True, len(offsets) - 1, worst)
+
+
+def _best_offsets(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float) -> tuple[Int64, Int64]:
+    """Distinct shifts, smallest first, that match the most frames, and how many that is (the same for all)."""
+    if not len(stamps_ns) or not len(pts_ns):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    anchors = sorted({0, len(pts_ns) // 2, len(pts_ns) - 1})
+    candidates = np.unique(np.concatenate([stamps_ns[:MAX_CANDIDATES] - pts_ns[anchor] for anchor in anchors]))
+    candidates = candidates[np.concatenate([[True], np.diff(candidates) > tolerance_ns])]
+    sample = pts_ns[np.unique(np.linspace(0, len(pts_ns) - 1, min(SCORED_FRAMES, len(pts_ns))).astype(int))]
+    rough = np.array([np.sum(match_times(sample + c, stamps_ns, tolerance_ns) >= 0) for c in candidates])
+    candidates = candidates[rough >= rough.max() - 1]
+    scores = np.array([np.sum(match_times(pts_ns + c, stamps_ns, tolerance_ns) >= 0) for c in candidates])
+    best = scores == scores.max()
+    return candidates[best], scores[best]
+
+
+def _misfit(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float, matched: int, what: str) -> ClockError:
+    common = min(len(pts_ns), len(stamps_ns))
+    text = f"movie has {len(pts_ns)} frames, {what} {len(stamps_ns)} rows; no shift matches more than {matched} of them"
+    if common > 1:
+        difference = np.abs(stamps_ns[:common] - stamps_ns[0] - pts_ns[:common])
+        first = int(np.argmax(difference > tolerance_ns))
+        text += (
+            f"; PTS and {what} part at frame {first} by {difference[first] / 1e3:.1f} µs"
+            f" (allowed {tolerance_ns / 1e3:.1f}), at most by {difference.max() / 1e6:.3f} ms"
+        )
+    hint = "movie and stamps are of different recordings, or the movie was re-encoded"
+    return ClockError(text, hint=hint, matched=matched)
+
+
+# ── clocks ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def overlap_s(camera_ns: Int64, imu_ns: Int64, shift_ns: int = 0) -> float:
+    """Seconds that both clocks' spans share once ``shift_ns`` is added to the camera's; negative: they lie apart."""
+    start = max(int(camera_ns[0]) + shift_ns, int(imu_ns[0]))
+    return (min(int(camera_ns[-1]) + shift_ns, int(imu_ns[-1])) - start) / 1e9
+
+
+def clock_shift_ns(camera_ns: Int64, imu_ns: Int64, epochs: EdgeEpochs) -> tuple[int, str]:
+    """What to add to camera stamps to bring them to the IMU's clock, and a remark ('' if all is as it should be).
+
+    REALTIME: nothing.  UNKNOWN: the mean difference of edge_epochs.  No difference known: nothing, if the spans share
+    time.  Raises ClockError with both spans if they lie apart.
+    """
+    known = epochs.mean_difference_ns if epochs.source == "UNKNOWN" else None
+    shift, remark = known or 0, ""
+    if known is None and epochs.source == "UNKNOWN":
+        remark = "edge_epochs.txt has no row of differences; the clocks share time, so stamps are taken as they are"
+    if overlap_s(camera_ns, imu_ns, shift) >= 0:
+        return shift, remark
+    if known is not None and overlap_s(camera_ns, imu_ns) >= 0:
+        return 0, f"edge_epochs.txt asks for {shift / 1e9:.3f} s, but only unshifted stamps meet the IMU; not applied"
+    camera = f"{(int(camera_ns[0]) + shift) / 1e9:.3f}–{(int(camera_ns[-1]) + shift) / 1e9:.3f} s"
+    imu = f"{int(imu_ns[0]) / 1e9:.3f}–{int(imu_ns[-1]) / 1e9:.3f} s"
+    raise ClockError(
+        f"gyro_accel.csv covers {imu}, the frames {camera}: {-overlap_s(camera_ns, imu_ns, shift):.3f} s apart",
+        hint="the files are of different sessions, or edge_epochs.txt is missing or wrong",
+        source=epochs.source,
+    )
+
+
+# ── coverage ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def median_period_s(time_s: NDArray[np.float64]) -> float:
+    """Median step, 0 for fewer than two."""
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+
+
+def find_gaps(time_s: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+    """(start, end) of each step longer than GAP_PERIODS median steps and than GAP_FLOOR_S."""
+    steps = np.diff(time_s)
+    limit = max(GAP_PERIODS * median_period_s(time_s), GAP_FLOOR_S)
+    return tuple((float(time_s[i]), float(time_s[i + 1])) for i in np.flatnonzero(steps > limit))
+
+
+def outside_reason(
+    start_s: float, end_s: float, time_s: NDArray[np.float64], gaps_s: tuple[tuple[float, float], ...]
+) -> tuple[str, str] | None:
+    """(code, text) of why the IMU does not cover [start_s, end_s], None if it does.
+
+    One period beyond either end of the IMU still counts as covered: the last rate is held that long.
+    """
+    period = median_period_s(time_s)
+    if start_s < time_s[0] - period:
+        return "no-imu", f"begins {(time_s[0] - start_s) * 1e3:.1f} ms before the first IMU row"
+    if end_s > time_s[-1] + period:
+        return "no-imu", f"ends {(end_s - time_s[-1]) * 1e3:.1f} ms after the last IMU row"
+    for gap_start, gap_end in gaps_s:
+        if start_s < gap_end and end_s > gap_start:
+            length = (gap_end - gap_start) * 1e3
+            return "imu-gap", f"falls into the IMU gap {gap_start:.3f}–{gap_end:.3f} s ({length:.0f} ms)"
+    return None

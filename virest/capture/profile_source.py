@@ -1,0 +1,80 @@
+"""Where a capture's camera profile comes from: a file given, the folder's camera.yaml, or its own metadata."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, read_profile
+from virest.camera.shutter import Shutter
+from virest.capture.files import is_present
+from virest.capture.records import Capture
+from virest.errors import SettingsError
+
+PROFILE_NAME = "camera.yaml"
+LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+"""Stored landscape picture of an Android phone's rear camera (sensor rows horizontal) against the device axes."""
+LOGGED = "movie_metadata.csv, median"
+
+
+def default_profile(capture: Capture) -> CameraProfile:
+    """The profile that the capture's own metadata give.
+
+    Documented defaults: principal point in the middle, no distortion; portrait pictures are read right to left with
+    x_cam = diag(1, −1, −1) x_imu, landscape ones top to bottom with the Android landscape map; response and time
+    offset unknown; readout unknown unless logged.
+    """
+    portrait = capture.height > capture.width
+    profile = CameraProfile(
+        width=capture.width,
+        height=capture.height,
+        device=capture.metadata.device,
+        shutter=Shutter(0.0, "right_to_left" if portrait else "top_to_bottom"),
+        readout_known=False,
+        r_cam_imu=ANDROID_R_CAM_IMU if portrait else LANDSCAPE_R_CAM_IMU,
+        focal_length_mm=capture.metadata.focal_length_mm,
+    )
+    return fill_from_metadata(profile, capture)
+
+
+def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfile:
+    """Put logged values where the profile has none: focal length and readout time; each with its source."""
+    logged = capture.metadata
+    if profile.intrinsics is None and (fx := logged.fx_px or logged.fy_px):
+        fy = logged.fy_px or fx
+        centre = (capture.width - 1) / 2, (capture.height - 1) / 2
+        lens = Intrinsics(capture.width, capture.height, fx, fy, *centre)
+        profile = profile.with_estimate("fx_px", fx, None, LOGGED, intrinsics=lens)
+    if not profile.readout_known and logged.readout_time_s is not None:
+        shutter = replace(profile.shutter, readout_time_s=logged.readout_time_s)
+        profile = profile.with_estimate(
+            "readout_time_s", logged.readout_time_s, None, LOGGED, shutter=shutter, readout_known=True
+        )
+    return profile
+
+
+def read_any_profile(path: Path) -> CameraProfile:
+    """Read a profile file by its kind; formats other than our own are told apart here."""
+    return read_profile(path)
+
+
+def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[CameraProfile, str]:
+    """The profile to use and its source: ``config``, else camera.yaml in the folder, else the metadata.
+
+    Null focal length and readout are filled from plausible metadata.  Raises SettingsError if the profile's picture
+    size is not the movie's, or the file cannot be read.
+    """
+    path = config
+    if path is None and is_present(capture.folder / PROFILE_NAME):
+        path = capture.folder / PROFILE_NAME
+    if path is None:
+        return default_profile(capture), "the capture's metadata and documented defaults"
+    profile = read_any_profile(Path(path))
+    if (profile.width, profile.height) != (capture.width, capture.height):
+        raise SettingsError(
+            f"{Path(path).name}: image {profile.width}x{profile.height}, but {capture.name}/{capture.movie.name} is "
+            f"{capture.width}x{capture.height}",
+            hint="a profile holds for one stored size; scale its intrinsics, or pass the one of this mode",
+        )
+    return fill_from_metadata(profile, capture), str(path)

@@ -1,0 +1,101 @@
+"""The records of a capture: what `capture.folder` hands to every later stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from virest.capture.imu import ImuSamples
+
+STARTUP = "start-up"
+NO_IMU = "no-imu"
+IMU_GAP = "imu-gap"
+NO_STAMP = "no-stamp"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame of the movie and what was logged for it."""
+
+    index: int
+    """Index in the movie, from 0."""
+    timestamp_ns: int
+    """As logged; on the IMU's clock once the capture is read (clock source UNKNOWN: brought there by edge_epochs)."""
+    time_s: float
+    """The same, seconds from the capture's stamp_0 (row 0 of frame_timestamps.txt)."""
+    exposure_s: float | None = None
+    """As logged; None: unknown."""
+    iso: float | None = None
+    skip_reason: str | None = None
+    """Why the frame cannot be processed (start-up content lag, no IMU, IMU gap, no stamp); None: it can."""
+    skip_codes: tuple[str, ...] = ()
+    """The same as stable names: ``start-up``, ``no-imu``, ``imu-gap``, ``no-stamp``."""
+
+    @property
+    def only_startup(self) -> bool:
+        """Whether nothing but the start-up lag speaks against the frame: a frame for diagnosis and calibration."""
+        return self.skip_codes == (STARTUP,)
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureMetadata:
+    """What the recorder logged about the camera, medians over the frames; None: not logged or not usable."""
+
+    fx_px: float | None = None
+    """Along x of the stored picture (the logger's fx belongs to the sensor's long axis; swapped for portrait)."""
+    fy_px: float | None = None
+    readout_time_s: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
+    focal_length_mm: float | None = None
+    device: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """One thing that a reader of the capture should know."""
+
+    severity: str
+    """``info``, ``warning`` or ``error`` (the capture is unusable)."""
+    code: str
+    """A stable short name, such as ``imu-gap`` or ``content-lag``."""
+    text: str
+    """What, where, how much, what it means."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """One recording, checked and joined."""
+
+    name: str
+    """Name of its folder."""
+    folder: Path
+    movie: Path
+    width: int
+    height: int
+    frames: tuple[Frame, ...]
+    """Every frame of the movie, in order; those that cannot be used carry their reason."""
+    imu: ImuSamples
+    metadata: CaptureMetadata
+    clock_source: str
+    """``REALTIME``, ``UNKNOWN`` or ``not logged``."""
+    clock_shift_ns: int
+    """What was added to the camera's stamps to bring them to the IMU's clock."""
+    imu_gaps_s: tuple[tuple[float, float], ...] = ()
+    """(start, end) of each hole in the inertial data."""
+    keyframes: tuple[int, ...] = ()
+    """Indices of the frames that the decoder can start from."""
+    notes: tuple[Note, ...] = ()
+    counts: dict[str, int] = field(default_factory=dict)
+    """Rows and frames read, joined, and dropped, by reason."""
+    stamp_0_ns: int = 0
+    """Row 0 of frame_timestamps.txt on the IMU's clock: the zero of every time_s."""
+    repeats: tuple[int, ...] = ()
+    """Frames of the first two seconds that repeat their predecessor although the phone turned."""
+    startup_lag_s: float | None = None
+    """How much later than its stamp frame 0's picture is, at least; None: no lag seen."""
+
+    @property
+    def usable(self) -> tuple[Frame, ...]:
+        """The frames that nothing speaks against."""
+        return tuple(frame for frame in self.frames if frame.skip_reason is None)

@@ -1,0 +1,113 @@
+"""Start-up content lag: while the recorder starts, pictures are later than the stamps that they carry.
+
+Stamps queue up while the encoder starts and are then drawn with whatever picture is current; exact repeats of pictures
+use the lead up.  Two witnesses: the Unix columns (time from capture to encoder output falls to its steady value), and
+pictures that repeat although the phone turns.  A still phone repeats too, so pictures only count under motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+LOOK_S = 2.0
+"""The queue is drained by then in every capture seen."""
+REPEAT_MAX_DIFFERENCE = 0.6
+"""Grey levels; a repeat coded by H.264 differs by 0.31–0.36, a picture of a moving phone by 2 and more."""
+REPEAT_MAX_SHARE = 0.25
+"""Of the median difference among the neighbours."""
+NEIGHBOURS = 5
+MIN_MOTION_PX = 0.5
+"""Less than this between two frames by the gyroscope: pictures may be alike without being repeats."""
+MOTION_WINDOW_S = (-0.05, 0.45)
+"""Where the picture's true time may lie from its stamp."""
+STEADY_PERCENTILE = 5.0
+MIN_LAGS = 5
+SETTLED_FRAMES = 10
+"""Repeats come at most six frames apart; so many quiet frames must follow before the start-up counts as over."""
+
+
+@dataclass(frozen=True, slots=True)
+class Startup:
+    """What was seen of the start-up lag."""
+
+    frames: int = 0
+    """Leading frames whose pictures are, or may be, later than their stamps."""
+    lag_s: float | None = None
+    """Least lag of frame 0 that explains what was seen; None without a lag."""
+    repeats: tuple[int, ...] = ()
+    """Frames that repeat their predecessor."""
+    unix_lag_s: tuple[float, float] | None = None
+    """Time from capture to encoder output at the first frame, and when steady; None: no Unix columns."""
+
+
+def picture_differences(pictures: list[NDArray[np.uint8] | None]) -> NDArray[np.float64]:
+    """(n,) mean absolute difference of each picture to the one before, grey levels; NaN at the first and lost ones."""
+    differences = np.full(len(pictures), np.nan)
+    for i in range(1, len(pictures)):
+        before, here = pictures[i - 1], pictures[i]
+        if before is not None and here is not None:
+            differences[i] = cv2.absdiff(before, here).mean()
+    return differences
+
+
+def find_repeats(differences: NDArray[np.float64], motion_px: NDArray[np.float64]) -> tuple[int, ...]:
+    """Frames that repeat their predecessor although the phone turned.
+
+    differences: (n,) of :func:`picture_differences`; motion_px: (n,) expected from the gyroscope, a frame, about there.
+    """
+    found = []
+    for i in np.flatnonzero(differences < REPEAT_MAX_DIFFERENCE):
+        near = differences[max(i - NEIGHBOURS, 1) : i + NEIGHBOURS + 1]
+        usual = np.nanmedian(near)
+        if differences[i] < REPEAT_MAX_SHARE * usual and motion_px[i] > MIN_MOTION_PX:
+            found.append(int(i))
+    return tuple(found)
+
+
+def expected_motion_px(
+    frame_time_s: NDArray[np.float64],
+    imu_time_s: NDArray[np.float64],
+    gyro_rad_s: NDArray[np.float64],
+    focal_px: float,
+    period_s: float,
+) -> NDArray[np.float64]:
+    """(n,) pixels a frame that the phone's mean turning rate about each frame moves the picture's middle."""
+    speed = np.linalg.norm(gyro_rad_s[:, :2], axis=1)
+    total = np.concatenate([[0.0], np.cumsum(speed)])
+    first = np.searchsorted(imu_time_s, frame_time_s + MOTION_WINDOW_S[0])
+    last = np.searchsorted(imu_time_s, frame_time_s + MOTION_WINDOW_S[1])
+    mean = (total[last] - total[first]) / np.maximum(last - first, 1)
+    return mean * focal_px * period_s
+
+
+def judge_startup(
+    unix_lag_s: NDArray[np.float64] | None, repeats: tuple[int, ...], frame_count: int, period_s: float
+) -> Startup:
+    """Put both witnesses together.
+
+    unix_lag_s: (n,) encoder output − capture result of each frame, NaN where unknown; None without Unix columns.
+    """
+    first, steady, late = _unix_witness(unix_lag_s, period_s)
+    frames = max(late, repeats[-1] + 1 if repeats else 0)
+    if frames and frame_count - frames < SETTLED_FRAMES:
+        frames = frame_count
+    shown = None if first is None or steady is None else (first, steady)
+    if not frames:
+        return Startup(unix_lag_s=shown)
+    fallen = first - steady if first is not None and steady is not None and late else 0.0
+    return Startup(frames, max(fallen, len(repeats) * period_s), repeats, shown)
+
+
+def _unix_witness(lag_s: NDArray[np.float64] | None, period_s: float) -> tuple[float | None, float | None, int]:
+    """(lag of the first frame, steady lag, number of leading frames above the steady lag by more than a period)."""
+    if lag_s is None or np.isfinite(lag_s).sum() < MIN_LAGS:
+        return None, None, 0
+    finite = lag_s[np.isfinite(lag_s)]
+    steady = float(np.percentile(finite, STEADY_PERCENTILE))
+    # not <=: a frame without metadata (NaN) does not end the run
+    settled = np.flatnonzero(lag_s <= steady + period_s)
+    return float(finite[0]), steady, int(settled[0]) if len(settled) else len(lag_s)

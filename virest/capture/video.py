@@ -1,0 +1,363 @@
+"""The movie: where its frames lie, and their pixels.
+
+A frame is known by its presentation time (PTS), never by counting.  Pictures come as stored: the display rotation is
+left alone, so that the profile's intrinsics hold.
+
+Colour (contract, section 3): luma and chroma become RGB by the stream's own matrix and range, rounded; an untagged
+stream is BT.601, limited range, at any size.  Chroma is taken as lying in the middle of its 2 × 2 pixels, where
+software encoders put it whatever they tag; at the price of half a pixel of chroma where an encoder means the left.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.capture.files import label, require_regular_file
+from virest.errors import VideoError
+
+log = logging.getLogger(__name__)
+
+MAX_SIDE_PX = 16384
+MAX_FRAMES = 2_000_000
+CONTAINER = "mov"
+"""MP4, QuickTime and 3GP. Named, so that no playlist in a movie's clothes makes the reader open other files."""
+KR_KB = {
+    1: (0.2126, 0.0722),  # BT.709
+    4: (0.30, 0.11),  # FCC
+    5: (0.299, 0.114),  # BT.601, 625 lines
+    6: (0.299, 0.114),  # BT.601, 525 lines
+    7: (0.212, 0.087),  # SMPTE 240M
+    9: (0.2627, 0.0593),  # BT.2020
+    10: (0.2627, 0.0593),
+}
+"""Weights of red and blue in luma, by the number that H.264 gives the matrix."""
+BT601 = 6
+FULL_RANGE = 2
+PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
+FIXED_POINT = 64
+"""Steps of a grey level in the 16-bit sums: luma and chroma together stay below 2^15."""
+
+
+@dataclass(frozen=True, slots=True)
+class MovieIndex:
+    """Where the frames of a movie lie, in presentation order."""
+
+    width: int
+    """Pixels of a stored row."""
+    height: int
+    time_base: Fraction
+    """Seconds of one tick."""
+    pts_ticks: NDArray[np.int64]
+    """(n,) strictly rising."""
+    keyframes: tuple[int, ...]
+    """Frame indices that the decoder can start from."""
+    keyframe_dts_ticks: tuple[int, ...]
+    """Decoding time of each of them, for seeking."""
+    codec: str = ""
+    declared_frames: int = 0
+    """What the container's table promises; more than ``len``: the file was cut. 0: not said."""
+    repeated_pts: int = 0
+    """Access units left out since another one has their time."""
+
+    def __len__(self) -> int:
+        return len(self.pts_ticks)
+
+    @property
+    def pts_s(self) -> NDArray[np.float64]:
+        """(n,) presentation times, seconds from the first frame; exact to 2^-53 of the value."""
+        ticks = self.pts_ticks - self.pts_ticks[0]
+        return ticks * self.time_base.numerator / self.time_base.denominator
+
+    @property
+    def pts_ns(self) -> NDArray[np.int64]:
+        """(n,) presentation times, whole nanoseconds from the first frame, rounded."""
+        return np.rint(self.pts_s * 1e9).astype(np.int64)
+
+    def keyframe_before(self, frame: int) -> int:
+        """Position in ``keyframes`` of the last one at or before ``frame``; 0 if there is none."""
+        return max(int(np.searchsorted(self.keyframes, frame, side="right")) - 1, 0)
+
+
+def probe_movie(path: Path) -> MovieIndex:
+    """Index the movie by its packets, without decoding.
+
+    Raises VideoError for a missing, cut or foreign file, no video stream, and absurd sizes.
+    """
+    size = require_regular_file(path, VideoError, "a capture needs its movie.mp4")
+    if size == 0:
+        raise VideoError(f"{label(path)}: is empty", hint="the recording was not stopped cleanly, or the copy failed")
+    try:
+        with _open(path) as container:
+            stream = _video_stream(container, path)
+            width, height = stream.codec_context.width, stream.codec_context.height
+            _check_size(width, height, path)
+            return _index(container, stream, width, height, path)
+    except (av.FFmpegError, UnicodeError, ValueError) as fault:
+        raise VideoError(
+            f"{label(path)}: cannot be opened as a movie ({_reason(fault)}, {size} bytes)",
+            hint="it has no index (moov) if the recorder was not stopped cleanly; stop it, then copy again",
+        ) from None
+
+
+def read_frames(path: Path, index: MovieIndex, first: int, last: int) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Stream frames ``first`` to ``last`` (both included, ends clipped) as (frame index, RGB (h, w, 3) or None).
+
+    None: the frame, or one that it depends on, cannot be decoded; later ones still come.  One is in memory at a time.
+    """
+    yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb)
+
+
+def read_gray(path: Path, index: MovieIndex, frames: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Stream the luma of ``frames`` (rising order) as (frame index, (h, w) or None), 0 black and 255 white."""
+    yield from _read(path, index, frames, to_gray)
+
+
+# ── the container ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _reason(fault: Exception) -> str:
+    return (getattr(fault, "strerror", None) or str(fault)).lower()
+
+
+def _open(path: Path) -> Any:
+    # An absolute path cannot be taken for a protocol ("http:...").
+    return av.open(str(path.absolute()), format=CONTAINER, metadata_errors="replace")
+
+
+def _video_stream(container: Any, path: Path) -> Any:
+    if not container.streams.video:
+        raise VideoError(f"{label(path)}: has no video stream", hint="is it the movie of this capture?")
+    stream = container.streams.video[0]
+    if stream.codec_context is None:
+        raise VideoError(f"{label(path)}: its video codec is not known", hint="convert it to H.264, time stamps kept")
+    return stream
+
+
+def _check_size(width: int, height: int, path: Path) -> None:
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
+        text = f"{label(path)}: picture size {width}x{height}, at most {MAX_SIDE_PX} px a side"
+        raise VideoError(text, hint="is it damaged?")
+
+
+def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> MovieIndex:
+    rows: list[tuple[int, int, bool]] = []
+    try:
+        for packet in container.demux(stream):
+            pts = packet.pts if packet.pts is not None else packet.dts
+            if pts is None or packet.is_discard or packet.size == 0:
+                continue
+            rows.append((pts, packet.dts if packet.dts is not None else pts, packet.is_keyframe))
+            if len(rows) > MAX_FRAMES:
+                raise VideoError(f"{label(path)}: more than {MAX_FRAMES} frames", hint="cut the movie")
+    except av.FFmpegError as fault:
+        log.warning("%s: reading stopped after %d frames: %s", label(path), len(rows), _reason(fault))
+    if not rows:
+        raise VideoError(f"{label(path)}: has no frames", hint="the recording was not stopped cleanly or the copy cut")
+    table = np.array(rows, np.int64)
+    order = np.argsort(table[:, 0], kind="stable")
+    table = table[order]
+    fresh = np.concatenate([[True], np.diff(table[:, 0]) > 0])
+    kept = table[fresh]
+    keys = np.flatnonzero(kept[:, 2])
+    return MovieIndex(
+        width,
+        height,
+        Fraction(stream.time_base),
+        kept[:, 0].copy(),
+        tuple(keys.tolist()),
+        tuple(kept[keys, 1].tolist()),
+        stream.codec_context.name,
+        int(stream.frames or 0),
+        int(len(table) - len(kept)),
+    )
+
+
+# ── decoding ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _read(
+    path: Path, index: MovieIndex, frames: Iterable[int], convert: Callable[[Any], NDArray[np.uint8]]
+) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    require_regular_file(path, VideoError, "a capture needs its movie.mp4")
+    for run in _runs(index, frames):
+        try:
+            with _open(path) as container:
+                stream = _video_stream(container, path)
+                stream.thread_type = "NONE"
+                stream.codec_context.thread_count = 1
+                for frame_index, frame in _in_order(run, _decoded(container, stream, index, run[0])):
+                    usable = frame is not None and (frame.width, frame.height) == (index.width, index.height)
+                    yield frame_index, convert(frame) if usable else None
+        except (av.FFmpegError, UnicodeError) as fault:
+            raise VideoError(f"{label(path)}: cannot be read ({_reason(fault)})", hint="copy the movie again") from None
+
+
+def _runs(index: MovieIndex, frames: Iterable[int]) -> Iterator[range | list[int]]:
+    """Split wanted frames where seeking to the next key frame saves decoding."""
+    if isinstance(frames, range) and frames.step == 1:
+        if len(frames):
+            yield frames
+        return
+    run: list[int] = []
+    for frame in sorted({f for f in frames if 0 <= f < len(index)}):
+        if run and index.keyframes and index.keyframes[index.keyframe_before(frame)] > run[-1] + 1:
+            yield run
+            run = []
+        run.append(frame)
+    if run:
+        yield run
+
+
+def _in_order(wanted: range | list[int], decoded: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
+    """Pick the wanted frames out of those decoded; None where one never came."""
+    position = 0
+    for frame_index, frame in decoded:
+        while position < len(wanted) and wanted[position] < frame_index:
+            yield wanted[position], None
+            position += 1
+        if position == len(wanted):
+            return
+        if wanted[position] == frame_index:
+            yield frame_index, frame
+            position += 1
+            if position == len(wanted):
+                return
+    for missing in wanted[position:]:
+        yield missing, None
+
+
+def _decoded(container: Any, stream: Any, index: MovieIndex, first: int) -> Iterator[tuple[int, Any]]:
+    """(frame index, frame or None) in presentation order, from the key frame at or before ``first``."""
+    if index.keyframes and first > 0:
+        container.seek(index.keyframe_dts_ticks[index.keyframe_before(first)], stream=stream, backward=True)
+    lookup = {int(ticks): number for number, ticks in enumerate(index.pts_ticks)}
+    broken_since: int | None = None
+    for packet in _packets(container, stream):
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            frames = []
+            if packet.pts is not None:
+                broken_since = packet.pts if broken_since is None else min(broken_since, packet.pts)
+        for frame in frames:
+            if frame.pts is None or int(frame.pts) not in lookup:
+                continue
+            if frame.is_corrupt:
+                broken_since = frame.pts if broken_since is None else broken_since
+            elif frame.key_frame and broken_since is not None and frame.pts > broken_since:
+                broken_since = None
+            # What follows a lost picture is predicted from it: wrong, up to the next key frame.
+            lost = broken_since is not None and frame.pts >= broken_since
+            yield lookup[int(frame.pts)], None if lost else frame
+
+
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    """Packets up to the end of what can be read, then the flushing one."""
+    try:
+        yield from container.demux(stream)
+    except av.FFmpegError as fault:
+        log.warning("the movie's data end early: %s", _reason(fault))
+        yield av.Packet(0)
+
+
+# ── pixels ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class _ColourTables:
+    """Contribution of each 8-bit luma and chroma value to each of red, green and blue, in 1/FIXED_POINT levels."""
+
+    luma: NDArray[np.int16]
+    red_v: NDArray[np.int16]
+    green_u: NDArray[np.int16]
+    green_v: NDArray[np.int16]
+    blue_u: NDArray[np.int16]
+    gray: NDArray[np.uint8]
+    """Luma as full-range grey."""
+
+
+@lru_cache(maxsize=16)
+def _tables(matrix: int, full_range: bool) -> _ColourTables:
+    kr, kb = KR_KB[matrix]
+    kg = 1.0 - kr - kb
+    code = np.arange(256.0)
+    luma = code if full_range else (code - 16) * (255 / 219)
+    chroma = (code - 128) * (1.0 if full_range else 255 / 224)
+
+    def fixed(values: NDArray[np.float64]) -> NDArray[np.int16]:
+        return np.rint(values * FIXED_POINT).astype(np.int16)
+
+    return _ColourTables(
+        fixed(luma),
+        fixed(2 * (1 - kr) * chroma),
+        fixed(-2 * kb * (1 - kb) / kg * chroma),
+        fixed(-2 * kr * (1 - kr) / kg * chroma),
+        fixed(2 * (1 - kb) * chroma),
+        np.clip(np.rint(luma), 0, 255).astype(np.uint8),
+    )
+
+
+def _frame_tables(frame: Any) -> _ColourTables:
+    matrix = int(frame.colorspace)
+    full = int(frame.color_range) == FULL_RANGE or frame.format.name.startswith("yuvj")
+    return _tables(matrix if matrix in KR_KB else BT601, full)
+
+
+def _planes(frame: Any) -> list[NDArray[np.uint8]]:
+    """Views of the planes, padding cut off."""
+    return [
+        np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
+        for plane in frame.planes[:3]
+    ]
+
+
+def to_rgb(frame: Any) -> NDArray[np.uint8]:
+    """RGB (h, w, 3) of a decoded PyAV frame, rounded; its size, matrix and range as the stream says."""
+    if frame.format.is_rgb:
+        return frame.to_ndarray(format="rgb24")
+    if frame.format.name not in PLANAR_8BIT:
+        frame = frame.reformat(format="yuv444p")
+    tables = _frame_tables(frame)
+    y_code, u_code, v_code = _planes(frame)
+    luma = cv2.LUT(y_code, tables.luma)
+    green = cv2.add(cv2.LUT(u_code, tables.green_u), cv2.LUT(v_code, tables.green_v))
+    channels = [
+        _levels(cv2.add(luma, _upsample(chroma, luma.shape)))
+        for chroma in (cv2.LUT(v_code, tables.red_v), green, cv2.LUT(u_code, tables.blue_u))
+    ]
+    return np.asarray(cv2.merge(channels), np.uint8)
+
+
+def _levels(fixed: NDArray[Any]) -> NDArray[Any]:
+    """Fixed-point sums to 8 bit, rounded, both ends clipped (three cheap passes, four times faster than one in float)."""
+    return cv2.convertScaleAbs(cv2.max(fixed, 0), alpha=1 / FIXED_POINT)
+
+
+def _upsample(chroma: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Chroma at the luma's size, bilinear between centred samples; an odd side is cut after doubling."""
+    height, width = shape[:2]
+    if chroma.shape[:2] == (height, width):
+        return chroma
+    factor_x, factor_y = -(-width // chroma.shape[1]), -(-height // chroma.shape[0])
+    size = (chroma.shape[1] * factor_x, chroma.shape[0] * factor_y)
+    return np.ascontiguousarray(cv2.resize(chroma, size, interpolation=cv2.INTER_LINEAR)[:height, :width])
+
+
+def to_gray(frame: Any) -> NDArray[np.uint8]:
+    """Luma (h, w) of a decoded PyAV frame, scaled to the full range."""
+    if frame.format.is_rgb:
+        return cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
+    if frame.format.name not in PLANAR_8BIT:
+        frame = frame.reformat(format="yuv444p")
+    return np.asarray(cv2.LUT(_planes(frame)[0], _frame_tables(frame).gray), np.uint8)

@@ -1,0 +1,101 @@
+"""Where points go: the one map p(t) ~ K (R_t_ref K⁻¹ p_ref + t_t_ref / Z) (forward_model, section 5; eqs 23-28).
+
+Rolling shutter, blur paths and the log's corner points are this map between different times.  Points are undistorted
+before it and distorted after it.  Depth is along the optical axis, in metres; its inverse 0 means rotation only.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.intrinsics import Intrinsics
+from virest.degradation.row_motion import RowMotion
+
+Array = NDArray[np.float64]
+FIXED_POINT_STEPS = 6
+"""Row times depend on where a point lands; each step shrinks the error by image speed x readout / height, about 0.03."""
+
+
+def move_points(
+    lens: Intrinsics, points_px: Array, rotation: Array, translation_m: Array | None, inverse_depth: Any = 0.0
+) -> Array:
+    """Pixels (..., 2) after the camera's change of pose (eqs 25, 28): rotation (..., 3, 3), translation (..., 3)."""
+    moved = np.squeeze(rotation @ lens.rays(points_px)[..., None], -1)
+    if translation_m is not None:
+        moved = moved + translation_m * np.asarray(inverse_depth)[..., None]
+    return lens.project(moved)
+
+
+def moved_between(motion: RowMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = 0.0) -> Array:
+    """Where points seen at pixels (..., 2) at one time are seen at another."""
+    rotation, translation = motion.relative_pose(from_s, to_s)
+    return move_points(_lens(motion), points_px, rotation, translation, inverse_depth)
+
+
+def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = 0.0) -> Array:
+    """p_g of eq 28: where points of the recorded picture, (..., 2), belong at the reference time.
+
+    anchor: the part of its exposure at which each row is taken to be seen; 0 its start (the paper), 0.5 its middle.
+    """
+    seen_s = motion.row_start_s(points_px) + anchor * motion.exposure_s
+    return moved_between(motion, points_px, seen_s, motion.reference_s, inverse_depth)
+
+
+def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = 0.0) -> Array:
+    """The inverse of :func:`straightened_points`: where points of the picture at the reference time were recorded."""
+    return seen_by_rows(motion, points_px, motion.reference_s, anchor, inverse_depth)
+
+
+def seen_by_rows(motion: RowMotion, points_px: Array, at_s: Any, anchor: float, inverse_depth: Any = 0.0) -> Array:
+    """Where points seen at pixels (..., 2) at time ``at_s`` lie in the picture whose rows are each seen at their anchor.
+
+    A fixed point, since the row that sees a point depends on where it sees it.
+    """
+    seen = points_px
+    for _ in range(FIXED_POINT_STEPS if motion.readout_time_s else 1):
+        row_s = motion.row_start_s(seen) + anchor * motion.exposure_s
+        seen = moved_between(motion, points_px, at_s, row_s, inverse_depth)
+    return seen
+
+
+def corner_points(width: int, height: int) -> Array:
+    """P1..P4 of the paper, as pixel centres: top left, top right, bottom right, bottom left, (4, 2)."""
+    return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
+
+
+def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = 0.0) -> NDArray[np.float32]:
+    """:func:`recorded_points` of every pixel, (height, width, 2) as cv2.remap takes it.
+
+    Computed on a grid and filled in by straight lines; the map is smooth, so this is off by less than 0.01 px.
+    """
+    width, height = motion.profile.width, motion.profile.height
+    x, y = _grid(width, spacing_px), _grid(height, spacing_px)
+    nodes = np.stack(np.meshgrid(x, y), -1)
+    source = recorded_points(motion, nodes, anchor, inverse_depth).astype(np.float32)
+    rows, columns = _line_weights(y, height), _line_weights(x, width)
+    return np.stack([rows @ source[..., k] @ columns.T for k in (0, 1)], -1)
+
+
+def _grid(length: int, spacing: int) -> Array:
+    return np.linspace(0, length - 1, max(2, round((length - 1) / spacing) + 1))
+
+
+def _line_weights(nodes: Array, length: int) -> NDArray[np.float32]:
+    """(length, n) weights of straight-line interpolation from nodes to 0, 1, ..., length − 1."""
+    position = np.arange(length) / (nodes[1] - nodes[0])
+    index = np.minimum(position.astype(int), len(nodes) - 2)
+    part = position - index
+    weights = np.zeros((length, len(nodes)), np.float32)
+    weights[np.arange(length), index] = 1 - part
+    weights[np.arange(length), index + 1] = part
+    return weights
+
+
+def _lens(motion: RowMotion) -> Intrinsics:
+    lens = motion.profile.intrinsics
+    if lens is None:
+        raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
+    return lens

@@ -1,0 +1,165 @@
+"""Points followed from one frame to the next (pyramidal Lucas & Kanade 1981; Bouguet 2001), checked forwards and backwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+CORNER_BLOCK_PX = 5
+CORNER_SPACING_PX = 7
+"""A corner is the strongest of a square of this side."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingSettings:
+    """How points are picked and followed. Lengths are pixels of the picture after halving."""
+
+    halve_above_px: int = 800
+    """Pictures with a longer side are halved first, again and again."""
+    grid: tuple[int, int] = (8, 8)
+    """(columns, rows) of cells over the picture; each gives its best corners."""
+    points_per_cell: int = 4
+    window_px: int = 21
+    pyramid_levels: int = 4
+    """Levels above the picture itself: 4 with this window follow some 70 px."""
+    max_forward_backward_px: float = 0.3
+    """A point that does not come back to within this is dropped."""
+    min_corner_levels: float = 1.5
+    """Least gradient of a corner, grey levels a pixel along the weaker axis; noise of 2 levels makes about 1."""
+    border_px: int = 6
+    """Points nearer to the picture's edge than this are dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackPair:
+    """Points seen in two consecutive frames; (0, 0) is the centre of the top-left pixel of the stored picture."""
+
+    first: int
+    """Movie index of the first frame."""
+    second: int
+    points_first_px: Array
+    """(n, 2)."""
+    points_second_px: Array
+    """(n, 2), the same points."""
+    forward_backward_px: Array | None = None
+    """(n,) distance between a point and where tracking back puts it."""
+
+    def __len__(self) -> int:
+        return len(self.points_first_px)
+
+
+def track_pairs(
+    pictures: Iterable[tuple[int, NDArray[np.uint8] | None]],
+    settings: TrackingSettings | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[TrackPair]:
+    """Follow points between each two consecutive frames of a stream of (movie index, grey (h, w) or None).
+
+    Fresh corners are picked in every first frame, so pairs are independent of each other.  None and jumps in the index
+    begin anew.  A picture identical to the one before it shows another time than its stamp: it gives no pair, neither
+    backwards nor forwards.  Two pictures are in memory at a time.  progress is called with each index.
+    """
+    settings = settings or TrackingSettings()
+    pairs: list[TrackPair] = []
+    before: tuple[int, NDArray[np.uint8]] | None = None
+    newest: NDArray[np.uint8] | None = None
+    for index, picture in pictures:
+        repeated = picture is not None and newest is not None and np.array_equal(picture, newest)
+        newest = picture
+        if progress is not None:
+            progress(index)
+        if picture is None or repeated:
+            before = None
+            continue
+        small, factor = _halved(picture, settings.halve_above_px)
+        if before is not None and before[0] == index - 1 and before[1].shape == small.shape:
+            pair = _track(before[1], small, factor, before[0], settings)
+            if len(pair):
+                pairs.append(pair)
+        before = (index, small)
+    return pairs
+
+
+def find_corners(picture: NDArray[np.uint8], settings: TrackingSettings) -> NDArray[np.float32]:
+    """Corners (n, 2) of a grey picture, strongest first, at most ``points_per_cell`` from each cell of the grid.
+
+    Strength is the smaller eigenvalue of the structure tensor (Shi & Tomasi 1994).
+    """
+    strength = cv2.cornerMinEigenVal(picture, CORNER_BLOCK_PX, ksize=3)
+    # OpenCV's scaling of 8-bit pictures makes this 4 x (mean squared gradient) / 255².
+    least = 4 * (settings.min_corner_levels / 255.0) ** 2
+    peak = cv2.dilate(strength, np.ones((CORNER_SPACING_PX, CORNER_SPACING_PX), np.uint8))
+    candidate = (strength >= peak) & (strength > least)
+    edge = settings.border_px
+    candidate[:edge], candidate[-edge:], candidate[:, :edge], candidate[:, -edge:] = False, False, False, False
+    y, x = np.nonzero(candidate)
+    order = np.argsort(-strength[y, x], kind="stable")
+    y, x = y[order], x[order]
+    height, width = picture.shape
+    columns, rows = settings.grid
+    cell = (y * rows // height) * columns + x * columns // width
+    kept = _rank_within(cell) < settings.points_per_cell
+    return np.stack([x[kept], y[kept]], axis=-1).astype(np.float32)
+
+
+def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
+    """How many earlier entries have the same group."""
+    order = np.argsort(group, kind="stable")
+    ordered = group[order]
+    start = np.searchsorted(ordered, ordered, side="left")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(group)) - start
+    return rank
+
+
+def _halved(picture: NDArray[np.uint8], limit_px: int) -> tuple[NDArray[np.uint8], int]:
+    """The picture halved until it fits, by means of 2 x 2 pixels, and the factor."""
+    factor = 1
+    while max(picture.shape) > limit_px and min(picture.shape) >= 64:
+        even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+        picture = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        factor *= 2
+    return picture, factor
+
+
+def _track(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], factor: int, index: int, settings: TrackingSettings
+) -> TrackPair:
+    start = find_corners(first, settings)
+    if len(start) == 0:
+        return TrackPair(index, index + 1, np.zeros((0, 2)), np.zeros((0, 2)))
+    ahead, found = _follow(first, second, start, settings)
+    back, returned = _follow(second, first, ahead, settings)
+    distance = np.linalg.norm(back - start, axis=-1)
+    height, width = second.shape
+    edge = settings.border_px
+    inside = (ahead >= edge).all(axis=-1) & (ahead[:, 0] < width - edge) & (ahead[:, 1] < height - edge)
+    good = found & returned & inside & (distance < settings.max_forward_backward_px)
+    return TrackPair(
+        index, index + 1, _stored(start[good], factor), _stored(ahead[good], factor), distance[good] * float(factor)
+    )
+
+
+def _follow(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], points: NDArray[np.float32], settings: TrackingSettings
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        points[:, None],
+        None,
+        winSize=(settings.window_px, settings.window_px),
+        maxLevel=settings.pyramid_levels,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005),
+    )
+    return moved[:, 0], status.ravel() == 1
+
+
+def _stored(points: NDArray[np.float32], factor: int) -> Array:
+    """Pixels of the stored picture: the mean of factor x factor pixels lies at their common centre."""
+    return points.astype(float) * factor + (factor - 1) / 2

@@ -1,0 +1,144 @@
+"""Deconvolution solvers.  They take callables, so that any linear operator will do.
+
+Data model: ``observed = apply(sharp) + noise``, with a weight per observed pixel: 0 where it is censored or outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+Image = NDArray[np.float32]
+Operator = Callable[[Image], Image]
+ALPHA = 2.0 / 3.0
+"""Exponent of the gradients' hyper-Laplacian (Krishnan & Fergus 2009)."""
+_TABLE_SIZE = 2048
+_TABLE_END = 8.0
+
+
+def richardson_lucy(
+    observed: Image, apply: Operator, adjoint: Operator, start: Image, weight: Image, iterations: int
+) -> Image:
+    """Multiplicative updates for Poisson noise (Richardson 1972, Lucy 1974), with weights (Whyte et al. 2014).
+
+    f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.
+    """
+    sharp = np.maximum(start, 1e-4)
+    seen = np.maximum(adjoint(weight), 1e-3)
+    for _ in range(iterations):
+        ratio = weight * observed / np.maximum(apply(sharp), 1e-4)
+        sharp = np.maximum(sharp * (adjoint(ratio) + np.maximum(1e-3 - seen, 0)) / seen, 1e-5)
+    return sharp
+
+
+def shrinkage_table(beta: float, exponent: float = ALPHA) -> Image:
+    """argmin over w of |w|^exponent + β/2 (w − v)², tabulated over |v| in [0, _TABLE_END), as the factor w / v.
+
+    Krishnan & Fergus 2009 (NIPS): the minimum is 0 or the outer root; the root is found by Newton's steps.
+    """
+    v = (np.arange(_TABLE_SIZE) + 0.5) * (_TABLE_END / _TABLE_SIZE)
+    w = v.copy()
+    for _ in range(20):
+        slope = exponent * np.maximum(w, 1e-9) ** (exponent - 1) + beta * (w - v)
+        curvature = exponent * (exponent - 1) * np.maximum(w, 1e-9) ** (exponent - 2) + beta
+        w = np.clip(w - slope / np.where(curvature > 1e-6, curvature, np.inf), 1e-6, v)
+    better = w**exponent + beta / 2 * (w - v) ** 2 < beta / 2 * v**2
+    return np.where(better, w / v, 0.0).astype(np.float32)
+
+
+def shrink(gradient: Image, table: Image) -> Image:
+    """Apply a table of :func:`shrinkage_table` to signed values."""
+    index = np.minimum(np.abs(gradient) * np.float32(_TABLE_SIZE / _TABLE_END), _TABLE_SIZE - 1).astype(np.int32)
+    return gradient * np.take(table, index)
+
+
+def difference(picture: Image, axis: int) -> Image:
+    """Forward difference along an axis, 0 in the last place."""
+    result = np.zeros_like(picture)
+    if axis == 0:
+        np.subtract(picture[1:], picture[:-1], out=result[:-1])
+    else:
+        np.subtract(picture[:, 1:], picture[:, :-1], out=result[:, :-1])
+    return result
+
+
+def difference_adjoint(gradient: Image, axis: int) -> Image:
+    """The transpose of :func:`difference`."""
+    result = np.zeros_like(gradient)
+    if axis == 0:
+        np.negative(gradient[:-1], out=result[:-1])
+        result[1:] += gradient[:-1]
+    else:
+        np.negative(gradient[:, :-1], out=result[:, :-1])
+        result[:, 1:] += gradient[:, :-1]
+    return result
+
+
+def conjugate_gradients(normal: Operator, right: Image, start: Image, precondition: Image, iterations: int) -> Image:
+    """Solve normal(x) = right for a symmetric positive operator; ``precondition`` is an approximate inverse diagonal."""
+    x = start.copy()
+    residual = right - normal(x)
+    direction = precondition * residual
+    energy = float(np.vdot(residual, direction))
+    conjugate = direction
+    for _ in range(iterations):
+        if energy <= 0:
+            break
+        product = normal(conjugate)
+        step = energy / max(float(np.vdot(conjugate, product)), 1e-20)
+        x += np.float32(step) * conjugate
+        residual -= np.float32(step) * product
+        direction = precondition * residual
+        before, energy = energy, float(np.vdot(residual, direction))
+        conjugate = direction + np.float32(energy / before) * conjugate
+    return x
+
+
+def hyper_laplacian(
+    observed: Image,
+    apply: Operator,
+    adjoint: Operator,
+    start: Image,
+    weight: Image,
+    slope: Image,
+    data_weight: float,
+    gradient_unit: float,
+    betas: tuple[float, ...],
+    inner: int,
+    ceiling: Image | None = None,
+) -> Image:
+    """min over f of data_weight/2 Σ weight² (A f − g)² + Σ |s ∇f / u|^⅔, by half-quadratic splitting.
+
+    Krishnan & Fergus 2009, over any operator A and with weights.  observed, weight: shape of A f; start, slope
+    s: shape of f.  s is the curve's slope (grey levels per light), so that gradients and noise count as they are
+    seen; u = gradient_unit is the grey level that a gradient of 1 stands for.  betas: rising penalties; inner:
+    conjugate-gradient steps for each.  ceiling: True-like (1.0) where the observation is only a lower bound (clipped
+    at the top): there A f may exceed it freely and is pulled up where it stays below.
+    """
+    unit_slope = slope / np.float32(gradient_unit)
+    squared = unit_slope * unit_slope
+    sharp = start
+    for beta in betas:
+        table = shrinkage_table(beta)
+        active = weight
+        if ceiling is not None:
+            active = np.where(ceiling > 0, weight * (apply(sharp) < observed), weight)
+        data = np.float32(data_weight / beta) * active * active
+        right = adjoint(data * observed)
+        for axis in (0, 1):
+            target = shrink(unit_slope * difference(sharp, axis), table)
+            right += difference_adjoint(unit_slope * target, axis)
+
+        def normal(x: Image, data: Image = data) -> Image:
+            result = adjoint(data * apply(x))
+            for axis in (0, 1):
+                result += difference_adjoint(squared * difference(x, axis), axis)
+            return result
+
+        typical = float(np.median(active)) ** 2 / max(float(np.median(slope)) ** 2, 1e-12)
+        precondition = 1.0 / (slope * slope * np.float32(data_weight / beta * typical) + 4 * squared)
+        sharp = conjugate_gradients(normal, right, sharp, precondition, inner)
+    return sharp

@@ -1,0 +1,238 @@
+"""One frame: recorded picture in, restored picture and everything that was assumed out."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.capture.folder import Frame
+from virest.degradation.blur import tile_grid
+from virest.degradation.kernels import angle_and_length, blur_chords, kernel_field
+from virest.degradation.row_motion import RowMotion
+from virest.degradation.warp import corner_points, straightened_points
+from virest.motion.trajectory import Trajectory, quaternion_wxyz
+from virest.restoration.deblur import blurred_picture, deblur
+from virest.restoration.settings import RestorationSettings
+from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
+from virest.restoration.statistics import measure_picture
+
+LOG_TILE_PX = 128
+"""Spacing of the tiles in the log."""
+MIN_WARP_PX = 0.05
+"""Straightening that moves no point further than this is left out."""
+_ENCODE_STEPS = 8192
+
+
+@dataclass(frozen=True, slots=True)
+class RestoredFrame:
+    """What became of one frame."""
+
+    frame: Frame
+    status: str
+    """``restored``, ``copied``, ``skipped`` or ``failed``."""
+    picture: NDArray[np.uint8] | None
+    """(height, width, 3) RGB; None where there is no output."""
+    warnings: tuple[str, ...] = ()
+    valid_px: tuple[int, int, int, int] = (0, 0, 0, 0)
+    """x0, y0, x1, y1, the last two one past the end: the rectangle of real data."""
+    exposure_s: float | None = None
+    """True exposure: logged × scale."""
+    parameters: dict[str, Any] = field(default_factory=dict)
+    """motion, depth_m, depth_source, blur, shutter, response, deblur: the log's line."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time spent: estimate, deblur, shutter."""
+
+
+def restore_frame(
+    frame: Frame, picture: NDArray[np.uint8], motion: RowMotion, trajectory: Trajectory, settings: RestorationSettings
+) -> RestoredFrame:
+    """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
+
+    picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.
+    """
+    clock = _Clock()
+    profile = motion.profile
+    curve = profile.response or ResponseCurve("srgb")
+    parameters = degradation_parameters(motion, trajectory, settings)
+    longest_px = max(tile["length_px"] for tile in parameters["blur"]["tiles"])
+    straighten, displacement_px = _straightening(motion, settings)
+    method, why_not = _deblur_method(motion, settings, longest_px)
+    anchor = 0.5 if straighten or settings.reference == "frame-middle" or method == "none" else 0.0
+    clock.lap("estimate")
+    restored = picture
+    details: dict[str, Any] = {"method": method}
+    if method != "none":
+        restored, details = _deblurred(picture, motion, curve, settings, anchor, parameters["blur"]["angle_rad"], longest_px)
+    clock.lap("deblur")
+    source = None
+    if straighten:
+        source = (perspective_map if settings.shutter == "perspective" else rowwise_map)(motion, anchor)
+        if method == "none" and displacement_px < MIN_WARP_PX and np.abs(source - _identity(source)).max() < MIN_WARP_PX:
+            source = None
+    if source is not None:
+        restored = warp(restored, source)
+    clock.lap("shutter")
+    height, width = picture.shape[:2]
+    parameters["deblur"] = details
+    parameters["shutter"]["method"] = settings.shutter if source is not None else "none"
+    changed = method != "none" or source is not None
+    return RestoredFrame(
+        frame,
+        "restored" if changed else "copied",
+        restored,
+        why_not if not changed else tuple(w for w in why_not if "known" in w),
+        valid_rectangle(source) if source is not None else (0, 0, width, height),
+        motion.exposure_s or None,
+        parameters,
+        clock.seconds,
+    )
+
+
+def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: RestorationSettings) -> dict[str, Any]:
+    """The log's account of one frame: motion (eqs 4-10), blur (eqs 12-18), shutter (eq 28)."""
+    profile = motion.profile
+    width, height = profile.width, profile.height
+    centre = np.array([[(width - 1) / 2, (height - 1) / 2]])
+    row_start_s = float(motion.row_start_s(centre)[0])
+    r_end_start, _ = motion.relative_pose(row_start_s, row_start_s + motion.exposure_s)
+    grid = tile_grid(height, width, LOG_TILE_PX, LOG_TILE_PX // 4)
+    points = np.concatenate([centre, grid.centres_px])
+    angle, length = angle_and_length(blur_chords(motion, points))
+    corners = straightened_points(motion, corner_points(width, height))
+    return {
+        "motion": {
+            "delta_position_m": None,
+            "delta_q_wxyz": quaternion_wxyz(r_end_start.T).tolist(),
+            "rate_rad_s": trajectory.rate_rad_s(row_start_s + motion.exposure_s / 2).tolist(),
+            "velocity_m_s": None,
+        },
+        "depth_m": None,
+        "depth_source": "none",
+        "blur": {
+            "angle_rad": float(angle[0]),
+            "length_px": float(length[0]),
+            "tiles": [
+                {"centre_px": c, "angle_rad": a, "length_px": n}
+                for c, a, n in zip(points[1:].tolist(), angle[1:].tolist(), length[1:].tolist(), strict=True)
+            ],
+        },
+        "shutter": {
+            "readout_time_s": motion.readout_time_s,
+            "method": settings.shutter,
+            "corners_px": corners.tolist(),
+            "max_displacement_px": float(np.linalg.norm(corners - corner_points(width, height), axis=1).max()),
+        },
+        "response": (profile.response or ResponseCurve("srgb")).describe(),
+    }
+
+
+def copied_frame(
+    frame: Frame, picture: NDArray[np.uint8], profile: CameraProfile, reason: str, parameters: dict[str, Any] | None = None
+) -> RestoredFrame:
+    """The decoded pixels unchanged, and why."""
+    height, width = picture.shape[:2]
+    exposure_s = profile.shutter.true_exposure_s(frame.exposure_s) if frame.exposure_s else None
+    details = {**unknown_parameters(profile), **(parameters or {}), "deblur": {"method": "none"}}
+    details["shutter"] = {**details["shutter"], "method": "none"}
+    return RestoredFrame(frame, "copied", picture, (reason,), (0, 0, width, height), exposure_s, details)
+
+
+def unknown_parameters(profile: CameraProfile) -> dict[str, Any]:
+    """The log's keys for a frame whose motion is not known."""
+    return {
+        "motion": {"delta_position_m": None, "delta_q_wxyz": None, "rate_rad_s": None, "velocity_m_s": None},
+        "depth_m": None,
+        "depth_source": "none",
+        "blur": {"angle_rad": None, "length_px": None, "tiles": []},
+        "shutter": {
+            "readout_time_s": profile.shutter.readout_time_s if profile.readout_known else None,
+            "method": "none",
+            "corners_px": None,
+            "max_displacement_px": None,
+        },
+        "response": (profile.response or ResponseCurve("srgb")).describe(),
+        "deblur": {"method": "none"},
+    }
+
+
+def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> NDArray[np.uint8]:
+    """Linear light of the channels to a stored picture (height, width, 3), through a table over the root of light."""
+    low, high = curve.light_range
+    roots = np.linspace(0.0, 1.0, _ENCODE_STEPS)
+    table = np.clip(np.rint(curve.encode(low + (high - low) * roots**2) * 255.0), 0, 255).astype(np.uint8)
+    picture = np.empty((*light[0].shape, len(light)), np.uint8)
+    for channel, plane in enumerate(light):
+        part = np.clip((plane - np.float32(low)) * np.float32(1.0 / (high - low)), 0.0, 1.0)
+        index = (np.sqrt(part) * np.float32(_ENCODE_STEPS - 1) + np.float32(0.5)).astype(np.uint16)
+        picture[..., channel] = table[index]
+    return picture
+
+
+def _straightening(motion: RowMotion, settings: RestorationSettings) -> tuple[bool, float]:
+    width, height = motion.profile.width, motion.profile.height
+    corners = corner_points(width, height)
+    moved = np.linalg.norm(straightened_points(motion, corners, 0.5) - corners, axis=1).max()
+    return settings.shutter != "none", float(moved)
+
+
+def _deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: float) -> tuple[str, tuple[str, ...]]:
+    if settings.deblur == "none":
+        return "none", ("no deblurring asked for",)
+    if motion.exposure_s <= 0:
+        return "none", ("exposure time not known, not deblurred",)
+    if longest_px < settings.min_blur_px:
+        return "none", (f"blur of {longest_px:.2f} px is below {settings.min_blur_px:g} px, left alone",)
+    return settings.deblur, ()
+
+
+def _deblurred(
+    picture: NDArray[np.uint8],
+    motion: RowMotion,
+    curve: ResponseCurve,
+    settings: RestorationSettings,
+    anchor: float,
+    angle_rad: float,
+    longest_px: float,
+) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    height, width = picture.shape[:2]
+    samples = tile_grid(height, width, 128, 0).centres_px
+    statistics = measure_picture(picture, kernel_field(motion, samples, anchor))
+    blurred = blurred_picture(
+        picture, curve, statistics, lambda centres: kernel_field(motion, centres, anchor), longest_px
+    )
+    restored = encode_picture(deblur(blurred, settings), curve)
+    censored = curve.censored_table()[picture]
+    np.copyto(restored, picture, where=censored)
+    return restored, {
+        "method": settings.deblur,
+        "preset": settings.preset,
+        "iterations": settings.iterations,
+        "strength": settings.strength,
+        "tile_px": settings.tile_px,
+        "noise_grey_levels": statistics[0].noise_levels,
+    }
+
+
+def _identity(source: NDArray[np.float32]) -> NDArray[np.float32]:
+    height, width = source.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    return np.stack([x, y], -1)
+
+
+class _Clock:
+    """Seconds of each step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name] = now - self._last
+        self._last = now

@@ -1,0 +1,56 @@
+"""Straightening: one warp from the picture whose rows were seen one after another to the picture of one instant."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.degradation.row_motion import RowMotion
+from virest.degradation.warp import corner_points, dense_map, straightened_points
+
+
+def rowwise_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
+    """Where each pixel of the straightened picture was recorded, (height, width, 2): every row at its own time."""
+    return dense_map(motion, anchor)
+
+
+def perspective_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
+    """The same by the paper's four corners (eqs 23-28): one homography between recorded and straightened corners."""
+    width, height = motion.profile.width, motion.profile.height
+    recorded = corner_points(width, height)
+    straightened = straightened_points(motion, recorded, anchor)
+    homography = cv2.getPerspectiveTransform(straightened.astype(np.float32), recorded.astype(np.float32))
+    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    denominator = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
+    source_x = (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]) / denominator
+    source_y = (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]) / denominator
+    return np.stack([source_x, source_y], -1).astype(np.float32)
+
+
+def warp(picture: NDArray[np.uint8], source_px: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Cubic interpolation at ``source_px``; where there are no data the edge is repeated."""
+    return cv2.remap(picture, source_px, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def valid_rectangle(source_px: NDArray[np.float32]) -> tuple[int, int, int, int]:
+    """(x0, y0, x1, y1), x1 and y1 one past the end: a large rectangle whose every pixel was recorded.
+
+    Its sides move in from the picture's own, always the one with the largest part of missing pixels.
+    """
+    height, width = source_px.shape[:2]
+    x, y = source_px[..., 0], source_px[..., 1]
+    missing = (x < -0.5) | (x > width - 0.5) | (y < -0.5) | (y > height - 0.5)
+    x0, y0, x1, y1 = 0, 0, width, height
+    while x1 - x0 > 1 and y1 - y0 > 1:
+        sides = (
+            missing[y0:y1, x0].mean(),
+            missing[y0, x0:x1].mean(),
+            missing[y0:y1, x1 - 1].mean(),
+            missing[y1 - 1, x0:x1].mean(),
+        )
+        worst = int(np.argmax(sides))
+        if sides[worst] == 0:
+            break
+        x0, y0, x1, y1 = x0 + (worst == 0), y0 + (worst == 1), x1 - (worst == 2), y1 - (worst == 3)
+    return x0, y0, x1, y1

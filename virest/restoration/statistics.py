@@ -1,0 +1,205 @@
+"""What a blurred picture says of itself: the spectrum of its noise and that of its sharp content.
+
+The predicted kernels K pass some frequencies and cancel others.  What a picture holds where they cancel is noise (of
+the sensor, of the movie's codec, and of kernels that are not quite right); what it holds where they pass is the sharp
+picture.  So |G|² = |K|² S + N, fitted over the tiles in rings of equal frequency, measures both: the regularisation
+is no constant, and a predicted blur that the picture does not show comes out as noise and is left alone.
+
+Grey levels throughout; a white noise of standard deviation σ has N = σ².
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft2
+
+from virest.degradation.kernels import KernelField
+
+Array = NDArray[np.float64]
+RINGS = 24
+_SIDE = 128
+_WINDOW = np.outer(np.hanning(_SIDE + 2)[1:-1], np.hanning(_SIDE + 2)[1:-1]).astype(np.float32)
+_ROUNDING_POWER = 1 / 12
+_FIT_STEPS = 6
+_NEAR_CLIPPING = 250
+_MAX_CLIPPED = 0.002
+"""Tiles with a larger part of clipped pixels are no linear blur and tell nothing of the noise."""
+_HYPER_LAPLACIAN_RMS = 3.62
+"""RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureStatistics:
+    """Measured on one blurred picture, over rings of spatial frequency, in grey levels squared."""
+
+    frequency: Array
+    """(RINGS,) middle of each ring, cycles per pixel."""
+    signal: Array
+    """(RINGS,) power of the sharp picture."""
+    noise: Array
+    """(RINGS,) power of the noise."""
+    passed: Array
+    """(RINGS,) mean |K|² of the kernels."""
+
+    @property
+    def noise_to_signal(self) -> Array:
+        """(RINGS,) N / S."""
+        return self.noise / self.signal
+
+    @property
+    def noise_levels(self) -> float:
+        """One standard deviation of the noise: at the frequencies where signal and noise are about equal."""
+        through = self.passed * self.signal
+        weight = self.frequency * through * self.noise / (through + self.noise) ** 2
+        return float(np.sqrt(np.sum(weight * self.noise) / np.sum(weight)))
+
+    @property
+    def gradient_scale(self) -> float:
+        """Unit u of the prior exp(−|∇f/u|^⅔) that has the sharp picture's mean square gradient."""
+        # forward differences pass 4 sin²(π f_x); its mean over a ring's directions is 2 − 2 J0(2π f)
+        gain = 2 - 2 * _bessel_j0(2 * np.pi * self.frequency)
+        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0])
+        return float(np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
+
+    @property
+    def expected_gain_db(self) -> float:
+        """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more."""
+        area = self.frequency
+        through = self.passed * self.signal
+        left = np.sum(area * ((1 - np.sqrt(self.passed)) ** 2 * self.signal + self.noise))
+        restored = np.sum(area * self.signal * self.noise / (through + self.noise))
+        return float(10 * np.log10(left / restored))
+
+
+def measure_picture(picture: NDArray[np.uint8], field: KernelField) -> tuple[PictureStatistics, PictureStatistics]:
+    """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
+
+    picture: (height, width, 3) RGB.  Returns the statistics of luma and of chroma, both colour differences together.
+    """
+    luma, red, blue = cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb))
+    corners = _corners(field, luma.shape)
+    if not corners or field.radius_px >= _SIDE // 2:
+        return _unknown_picture(), _unknown_picture()
+    clipped = np.array([np.mean(_cut(luma, corner) >= _NEAR_CLIPPING) for corner in corners])
+    chosen = np.flatnonzero(clipped <= max(_MAX_CLIPPED, float(np.quantile(clipped, 0.25))))
+    kernels = field.arrays()
+    passed = np.stack([_passed(kernels[i]) for i in chosen])
+
+    def observed(plane: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return np.stack([_windowed_power(_cut(plane, corners[i])) for i in chosen])
+
+    chroma = _fit_rings(np.concatenate([observed(red), observed(blue)]), np.concatenate([passed, passed]))
+    return _fit_rings(observed(luma), passed), chroma
+
+
+def _corners(field: KernelField, shape: tuple[int, ...]) -> list[tuple[int, int]]:
+    """(top, left) of the tile around each centre, moved inside the picture; none if the picture is too small."""
+    height, width = shape
+    if min(height, width) < _SIDE:
+        return []
+    return [
+        (int(np.clip(y - _SIDE / 2, 0, height - _SIDE)), int(np.clip(x - _SIDE / 2, 0, width - _SIDE)))
+        for x, y in field.centres_px
+    ]
+
+
+def _cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]:
+    return plane[corner[0] : corner[0] + _SIDE, corner[1] : corner[1] + _SIDE]
+
+
+def _windowed_power(tile: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Power of a tile less its mean under a Hann window; white noise of variance σ² gives σ² everywhere."""
+    return _power((tile - np.average(tile, weights=_WINDOW)).astype(np.float32) * _WINDOW) / np.sum(_WINDOW**2)
+
+
+def _passed(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """|K|² as seen through the tile's window."""
+    padded = np.zeros((_SIDE, _SIDE), np.float32)
+    padded[: kernel.shape[0], : kernel.shape[1]] = kernel
+    return cv2.blur(_power(padded), (3, 3), borderType=cv2.BORDER_REPLICATE)
+
+
+def _power(tile: NDArray[np.float32]) -> NDArray[np.float32]:
+    """|F|² over the half plane of the transform, (side, side / 2 + 1)."""
+    spectrum = rfft2(tile)
+    return (spectrum.real**2 + spectrum.imag**2).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _ring_index(side: int) -> NDArray[np.intp]:
+    """Ring of each place of the half plane; RINGS for those beyond half a cycle per pixel, and for the lowest."""
+    fy, fx = np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :]
+    radius = np.hypot(fx, fy)
+    ring = (radius / 0.5 * RINGS).astype(np.intp)
+    return np.where((radius < 0.5) & (radius > 2.5 / side) & (np.abs(fx) > 1.5 / side) & (np.abs(fy) > 1.5 / side), ring, RINGS)
+
+
+def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> PictureStatistics:
+    ring = np.broadcast_to(_ring_index(_SIDE), observed.shape).ravel()
+    g, k = observed.ravel().astype(float), passed.ravel().astype(float)
+
+    def total(values: Array) -> Array:
+        return np.bincount(ring, values, RINGS + 1)[:RINGS]
+
+    count = np.maximum(total(np.ones_like(g)), 1)
+    mean_k, mean_g = total(k) / count, total(g) / count
+    signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
+    for _ in range(_FIT_STEPS):
+        fitted = np.append(noise, 1.0)[ring] + np.append(signal, 1.0)[ring] * k
+        weight = 1.0 / np.maximum(fitted, 1e-6) ** 2
+        w, wk, wkk, wg, wkg = (total(v) for v in (weight, weight * k, weight * k * k, weight * g, weight * k * g))
+        determinant = np.maximum(w * wkk - wk * wk, 1e-30)
+        signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)
+        noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
+    spread = np.sqrt(np.maximum(total(k * k) / count - mean_k**2, 0))
+    return _settled(signal, noise, mean_k, determined=(spread > 0.1) & (count > 20))
+
+
+def _settled(signal: Array, noise: Array, passed: Array, determined: NDArray[np.bool_]) -> PictureStatistics:
+    """Rings that cannot tell S from N borrow the noise of the nearest that can; S never rises with frequency."""
+    frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
+    if not determined.any():
+        return _unknown_picture()
+    through = passed * signal + noise
+    noise = np.interp(frequency, frequency[determined], noise[determined])
+    noise = np.maximum.accumulate(noise[::-1])[::-1]
+    signal = np.where(determined, signal, np.maximum(through - noise, 0.05 * through) / np.maximum(passed, 0.05))
+    signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
+    return PictureStatistics(frequency, signal, noise, passed)
+
+
+def _unknown_picture() -> PictureStatistics:
+    """Nothing could be measured: all noise, so that nothing is sharpened."""
+    frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
+    return PictureStatistics(frequency, np.full(RINGS, 1e-3), np.ones(RINGS), np.ones(RINGS))
+
+
+@lru_cache(maxsize=8)
+def packed_frequency(size: int) -> NDArray[np.float32]:
+    """Frequency in cycles per pixel of each place of OpenCV's packed spectrum, (size, size)."""
+    index = (np.arange(size) + 1) // 2
+    along = np.minimum(np.arange(size), size - np.arange(size)) / size
+    packed = np.hypot(along[:, None], index[None, :] / size)
+    packed[:, 0] = index / size
+    packed[:, -1] = np.hypot(index / size, 0.5)
+    return packed.astype(np.float32)
+
+
+def on_spectrum(statistics: PictureStatistics, ring_values: Array, size: int) -> NDArray[np.float32]:
+    """Noise-to-signal of the rings spread over a packed spectrum of a tile; falls as f² below the lowest ring."""
+    frequency = packed_frequency(size)
+    values = np.exp(np.interp(frequency, statistics.frequency, np.log(ring_values)))
+    values *= np.minimum(frequency / statistics.frequency[0], 1.0) ** 2
+    return values.astype(np.float32)
+
+
+def _bessel_j0(x: Array) -> Array:
+    angle = (np.arange(64) + 0.5) * np.pi / 64
+    return np.cos(x[:, None] * np.sin(angle)).mean(axis=1)
+
+

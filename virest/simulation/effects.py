@@ -1,0 +1,285 @@
+"""Hidden effects: what the true camera does and its nominal profile does not say (contract, section 4).
+
+An effect is one line here: where its value goes in the profile, and what size it takes when none is given.  The simulator
+then renders with the true profile and writes the nominal one beside the movie.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.errors import SettingsError
+
+DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
+OPPOSITE = dict(zip(DIRECTIONS, ("bottom_to_top", "top_to_bottom", "right_to_left", "left_to_right"), strict=True))
+STAMPS = ("exposure_start", "exposure_middle", "exposure_end")
+
+
+@dataclass(frozen=True, slots=True)
+class EffectContext:
+    """What a default size may depend on."""
+
+    frames: int
+    fps: float
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One named effect."""
+
+    parameters: tuple[str, ...]
+    """Names of its numbers (or its one word), in the order in which VALUE lists them."""
+    draw: Callable[[CameraProfile, EffectContext], list[Any]]
+    """Values when none are given."""
+    apply: Callable[[CameraProfile, list[Any]], CameraProfile]
+    """The nominal profile with the effect in it."""
+    words: tuple[str, ...] = ()
+    """Allowed words, for an effect whose value is a word."""
+    spread: bool = False
+    """Whether one given number stands for the size of many values that are then drawn (gain_drift)."""
+    optional: int = 0
+    """How many of the last parameters may be left out of VALUE; they are drawn."""
+
+
+@dataclass(frozen=True, slots=True)
+class AppliedEffect:
+    """An effect with its values."""
+
+    name: str
+    parameters: dict[str, Any]
+
+
+def effect_names() -> tuple[str, ...]:
+    """All names that ``--effect`` knows."""
+    return tuple(EFFECTS)
+
+
+def hide_effects(
+    nominal: CameraProfile, texts: list[str] | tuple[str, ...], context: EffectContext
+) -> tuple[CameraProfile, tuple[AppliedEffect, ...]]:
+    """The true profile, from a nominal one and effects as ``NAME`` or ``NAME=VALUE[,VALUE…]``.
+
+    Sizes of effects without VALUE are drawn from the context's rng.
+    """
+    true, applied, seen = nominal, [], set()
+    for text in texts:
+        name, equals, value = text.partition("=")
+        name = name.strip().replace("-", "_")
+        effect = _find_effect(name)
+        if name in seen:
+            raise SettingsError(f"effect '{name}' is given twice", hint="give each effect once")
+        seen.add(name)
+        values = effect.draw(nominal, context)
+        if equals:
+            values = _parse_values(name, effect, value, values, context)
+        true = effect.apply(true, values)
+        listed = effect.spread or len(effect.parameters) != len(values)
+        shown = {effect.parameters[0]: values} if listed else dict(zip(effect.parameters, values, strict=True))
+        applied.append(AppliedEffect(name, shown))
+    return true, tuple(applied)
+
+
+def _find_effect(name: str) -> Effect:
+    if name in EFFECTS:
+        return EFFECTS[name]
+    near = difflib.get_close_matches(name, EFFECTS, n=1, cutoff=0.5)
+    hint = f"did you mean '{near[0]}'?" if near else f"use one of {', '.join(EFFECTS)}"
+    raise SettingsError(f"effect '{name}' is not known", hint=hint)
+
+
+def _parse_values(name: str, effect: Effect, text: str, drawn: list[Any], context: EffectContext) -> list[Any]:
+    parts = [part.strip(" []()") for part in text.split(",")]
+    if effect.words:
+        if parts[0] not in effect.words or len(parts) != 1:
+            raise SettingsError(f"effect {name}: '{text}' is not allowed", hint=f"use one of {', '.join(effect.words)}")
+        return list(parts)
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        raise SettingsError(f"effect {name}: '{text}' is no number", hint="write NAME=0.1 or NAME=0.1,0.2") from None
+    if any(math.isnan(n) for n in numbers):
+        raise SettingsError(f"effect {name}: '{text}' is no number", hint="write NAME=0.1 or NAME=0.1,0.2")
+    if effect.spread:
+        return _gain_walk(context, numbers[0]) if len(numbers) == 1 else numbers
+    wanted = len(drawn)
+    if not wanted - effect.optional <= len(numbers) <= wanted:
+        raise SettingsError(f"effect {name} takes {wanted} number(s), got {len(numbers)}", hint=", ".join(effect.parameters))
+    return numbers + drawn[len(numbers) :]
+
+
+# ── the table ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _signed(context: EffectContext, low: float, high: float) -> float:
+    """A value of random sign whose size lies between low and high."""
+    return round(float(context.rng.uniform(low, high) * context.rng.choice((-1, 1))), 6)
+
+
+def _between(context: EffectContext, low: float, high: float) -> float:
+    return round(float(context.rng.uniform(low, high)), 6)
+
+
+def _shutter(profile: CameraProfile, **changes: Any) -> CameraProfile:
+    return replace(profile, shutter=replace(profile.shutter, **changes))
+
+
+def _extend(profile: CameraProfile, **changes: Any) -> CameraProfile:
+    return replace(profile, extensions=replace(profile.extensions, **changes))
+
+
+def _lens(profile: CameraProfile, **changes: Any) -> CameraProfile:
+    if profile.intrinsics is None:
+        raise SettingsError("this effect needs a profile with intrinsics", hint="set intrinsics.fx_px")
+    return replace(profile, intrinsics=replace(profile.intrinsics, **changes))
+
+
+def _curve(profile: CameraProfile, **changes: Any) -> CameraProfile:
+    return replace(profile, response=replace(profile.response or ResponseCurve("srgb"), **changes))
+
+
+def _rotate_imu(profile: CameraProfile, values: list[float]) -> CameraProfile:
+    rotation = Rotation.from_rotvec(values).as_matrix() @ profile.rotation_cam_imu
+    return replace(profile, r_cam_imu=tuple(map(tuple, rotation.tolist())))
+
+
+def _scale_focal(profile: CameraProfile, values: list[float]) -> CameraProfile:
+    lens = _lens(profile).intrinsics
+    assert lens is not None
+    return _lens(profile, fx_px=lens.fx_px * values[0], fy_px=lens.fy_px * values[0])
+
+
+def _shift_principal_point(profile: CameraProfile, values: list[float]) -> CameraProfile:
+    lens = _lens(profile).intrinsics
+    assert lens is not None
+    return _lens(profile, cx_px=lens.cx_px + values[0], cy_px=lens.cy_px + values[1])
+
+
+def _bend_radially(profile: CameraProfile, values: list[float]) -> CameraProfile:
+    """``k1`` takes the value; it replaces no other distortion."""
+    lens = _lens(profile).intrinsics
+    assert lens is not None
+    if lens.model == "none":
+        return _lens(profile, model="radtan", coefficients=(values[0], 0.0, 0.0, 0.0, 0.0))
+    return _lens(profile, coefficients=(values[0], *lens.coefficients[1:]))
+
+
+def _draw_frame_lag(_: CameraProfile, context: EffectContext) -> list[float]:
+    repeats = max(1, min(int(context.rng.integers(3, 8)), context.frames // 3))
+    return [round(repeats / context.fps, 6), float(min(3 * repeats, context.frames - 1))]
+
+
+def _gain_walk(context: EffectContext, rms: float) -> list[float]:
+    """A smooth brightness drift of the given RMS in log light, median 1."""
+    k = np.arange(context.frames)
+    drift = sum(
+        np.cos(2 * np.pi * k / period + context.rng.uniform(0, 2 * np.pi)) for period in (7.0, 17.0, 41.0)
+    )  # fmt: skip
+    gain = np.exp(rms * drift / max(float(np.std(drift)), 1e-9))
+    return [round(float(g), 6) for g in gain / np.median(gain)]
+
+
+def _replace_gain(profile: CameraProfile, values: list[float]) -> CameraProfile:
+    if any(v <= 0 for v in values):
+        raise SettingsError("effect gain_drift: gains must be positive", hint="a list with one factor per frame")
+    return _extend(profile, gain=tuple(values))
+
+
+EFFECTS: dict[str, Effect] = {
+    "time_offset": Effect(
+        ("time_offset_s",),
+        lambda p, c: [_signed(c, 0.004, 0.015)],
+        lambda p, v: replace(p, time_offset_s=(p.time_offset_s or 0.0) + v[0]),
+    ),
+    "clock_skew": Effect(
+        ("clock_skew",), lambda p, c: [_signed(c, 0.002, 0.005)], lambda p, v: replace(p, clock_skew=p.clock_skew + v[0])
+    ),
+    "readout_time": Effect(
+        ("readout_time_s",),
+        lambda p, c: [round(p.shutter.readout_time_s * (1 + _signed(c, 0.15, 0.3)), 6)],
+        lambda p, v: _shutter(p, readout_time_s=v[0]),
+    ),
+    "readout_direction": Effect(
+        ("readout_direction",),
+        lambda p, c: [OPPOSITE[p.shutter.readout_direction]],
+        lambda p, v: _shutter(p, readout_direction=v[0]),
+        words=DIRECTIONS,
+    ),
+    "timestamp_reference": Effect(
+        ("timestamp",),
+        lambda p, c: [str(c.rng.choice([s for s in STAMPS if s != p.shutter.timestamp]))],
+        lambda p, v: _shutter(p, timestamp=v[0]),
+        words=STAMPS,
+    ),
+    "exposure_time": Effect(
+        ("exposure_scale",),
+        lambda p, c: [round(float(np.exp(_signed(c, 0.25, 0.45))), 4)],
+        lambda p, v: _shutter(p, exposure_scale=p.shutter.exposure_scale * v[0]),
+    ),
+    "gyro_bias": Effect(
+        ("x", "y", "z"),
+        lambda p, c: [_signed(c, 0.02, 0.06) for _ in range(3)],
+        lambda p, v: replace(p, gyro_bias_rad_s=tuple(a + b for a, b in zip(p.gyro_bias_rad_s, v, strict=True))),
+    ),
+    "gyro_scale": Effect(
+        ("gyro_scale",),
+        lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)],
+        lambda p, v: replace(p, gyro_scale=tuple(s * v[0] for s in p.gyro_scale)),
+    ),
+    "imu_rotation": Effect(
+        ("x", "y", "z"), lambda p, c: [_signed(c, 0.015, 0.04) for _ in range(3)], _rotate_imu
+    ),
+    "focal_length": Effect(("focal_scale",), lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)], _scale_focal),
+    "focal_drift": Effect(
+        ("focal_drift_per_s",),
+        lambda p, c: [_signed(c, 0.01, 0.03)],
+        lambda p, v: _extend(p, focal_drift_per_s=v[0]),
+    ),
+    "radial_distortion": Effect(("k1",), lambda p, c: [_signed(c, 0.04, 0.1)], _bend_radially),
+    "principal_point": Effect(
+        ("x", "y"),
+        lambda p, c: [_signed(c, 0.01 * max(p.width, p.height), 0.03 * max(p.width, p.height)) for _ in range(2)],
+        _shift_principal_point,
+    ),
+    "stabilisation": Effect(
+        ("fraction", "cutoff_hz"),
+        lambda p, c: [_between(c, 0.4, 0.8), _between(c, 0.5, 1.5)],
+        lambda p, v: _extend(p, stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
+        optional=1,
+    ),
+    "scene_depth": Effect(
+        ("depth_m",), lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0])
+    ),
+    "frame_lag": Effect(
+        ("lag_s", "frames"),
+        _draw_frame_lag,
+        lambda p, v: _extend(p, frame_lag_s=v[0], frame_lag_frames=int(v[1])),
+        optional=1,
+    ),
+    "response_curve": Effect(
+        ("gamma",), lambda p, c: [round(float(np.exp(_signed(c, 0.15, 0.3))), 4)], lambda p, v: _curve(p, extra_gamma=v[0])
+    ),
+    "black_level": Effect(("black_level",), lambda p, c: [_between(c, 0.03, 0.08)], lambda p, v: _curve(p, black_level=v[0])),
+    "vignetting": Effect(
+        ("corner_loss",), lambda p, c: [_between(c, 0.3, 0.6)], lambda p, v: _extend(p, vignetting_corner_loss=v[0])
+    ),
+    "flicker": Effect(
+        ("amplitude", "frequency_hz", "phase_rad"),
+        lambda p, c: [_between(c, 0.15, 0.4), float(c.rng.choice([100.0, 120.0])), _between(c, 0, 6.28)],
+        lambda p, v: _extend(p, flicker_amplitude=v[0], flicker_frequency_hz=v[1], flicker_phase_rad=v[2]),
+        optional=2,
+    ),
+    "gain_drift": Effect(("gain",), lambda p, c: _gain_walk(c, 0.12), _replace_gain, spread=True),
+    "defocus": Effect(
+        ("sigma_px",), lambda p, c: [_between(c, 1.0, 2.0)], lambda p, v: _extend(p, defocus_sigma_px=v[0])
+    ),
+}

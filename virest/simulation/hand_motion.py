@@ -1,0 +1,191 @@
+"""How the hand moves: angular rate and sway as sums of sinusoids, orientation integrated from them.
+
+The rate of the camera, in its own axes, is ``ω(t) = Σ a cos(2π f t + φ)`` per axis, so it and its derivative are known
+in closed form.  Orientation follows ``R' = R [ω]`` and is integrated by the fourth-order Magnus method (two Gauss
+nodes a step; Iserles & Nørsett 1999, doi:10.1098/rsta.1999.0362), from the nearest node to any time that is asked for.
+
+World axes: those of the camera at its mean pose, x right, y down, z forward.  Times are seconds on the IMU's clock,
+counted from the first stamp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+NODE_STEP_S = 5e-4
+SHARE_PER_AXIS = (0.64, 0.64, 0.42)
+"""Of the RMS rate, on pitch, yaw and roll: hands roll less than they nod and turn."""
+_GAUSS = 0.5 - np.sqrt(3.0) / 6.0
+_COMPONENTS = 18
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """A vector-valued sum of cosines, ``Σ amplitude cos(2π frequency t + phase)`` on each of three axes."""
+
+    frequency_hz: Array
+    """(3, n)."""
+    amplitude: Array
+    """(3, n)."""
+    phase_rad: Array
+    """(3, n)."""
+
+    def at(self, time_s: Array, derivative: int = 0) -> Array:
+        """The sum or its time derivative of the given order at times (...,): (..., 3)."""
+        omega = 2 * np.pi * self.frequency_hz
+        angle = np.asarray(time_s, float)[..., None, None] * omega + self.phase_rad + derivative * np.pi / 2
+        return np.sum(self.amplitude * omega**derivative * np.cos(angle), axis=-1)
+
+    def scaled(self, factor: float) -> Waves:
+        """The same motion, ``factor`` times as large."""
+        return Waves(self.frequency_hz, self.amplitude * factor, self.phase_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class HandMotion:
+    """A camera's motion, known at every time of [start_s, end_s] (and, more slowly integrated, a little beyond)."""
+
+    rate: Waves
+    """Angular rate, rad/s, camera axes."""
+    sway: Waves
+    """Position of the camera's centre, metres, world axes."""
+    node_s: Array
+    """(n,) times of the integrated orientations."""
+    node_quat: Array
+    """(n, 4) world from camera at node_s, w x y z."""
+
+    @property
+    def start_s(self) -> float:
+        """First time with an integrated orientation."""
+        return float(self.node_s[0])
+
+    @property
+    def end_s(self) -> float:
+        """Last time with an integrated orientation."""
+        return float(self.node_s[-1])
+
+    def rate_rad_s(self, time_s: Array) -> Array:
+        """Angular rate in camera axes at times (...,): (..., 3)."""
+        return self.rate.at(time_s)
+
+    def rotation(self, time_s: Array) -> Rotation:
+        """World from camera at times (n,)."""
+        time_s = np.atleast_1d(np.asarray(time_s, float))
+        nearest = np.clip(np.round((time_s - self.node_s[0]) / NODE_STEP_S).astype(int), 0, len(self.node_s) - 1)
+        step = time_s - self.node_s[nearest]
+        start = Rotation.from_quat(self.node_quat[nearest], scalar_first=True)
+        return start * Rotation.from_rotvec(_magnus(self.rate, self.node_s[nearest], step))
+
+    def quat_world_cam(self, time_s: Array) -> Array:
+        """World from camera at times (n,), w x y z, scalar part not negative: (n, 4)."""
+        return self.rotation(time_s).as_quat(canonical=True, scalar_first=True)
+
+    def position_m(self, time_s: Array) -> Array:
+        """Camera centre in world axes at times (...,): (..., 3)."""
+        return self.sway.at(time_s)
+
+    def specific_force_m_s2(self, time_s: Array, arm_cam_m: Array, gravity_world_m_s2: Array) -> Array:
+        """What an accelerometer at ``arm_cam_m`` in camera axes feels, in camera axes, at times (n,): (n, 3).
+
+        ``f = Rᵀ (p'' − g) + ω' × r + ω × (ω × r)``; at rest −g, so +9.8 upwards.
+        """
+        omega, omega_dot = self.rate.at(time_s), self.rate.at(time_s, 1)
+        inertial = self.sway.at(time_s, 2) - gravity_world_m_s2
+        arm = np.broadcast_to(arm_cam_m, omega.shape)
+        lever = np.cross(omega_dot, arm) + np.cross(omega, np.cross(omega, arm))
+        return self.rotation(time_s).inv().apply(inertial) + lever
+
+
+def random_hand_motion(
+    rng: np.random.Generator,
+    *,
+    rate_rms_rad_s: float,
+    duration_s: float,
+    sway_rms_m: float = 0.0,
+    margin_s: float = 1.0,
+    band_hz: tuple[float, float] = (0.5, 12.0),
+) -> HandMotion:
+    """Hand tremor whose rate has the given RMS (of the vector's length) over [0, duration_s].
+
+    The rate's spectrum rises to about 2 Hz, is flat, and falls above 8 Hz.  Orientations cover ``margin_s`` more on both
+    sides.  ``sway_rms_m`` adds a translation between 0.3 and 2.5 Hz of that RMS length.
+    """
+    rate = _random_waves(rng, band_hz, lambda f: (f / 2) / (1 + f / 2) / (1 + (f / 8) ** 2))
+    rate = _with_rms(rate, np.array(SHARE_PER_AXIS) * rate_rms_rad_s, duration_s)
+    sway = _random_waves(rng, (0.3, 2.5), lambda f: 1 / (1 + f))
+    sway = _with_rms(sway, np.array([0.65, 0.65, 0.4]) * sway_rms_m, duration_s)
+    return integrate_motion(rate, sway, -margin_s, duration_s + margin_s, centre_on_s=(0.0, duration_s))
+
+
+def constant_motion(
+    rate_rad_s: tuple[float, float, float],
+    *,
+    start_s: float = -1.0,
+    end_s: float = 1.0,
+    velocity_free_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> HandMotion:
+    """A constant rate in camera axes at a constant position; the world's axes are the camera's at time 0."""
+    rate = Waves(np.zeros((3, 1)), np.array(rate_rad_s, float)[:, None], np.zeros((3, 1)))
+    sway = Waves(np.zeros((3, 1)), np.array(velocity_free_position_m, float)[:, None], np.zeros((3, 1)))
+    return integrate_motion(rate, sway, start_s, end_s, centre_on_s=(0.0, 0.0))
+
+
+def integrate_motion(
+    rate: Waves, sway: Waves, start_s: float, end_s: float, *, centre_on_s: tuple[float, float]
+) -> HandMotion:
+    """Orientation at nodes over [start_s, end_s]; the mean orientation over ``centre_on_s`` is the world's axes."""
+    count = int(np.ceil((end_s - start_s) / NODE_STEP_S)) + 1
+    node_s = start_s + NODE_STEP_S * np.arange(count)
+    steps = Rotation.from_rotvec(_magnus(rate, node_s[:-1], np.full(count - 1, NODE_STEP_S)))
+    quat = _running_product(steps.as_quat(scalar_first=True))
+    inside = (node_s >= centre_on_s[0] - NODE_STEP_S / 2) & (node_s <= centre_on_s[1] + NODE_STEP_S / 2)
+    chosen = quat[inside] if inside.any() else quat[:1]
+    mean = Rotation.from_quat(chosen, scalar_first=True).mean()
+    centred = mean.inv() * Rotation.from_quat(quat, scalar_first=True)
+    return HandMotion(rate, sway, node_s, centred.as_quat(scalar_first=True))
+
+
+def _magnus(rate: Waves, start_s: Array, step_s: Array) -> Array:
+    """Rotation vectors of steps (n,) that begin at start_s (n,), in the axes at the start: (n, 3); O(step⁵)."""
+    first = rate.at(start_s + _GAUSS * step_s)
+    second = rate.at(start_s + (1 - _GAUSS) * step_s)
+    step = step_s[:, None]
+    return 0.5 * step * (first + second) + np.sqrt(3.0) / 12.0 * step**2 * np.cross(first, second)
+
+
+def _running_product(steps: Array) -> Array:
+    """Products q0 = 1, q1 = s0, q2 = s0 s1, … of quaternions (n, 4): (n + 1, 4)."""
+    result = np.empty((len(steps) + 1, 4))
+    w, x, y, z = 1.0, 0.0, 0.0, 0.0
+    result[0] = w, x, y, z
+    for i, (a, b, c, d) in enumerate(steps.tolist(), start=1):
+        w, x, y, z = (
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        )
+        result[i] = w, x, y, z
+    return result / np.linalg.norm(result, axis=1, keepdims=True)
+
+
+def _random_waves(rng: np.random.Generator, band_hz: tuple[float, float], spectrum) -> Waves:  # noqa: ANN001
+    """One component in each of equal steps of log frequency, with random phase and a little random amplitude."""
+    low, high = np.log(band_hz)
+    place = (np.arange(_COMPONENTS) + rng.uniform(size=(3, _COMPONENTS))) / _COMPONENTS
+    frequency = np.exp(low + (high - low) * place)
+    amplitude = spectrum(frequency) * rng.uniform(0.6, 1.4, (3, _COMPONENTS))
+    return Waves(frequency, amplitude, rng.uniform(0, 2 * np.pi, (3, _COMPONENTS)))
+
+
+def _with_rms(waves: Waves, rms_per_axis: Array, duration_s: float) -> Waves:
+    """Each axis scaled to its RMS over [0, duration_s]."""
+    sampled = waves.at(np.linspace(0.0, max(duration_s, 0.05), 2000))
+    now = np.sqrt(np.mean(sampled**2, axis=0))
+    return Waves(waves.frequency_hz, waves.amplitude * (rms_per_axis / now)[:, None], waves.phase_rad)

@@ -1,0 +1,283 @@
+"""What the camera looks at: a radiance chart on a plane, at infinity or at a depth.
+
+A chart is linear light, float32 RGB, 1 = the light that just fills a curve that ends at 1.  It is drawn finer than the
+picture and blurred once by the lens and pixel (a Gaussian of LENS_SIGMA_PX picture pixels: contrast 0.29 at the
+picture's Nyquist frequency), so one interpolated sample a pixel gives an instant's picture without aliases.
+
+Dead leaves: occluding discs, ellipses and polygons whose radii follow r⁻³, which gives the scale invariance of natural
+pictures (Lee, Mumford & Huang 2001, doi:10.1023/A:1011109015675), here with 1/f texture and shading inside each leaf.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.errors import SettingsError
+
+log = logging.getLogger(__name__)
+
+KINDS = ("leaves", "bright", "board", "text")
+LENS_SIGMA_PX = 0.5
+MAX_CHART_PX = 36_000_000
+_TEXTURE_SIDE = 512
+_TEXT = (
+    "the quick brown fox jumps over the lazy dog",
+    "restored frames keep the lens, undo the hand",
+    "rows are read one by one, right to left",
+    "0123456789 +-*/= (a, b) [c] {d} <e> #f",
+    "sphinx of black quartz, judge my vow",
+    "five dozen liquor jugs packed in my box",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A chart on a plane.
+
+    In world axes the plane passes through ``centre_m`` with the given normal; its chart axes are the world's x and y laid
+    into the plane.  With ``depth_m`` infinite only directions count: the plane z = 1 seen from the origin.
+    """
+
+    chart: NDArray[np.float32]
+    """(rows, columns, 3) linear light."""
+    chart_focal_px: float
+    """Chart pixels per unit of x/z: at the chart's middle, that many times finer than a camera of focal length 1 px."""
+    depth_m: float = np.inf
+    """Distance of the plane along the world's z axis."""
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Unit normal of the plane, world axes."""
+
+    def chart_from_ray(self, rotation_world_cam: NDArray[np.float64], position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Homography from rays (x, y, 1) in camera axes to homogeneous chart pixels, for poses (..., 3, 3), (..., 3).
+
+        A ray d from p meets the plane n·X = n·X0 at ``X = p + d n·(X0 − p)/(n·d)``; dividing nothing keeps it linear in d.
+        """
+        rotation = np.asarray(rotation_world_cam, float)
+        position = np.asarray(position_m, float)
+        if np.isinf(self.depth_m):
+            plane = np.broadcast_to(np.eye(3), rotation.shape)
+        else:
+            n = np.array(self.normal)
+            e1 = _unit(np.array([1.0, 0, 0]) - n[0] * n)
+            e2 = np.cross(n, e1)
+            offset = position - np.array([0, 0, self.depth_m])
+            distance = -(offset @ n)
+            rows = [distance[..., None] * e + (offset @ e)[..., None] * n for e in (e1, e2)]
+            plane = np.stack([rows[0], rows[1], np.broadcast_to(n * self.depth_m, rows[0].shape)], axis=-2)
+        return self._chart_matrix @ plane @ rotation
+
+    @property
+    def _chart_matrix(self) -> NDArray[np.float64]:
+        height, width = self.chart.shape[:2]
+        focal = self.chart_focal_px
+        return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+
+    def at_plane(self, depth_m: float, normal: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Scene:
+        """The same chart on a plane at another depth; it looks as large as before from the origin."""
+        return Scene(self.chart, self.chart_focal_px, depth_m, normal)
+
+    def sample(self, homography: NDArray[np.float64], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside the chart: (h, w, 3)."""
+        h = homography.astype(np.float32)
+        weight = 1.0 / (h[2, 0] * x + (h[2, 1] * y + h[2, 2]))
+        map_x = h[0, 0] * x + (h[0, 1] * y + h[0, 2])
+        map_y = h[1, 0] * x + (h[1, 1] * y + h[1, 2])
+        map_x *= weight
+        map_y *= weight
+        return cv2.remap(self.chart, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
+def make_scene(
+    kind: str,
+    rng: np.random.Generator,
+    *,
+    focal_px: float,
+    half_extent: tuple[float, float] = (1.0, 1.0),
+    depth_m: float = np.inf,
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    oversampling: float = 2.0,
+) -> Scene:
+    """Draw a scene of one of KINDS for a camera of ``focal_px``.
+
+    half_extent: how far x/z and y/z reach from the middle of the chart.  oversampling: chart pixels per picture pixel at
+    the middle; it is lowered (with a log message) where the chart would exceed MAX_CHART_PX.
+    """
+    if kind not in KINDS:
+        raise SettingsError(f"scene '{kind}' is not known", hint=f"use one of {', '.join(KINDS)}")
+    area = 4 * half_extent[0] * half_extent[1] * focal_px**2
+    finest = float(np.sqrt(MAX_CHART_PX / area))
+    if finest < oversampling:
+        log.warning("scene chart limited to %.2f chart pixels per picture pixel", finest)
+        oversampling = finest
+    chart_focal = focal_px * oversampling
+    width, height = (2 * int(np.ceil(extent * chart_focal)) for extent in half_extent)
+    drawing = _DRAWINGS[kind](rng, width, height, oversampling)
+    sigma = LENS_SIGMA_PX * oversampling
+    chart = cv2.GaussianBlur(drawing, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    return Scene(chart, chart_focal, depth_m, normal)
+
+
+# ── drawings: linear light, (height, width, 3) float32, not yet blurred ────────────────────────────────────────────
+
+
+def _draw_leaves(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
+    """Dead leaves with texture and shading; darkest about 0.01, brightest about 0.9."""
+    labels, count = _leaf_labels(rng, width, height, scale)
+    colour = _natural_colours(rng, count)
+    return np.clip(_textured(rng, labels, colour), 0.004, 0.9)
+
+
+def _draw_bright(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
+    """Dead leaves with lamps and glints of 2 to 12 times the clip level on about 3 % of the area."""
+    light = _draw_leaves(rng, width, height, scale)
+    target, covered, tries = 0.03 * width * height, 0.0, 0
+    while covered < target and tries < 20_000:
+        tries += 1
+        radius = float(_power_radii(rng, 1, 2.5 * scale, 0.02 * min(width, height) + 4 * scale)[0])
+        centre = rng.uniform((0, 0), (width, height))
+        colour = rng.uniform(2.0, 12.0) * rng.uniform(0.75, 1.0, 3)
+        _fill_leaf(light, rng, centre, radius, tuple(map(float, colour)))
+        covered += np.pi * radius**2
+    return light
+
+
+def _draw_board(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
+    """A chessboard on a white sheet before a grey wall, with solid tag-like squares in its white fields."""
+    light = np.full((height, width, 3), 0.25, np.float32)
+    columns, rows = (7, 10) if height >= width else (10, 7)
+    side = int(0.55 * min(width / columns, height / rows))
+    left, top = (width - columns * side) // 2, (height - rows * side) // 2
+    margin = side
+    light[max(top - margin, 0) : top + rows * side + margin, max(left - margin, 0) : left + columns * side + margin] = 0.8
+    for row in range(rows):
+        for column in range(columns):
+            y, x = top + row * side, left + column * side
+            if (row + column) % 2 == 0:
+                light[y : y + side, x : x + side] = 0.03
+            else:
+                _draw_tag(light, rng, x + side // 5, y + side // 5, 3 * side // 5)
+    return light * np.array([1.0, 0.98, 0.94], np.float32)
+
+
+def _draw_tag(light: NDArray[np.float32], rng: np.random.Generator, x: int, y: int, side: int) -> None:
+    """A square code of 6 x 6 black and white cells with a black border."""
+    cell = max(side // 8, 1)
+    light[y : y + 8 * cell, x : x + 8 * cell] = 0.03
+    bits = rng.integers(0, 2, (6, 6))
+    for row, column in np.argwhere(bits):
+        top, left = y + (row + 1) * cell, x + (column + 1) * cell
+        light[top : top + cell, left : left + cell] = 0.8
+
+
+def _draw_text(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
+    """Printed pages: dark text of several sizes on off-white paper, shaded slowly."""
+    ink = np.zeros((height, width), np.uint8)
+    y = int(20 * scale)
+    while y < height + 10:
+        size = scale * float(rng.choice([0.4, 0.55, 0.8, 1.2, 2.0], p=[0.2, 0.3, 0.25, 0.15, 0.1]))
+        x = int(rng.uniform(-200, 0) * scale)
+        while x < width:
+            line = str(rng.choice(_TEXT))
+            face = int(rng.choice([cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_DUPLEX]))
+            thick = max(1, round(size * 1.3))
+            (length, tall), _ = cv2.getTextSize(line, face, size, thick)
+            cv2.putText(ink, line, (x, y), face, size, 255, thick, cv2.LINE_AA)
+            x += length + int(30 * scale)
+        y += int(tall * 2.0 + 6 * scale)
+    grey = 0.72 - np.float32(0.68 / 255) * ink
+    shade = 1 + 0.15 * _smooth_field(rng, width, height)
+    tint = np.array([1.0, 0.97, 0.9], np.float32)
+    return np.clip(grey * shade, 0.004, 0.9)[..., None] * tint
+
+
+_DRAWINGS = {"leaves": _draw_leaves, "bright": _draw_bright, "board": _draw_board, "text": _draw_text}
+
+
+# ── dead leaves ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _leaf_labels(rng: np.random.Generator, width: int, height: int, scale: float) -> tuple[NDArray[np.int32], int]:
+    """Which leaf is on top at each chart pixel; leaf 0 is the ground."""
+    small, large = 2.2 * scale, 0.16 * min(width, height) + 3 * scale
+    mean_area = 2 * np.pi * small**2 * np.log(large / small) / (1 - (small / large) ** 2)
+    count = int(min(4.0 * width * height / mean_area, 150_000))
+    radii = _power_radii(rng, count, small, large)
+    centres = rng.uniform((-0.5 * large, -0.5 * large), (width + 0.5 * large, height + 0.5 * large), (count, 2))
+    labels = np.zeros((height, width), np.int32)
+    for leaf, (centre, radius) in enumerate(zip(centres, radii.tolist(), strict=True), start=1):
+        _fill_leaf(labels, rng, centre, radius, leaf)
+    return labels, count + 1
+
+
+def _power_radii(rng: np.random.Generator, count: int, small: float, large: float) -> NDArray[np.float64]:
+    """Radii with density r⁻³ between the two ends."""
+    u = rng.uniform(size=count)
+    return 1.0 / np.sqrt((1 - u) / small**2 + u / large**2)
+
+
+def _fill_leaf(canvas: NDArray, rng: np.random.Generator, centre: NDArray, radius: float, value: object) -> None:
+    """Fill a disc, an ellipse or a polygon, to 1/16 pixel."""
+    shape, angle, aspect = rng.uniform(size=3)
+    at = (int(centre[0] * 16), int(centre[1] * 16))
+    if shape < 0.35:
+        cv2.circle(canvas, at, max(int(radius * 16), 8), value, -1, cv2.LINE_8, 4)
+        return
+    if shape < 0.7:
+        axes = (max(int(radius * 16), 8), max(int(radius * (0.35 + 0.65 * aspect) * 16), 8))
+        cv2.ellipse(canvas, at, axes, angle * 180, 0, 360, value, -1, cv2.LINE_8, 4)
+        return
+    corners = 3 + int(aspect * 4)
+    turn = 2 * np.pi * (angle + (np.arange(corners) + 0.5 * rng.uniform(size=corners)) / corners)
+    points = 16 * (np.asarray(centre) + 1.15 * radius * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    cv2.fillPoly(canvas, [points.astype(np.int32)], value, cv2.LINE_8, 4)
+
+
+def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    """Linear RGB (count, 3): log-normal luminance around 0.16, muted hues along blue-yellow and red-green."""
+    luminance = np.clip(0.16 * np.exp(rng.normal(0, 0.85, count)), 0.012, 0.8)
+    yellow, red = rng.normal(0, 0.22, count), rng.normal(0, 0.09, count)
+    tint = np.exp(np.stack([0.5 * yellow + red, 0.15 * yellow - 0.5 * red, -yellow], axis=1))
+    return (luminance[:, None] * tint).astype(np.float32)
+
+
+def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Each leaf's colour times its own cut of a 1/f texture and of a slow shading field."""
+    height, width = labels.shape
+    texture = _one_over_f(rng, _TEXTURE_SIDE)
+    strength = (rng.gamma(2.0, 0.09, len(colour))).astype(np.float32)
+    shift = rng.integers(0, _TEXTURE_SIDE, (2, len(colour)), dtype=np.int32)
+    shade = np.exp(0.25 * _smooth_field(rng, width, height))
+    light = np.empty((height, width, 3), np.float32)
+    columns = np.arange(width, dtype=np.int32)
+    for top in range(0, height, 256):
+        leaf = labels[top : top + 256]
+        rows = np.arange(top, top + leaf.shape[0], dtype=np.int32)[:, None]
+        cut = texture[(rows + shift[0][leaf]) % _TEXTURE_SIDE, (columns + shift[1][leaf]) % _TEXTURE_SIDE]
+        factor = np.exp(strength[leaf] * cut) * shade[top : top + 256]
+        light[top : top + 256] = colour[leaf] * factor[..., None]
+    return light
+
+
+def _one_over_f(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
+    """A periodic texture whose amplitude falls as 1/f, mean 0, standard deviation 1: (side, side)."""
+    fy, fx = np.meshgrid(np.fft.fftfreq(side), np.fft.rfftfreq(side), indexing="ij")
+    radius = np.hypot(fx, fy)
+    radius[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.normal(size=(side, side))) / np.maximum(radius, 4 / side)
+    field = np.fft.irfft2(spectrum, s=(side, side))
+    return (field / field.std()).astype(np.float32)
+
+
+def _smooth_field(rng: np.random.Generator, width: int, height: int) -> NDArray[np.float32]:
+    """Slow variation over the chart, of about unit size."""
+    coarse = rng.normal(size=(6, 6)).astype(np.float32)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vector / np.linalg.norm(vector)

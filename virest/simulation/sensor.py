@@ -1,0 +1,78 @@
+"""From light to grey levels (contract, section 4, "Order"): defocus, vignetting, gain, curve, gamma, black level, noise.
+
+The curve is written down here once more, from the paper's equations 21 and 22, so that the judge has its own.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+
+Image = NDArray[np.float32]
+
+
+def sensor_light(light: Image, profile: CameraProfile, slot_gain: float, *, defocus: bool) -> Image:
+    """Light as it reaches the curve: defocused (where asked for), vignetted, times the frame's gain: (h, w, 3)."""
+    ext = profile.extensions
+    if defocus and ext.defocus_sigma_px:
+        light = cv2.GaussianBlur(light, (0, 0), ext.defocus_sigma_px, borderType=cv2.BORDER_REFLECT)
+    if ext.vignetting_corner_loss:
+        light = light * _vignetting(profile.width, profile.height, ext.vignetting_corner_loss)
+    return light if slot_gain == 1.0 else light * np.float32(slot_gain)
+
+
+def grey_of_light(light: Image, curve: ResponseCurve) -> Image:
+    """Grey in [0, 1]: black + (1 − black) · curve(light)^gamma."""
+    grey = _plain_curve(np.maximum(light, 0.0), curve)
+    if curve.extra_gamma != 1.0:
+        grey = grey**curve.extra_gamma
+    return (curve.black_level + (1 - curve.black_level) * grey).astype(np.float32)
+
+
+def eight_bit(grey: Image, noise_levels: float, rng: np.random.Generator | None) -> NDArray[np.uint8]:
+    """Grey levels 0 to 255 with Gaussian noise of ``noise_levels`` (none without rng), rounded."""
+    levels = 255.0 * grey
+    if rng is not None and noise_levels > 0:
+        levels = levels + np.float32(noise_levels) * rng.standard_normal(levels.shape, dtype=np.float32)
+    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def _vignetting(width: int, height: int, corner_loss: float) -> Image:
+    x = np.arange(width) - (width - 1) / 2
+    y = np.arange(height) - (height - 1) / 2
+    corner_squared = (width**2 + height**2) / 4
+    return (1 - corner_loss * (x[None, :] ** 2 + y[:, None] ** 2) / corner_squared)[..., None].astype(np.float32)
+
+
+def _plain_curve(light: Image, curve: ResponseCurve) -> Image:
+    if curve.kind == "five_segment":
+        return _five_segments(light, curve.b, curve.c, curve.y_max)
+    if curve.kind == "table":
+        return np.interp(light, curve.x, curve.y)
+    light = np.minimum(light, 1.0)
+    if curve.kind == "gamma":
+        return light ** (1 / curve.gamma)
+    if curve.kind == "srgb":
+        return np.where(light > 0.0031308, 1.055 * np.power(light, 1 / 2.4) - 0.055, light * 12.92)
+    return light
+
+
+def _five_segments(light: Image, b: tuple[float, float], c: tuple[float, float], top: float) -> Image:
+    """Zero, toe, line, shoulder, top; toe and shoulder are parabolas that meet the line with its slope."""
+    slope = (c[1] - b[1]) / (c[0] - b[0])
+    foot, head = b[0] - 2 * b[1] / slope, c[0] + 2 * (top - c[1]) / slope
+    grey = b[1] + slope * (light - b[0])
+    toe, shoulder = light < b[0], light > c[0]
+    if b[1] > 0:
+        grey[toe] = b[1] * ((np.maximum(light[toe], foot) - foot) / (b[0] - foot)) ** 2
+    else:
+        grey[toe] = 0.0
+    if top > c[1]:
+        grey[shoulder] = top - (top - c[1]) * ((head - np.minimum(light[shoulder], head)) / (head - c[0])) ** 2
+    else:
+        grey[shoulder] = top
+    return grey

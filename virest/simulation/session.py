@@ -1,0 +1,313 @@
+"""One simulated recording session: what is looked at, how the hand moves, when each frame is exposed, what is logged.
+
+Clocks (contract, section 4): ``t_imu − stamp_0 = (t_cam − stamp_0)(1 + clock_skew) + time_offset_s``; a stamp that means
+the middle or the end lies half or one true exposure after the start.  Rows follow on the IMU's clock.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import Shutter
+from virest.errors import SettingsError
+from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
+from virest.simulation.hand_motion import HandMotion, random_hand_motion
+from virest.simulation.scenes import Scene, make_scene
+from virest.simulation.sensor import eight_bit, grey_of_light, sensor_light
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+GRAVITY_WORLD_M_S2 = np.array([0.0, 9.81, 0.0])
+"""World y points down."""
+TICKS_PER_S = 90_000
+"""Time base of the movie; stamps are its ticks, cut to whole microseconds."""
+STAMP_PLACE = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
+DEFAULT_SWAY_M = 0.012
+"""RMS sway of the hand where the scene has a depth and no sway is asked for."""
+_IMU_LEAD_S = 0.6
+_SCENE_MARGIN = 1.12
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSettings:
+    """What is recorded and how; the camera itself is a profile."""
+
+    scene: str = "leaves"
+    frames: int = 12
+    fps: float = 30.0
+    exposure_s: tuple[float, ...] = (0.010,)
+    """As logged; frame k takes entry k modulo the length."""
+    rate_rad_s: float = 1.0
+    """RMS of the angular rate."""
+    sway_m: float | None = None
+    """RMS of the sway; None: DEFAULT_SWAY_M where the scene has a depth, else none."""
+    tilt_rad: tuple[float, float] = (0.0, 0.0)
+    """Turn of the scene's plane about world x and y; only with a finite depth."""
+    noise_levels: float = 1.5
+    """Standard deviation of the noise in grey levels of 255."""
+    imu_rate_hz: float = 200.0
+    gyro_noise_rad_s: float = 0.0015
+    accel_noise_m_s2: float = 0.02
+    seed: int = 0
+    oversampling: float = 2.0
+    """Chart pixels per picture pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A recording that is planned and not yet rendered."""
+
+    nominal: CameraProfile
+    """What the capture's camera.yaml will say."""
+    true: CameraProfile
+    """What the simulated camera is."""
+    settings: SessionSettings
+    scene: Scene
+    motion: HandMotion
+    view: View
+    stamp_tick: NDArray[np.int64]
+    """(frames,) movie time stamps in ticks, first 0."""
+    stamp_ns: NDArray[np.int64]
+    """(frames,) frame stamps, on the camera's clock."""
+    shows: NDArray[np.int64]
+    """(frames,) which capture each slot of the movie shows; the slot's own index without start-up lag."""
+    imu_span_s: tuple[float, float]
+    """First and last inertial sample."""
+
+    def logged_exposure_s(self, capture: int) -> float:
+        """Exposure that the log gives for a capture."""
+        return self.settings.exposure_s[capture % len(self.settings.exposure_s)]
+
+    def true_exposure_s(self, capture: int) -> float:
+        """Exposure that the sensor made."""
+        return self.logged_exposure_s(capture) * self.true.shutter.exposure_scale
+
+    def first_row_start_s(self, capture: int) -> float:
+        """Start of the first row's exposure, IMU clock from stamp_0."""
+        return _first_row_start_s(self.true, _stamp_s(capture, self.settings.fps), self.true_exposure_s(capture))
+
+    def middle_s(self, capture: int) -> float:
+        """Start of the first row + half the readout + half the exposure."""
+        half = 0.5 * (self.true.shutter.readout_time_s + self.true_exposure_s(capture))
+        return self.first_row_start_s(capture) + half
+
+
+@dataclass(frozen=True, slots=True)
+class ImuLog:
+    """Inertial samples as the phone logs them."""
+
+    time_ns: NDArray[np.int64]
+    """(n,)."""
+    gyro_rad_s: Array
+    """(n, 3) IMU axes."""
+    accel_m_s2: Array
+    """(n, 3) IMU axes, specific force."""
+
+
+def nominal_camera(
+    width: int,
+    height: int,
+    *,
+    focal_px: float | None = None,
+    readout_time_s: float = 0.020,
+    readout_direction: str | None = None,
+    response: ResponseCurve | None = None,
+    distortion: tuple[str, tuple[float, ...]] = ("none", ()),
+    depth_m: float = np.inf,
+) -> CameraProfile:
+    """A phone held upright (height > width) or on its side, focal length 0.8 of the long side unless given.
+
+    readout_direction: right_to_left for an upright phone and top_to_bottom for one on its side, unless given.
+    """
+    focal = 0.8 * max(width, height) if focal_px is None else focal_px
+    upright = height > width
+    return CameraProfile(
+        width=width,
+        height=height,
+        device="simulated phone",
+        intrinsics=Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, *distortion),
+        shutter=Shutter(readout_time_s, readout_direction or ("right_to_left" if upright else "top_to_bottom")),
+        r_cam_imu=ANDROID_R_CAM_IMU if upright else LANDSCAPE_R_CAM_IMU,
+        time_offset_s=0.0,
+        response=response or ResponseCurve("srgb"),
+        focal_length_mm=3.95,
+        depth_m=depth_m,
+    )
+
+
+def plan_session(
+    nominal: CameraProfile,
+    true: CameraProfile,
+    settings: SessionSettings,
+    *,
+    scene: Scene | None = None,
+    motion: HandMotion | None = None,
+) -> Session:
+    """Draw scene and motion (unless given) and lay out the times. The same seed gives the same session."""
+    _require_sizes(true, settings)
+    duration = settings.frames / settings.fps
+    offset = abs(true.time_offset_s or 0.0)
+    lead = _IMU_LEAD_S if offset <= 0.4 else float(np.ceil(offset + _IMU_LEAD_S))
+    span = (-lead, duration + lead)
+    depth = np.inf if true.depth_m is None else true.depth_m
+    if motion is None:
+        sway = settings.sway_m if settings.sway_m is not None else (DEFAULT_SWAY_M if np.isfinite(depth) else 0.0)
+        spare = lead + 0.6 + true.extensions.frame_lag_s + abs(true.clock_skew) * duration
+        motion = random_hand_motion(
+            np.random.default_rng([settings.seed, 1]),
+            rate_rms_rad_s=settings.rate_rad_s,
+            duration_s=duration,
+            sway_rms_m=sway,
+            margin_s=spare,
+        )
+    shows = _shown_captures(true, settings)
+    if scene is None:
+        scene = _draw_scene(nominal, motion, settings, duration)
+        if np.isfinite(depth):
+            tilt = Rotation.from_rotvec([*settings.tilt_rad, 0.0]).as_matrix()[:, 2]
+            scene = _at_median_depth(scene.at_plane(depth, tuple(tilt.tolist())), motion, true, settings, shows)
+    base_ns = 1_000 * int(np.random.default_rng([settings.seed, 2]).integers(20_000_000_000, 40_000_000_000))
+    ticks = np.array([_stamp_tick(k, settings.fps) for k in range(settings.frames)])
+    stamps = base_ns + np.array([round(_stamp_s(k, settings.fps) * 1e9) for k in range(settings.frames)])
+    view = make_view(true, motion, rest_s=span[0])
+    return Session(nominal, true, settings, scene, motion, view, ticks, stamps.astype(np.int64), shows, span)
+
+
+def render_picture(session: Session, slot: int) -> Picture:
+    """What the camera takes for a slot of the movie, before the encoder: (h, w, 3) RGB."""
+    capture = int(session.shows[slot])
+    light = expose(
+        session.scene, session.motion, session.view, session.first_row_start_s(capture), session.true_exposure_s(capture)
+    )
+    light = sensor_light(light, session.true, _gain(session, slot), defocus=True)
+    rng = np.random.default_rng([session.settings.seed, 3, capture])
+    return eight_bit(grey_of_light(light, _curve(session)), session.settings.noise_levels, rng)
+
+
+def render_truth(session: Session, slot: int, *, middle: bool = False) -> Picture:
+    """What a global shutter without blur, defocus, flicker and noise takes at the slot's reference time: (h, w, 3)."""
+    capture = int(session.shows[slot])
+    time_s = session.middle_s(capture) if middle else session.first_row_start_s(capture)
+    light = instant(session.scene, session.motion, session.view, time_s)
+    light = sensor_light(light, session.true, _gain(session, slot), defocus=False)
+    return eight_bit(grey_of_light(light, _curve(session)), 0.0, None)
+
+
+def sample_imu(session: Session) -> ImuLog:
+    """Gyroscope (scale × true + bias + noise) and accelerometer, at the IMU's place and in its axes."""
+    settings, true = session.settings, session.true
+    time_ns = np.arange(session.imu_span_s[0], session.imu_span_s[1], 1 / settings.imu_rate_hz) * 1e9
+    time_ns = np.rint(time_ns).astype(np.int64)
+    time_s = time_ns * 1e-9
+    rng = np.random.default_rng([settings.seed, 4])
+    imu_from_cam = np.array(true.r_cam_imu).T
+    gyro = session.motion.rate_rad_s(time_s) @ imu_from_cam.T
+    gyro = gyro * true.gyro_scale + true.gyro_bias_rad_s + settings.gyro_noise_rad_s * rng.normal(size=gyro.shape)
+    force = session.motion.specific_force_m_s2(time_s, np.array(true.p_cam_imu_m), GRAVITY_WORLD_M_S2)
+    force = force @ imu_from_cam.T + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
+    return ImuLog(int(session.stamp_ns[0]) + time_ns, gyro, force)
+
+
+# ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
+    def refuse(what: str, hint: str) -> None:
+        raise SettingsError(f"simulation: {what}", hint=hint)
+
+    if profile.width % 2 or profile.height % 2:
+        refuse(f"{profile.width}x{profile.height} is odd", "H.264 needs even width and height")
+    if settings.frames < 1:
+        refuse(f"{settings.frames} frames", "ask for at least 1")
+    if not 1 <= settings.fps <= 1000:
+        refuse(f"{settings.fps:g} frames per second", "use 1 to 1000")
+    if not settings.exposure_s or min(settings.exposure_s) <= 0:
+        refuse("the exposure is not positive", "use about 1 to 20 ms")
+    if settings.imu_rate_hz < 1 or settings.noise_levels < 0 or settings.rate_rad_s < 0:
+        refuse("a negative rate or noise", "use 0 or more")
+
+
+def _stamp_tick(index: int, fps: float) -> int:
+    return round(index * TICKS_PER_S / fps)
+
+
+def _stamp_s(index: int, fps: float) -> float:
+    """Stamp of a capture from stamp_0, camera clock: its tick, cut to a whole microsecond."""
+    return (_stamp_tick(index, fps) * 1_000_000 // TICKS_PER_S) * 1e-6
+
+
+def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: float) -> float:
+    start_cam = stamp_s - STAMP_PLACE[true.shutter.timestamp] * true_exposure_s
+    return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0)
+
+
+def _shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np.int64]:
+    """Slot k shows capture k + lag − repeats so far; the repeats are spread over slots 1 … frames."""
+    slots = np.arange(settings.frames)
+    last = true.extensions.frame_lag_frames
+    lag = round(true.extensions.frame_lag_s * settings.fps)
+    if not last or not lag:
+        return slots
+    if lag > last:
+        raise SettingsError(
+            f"a frame lag of {lag} frames cannot be used up in {last} slots", hint="give more slots or a smaller lag"
+        )
+    repeats = np.round(np.arange(1, lag + 1) * last / lag).astype(int)
+    return slots + lag - np.searchsorted(repeats, slots, side="right")
+
+
+def _draw_scene(nominal: CameraProfile, motion: HandMotion, settings: SessionSettings, duration_s: float) -> Scene:
+    """A chart that covers all that an upright view of the motion sees, half a second before and after too."""
+    lens = nominal.intrinsics
+    if lens is None:
+        raise SettingsError("a simulated camera needs a focal length", hint="set intrinsics.fx_px")
+    x, y = pixel_rays(lens)
+    x, y = np.abs(x).max() * _SCENE_MARGIN, np.abs(y).max() * _SCENE_MARGIN
+    corners = np.array([[i, j, 1.0] for i in (-x, 0, x) for j in (-y, 0, y)])
+    turns = motion.rotation(np.linspace(-0.5, duration_s + 0.5, 400)).as_matrix()
+    rays = np.einsum("tij,kj->tki", turns, corners)
+    plane = np.abs(rays[..., :2] / np.maximum(rays[..., 2:], 0.3)).max(axis=(0, 1))
+    extent = np.minimum(plane, 3.0)
+    return make_scene(
+        settings.scene,
+        np.random.default_rng([settings.seed, 0]),
+        focal_px=max(lens.fx_px, lens.fy_px),
+        half_extent=(float(extent[0]), float(extent[1])),
+        oversampling=settings.oversampling,
+    )
+
+
+def _at_median_depth(
+    scene: Scene, motion: HandMotion, true: CameraProfile, settings: SessionSettings, shows: NDArray[np.int64]
+) -> Scene:
+    """The plane moved so that the median over the frames of the distance along the optical axis is its depth."""
+    exposure = settings.exposure_s[0] * true.shutter.exposure_scale
+    times = np.array([_first_row_start_s(true, _stamp_s(int(k), settings.fps), exposure) for k in shows])
+    axis = motion.rotation(times).as_matrix()[:, :, 2]
+    normal = np.array(scene.normal)
+    middle = true.depth_m or np.inf
+    for _ in range(4):
+        to_plane = (np.array([0, 0, middle]) - motion.position_m(times)) @ normal
+        middle += scene.depth_m - float(np.median(to_plane / (axis @ normal)))
+    return dataclasses.replace(scene, depth_m=middle)
+
+
+def _gain(session: Session, slot: int) -> float:
+    """Gain of the first slot that shows this slot's capture, so that repeats are exact."""
+    gain = session.true.extensions.gain
+    first = int(np.argmax(session.shows == session.shows[slot]))
+    return gain[first] if first < len(gain) else 1.0
+
+
+def _curve(session: Session) -> ResponseCurve:
+    return session.true.response or ResponseCurve("srgb")
