@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from virest.restoration.capture import RestorationPlan
 
 from virest.app import jobs
 from virest.app.jobs import Segment, Workers, cut_frames, cut_imu, run_segment, run_segments
@@ -20,6 +19,7 @@ from virest.capture.folder import Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.video import MovieIndex
 from virest.errors import OutputError, RestorationError, VideoError
+from virest.restoration.capture import RestorationPlan
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import RestorationSettings
 
@@ -103,12 +103,18 @@ def pictures(segment: Segment) -> set[str]:
 
 
 def test_cuts_lie_at_key_frames_and_keep_segments_short() -> None:
-    """Every frame is in one segment, in order; none is longer than 16; key frames start segments where they can."""
-    frames = frames_of(*range(70))
-    parts = cut_frames(frames, (0, 12, 24, 60))
+    """Every frame is in one segment, in order; key frames start segments unless those would be very short."""
+    parts = cut_frames(frames_of(*range(70)), (0, 12, 24, 54))
     assert [frame.index for part in parts for frame in part] == list(range(70))
-    assert [part[0].index for part in parts] == [0, 12, 24, 40, 56]
-    assert max(map(len, parts)) <= 16
+    assert [part[0].index for part in parts] == [0, 10, 20, 30, 40, 50, 63]
+    assert [part[0].index for part in cut_frames(frames_of(*range(24)), (0, 8, 16))] == [0, 8, 16]
+
+
+def test_segments_grow_with_the_distance_from_the_key_frame() -> None:
+    """A movie with one key frame is not decoded again and again for a few frames each."""
+    lengths = [len(part) for part in cut_frames(frames_of(*range(300)), (0,))]
+    assert lengths[:4] == [10, 10, 10, 15]
+    assert max(lengths) == 30
 
 
 def test_cuts_of_every_fifth_frame_fall_where_a_key_frame_was_passed() -> None:

@@ -23,6 +23,7 @@ from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHU
 
 log = logging.getLogger(__name__)
 
+DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
 USAGE = 2
 INTERRUPTED = 130
 TERMINATED = 143
@@ -217,10 +218,108 @@ def inspect(
     return _batch_code(codes)
 
 
+def _parse_exposures(text: str) -> list[float]:
+    """Exposures in milliseconds, separated by commas."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no list of milliseconds; write 10 or 5,10,20") from None
+
+
+def _describe_simulation(facts: dict[str, Any]) -> str:
+    effects = [
+        f"{effect['name']} ({', '.join(f'{name} {value}' for name, value in effect['parameters'].items())})"
+        for effect in facts["effects"]
+    ]
+    size = f"{facts['frames']} frames of {facts['width']}x{facts['height']}"
+    return f"{facts['capture']}: {size}, blur {facts['blur_px']} px, effects: {', '.join(effects) or 'none'}"
+
+
 def _first_error(facts: dict[str, Any]) -> str:
     """What makes a capture unusable, of all that was noted."""
     errors = [note["text"] for note in facts["notes"] if note["severity"] == "error"]
     return errors[0] if errors else f"{facts['capture']}: cannot be used"
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the capture to write.")],
+    scene: Annotated[str, typer.Option(metavar="KIND", help="leaves, bright, board or text.")] = "leaves",
+    width: Annotated[int, typer.Option(metavar="PX")] = 720,
+    height: Annotated[int, typer.Option(metavar="PX")] = 1280,
+    frames: Annotated[int, typer.Option(metavar="N")] = 12,
+    fps: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
+    exposure_ms: Annotated[str, typer.Option(metavar="MS[,MS...]", help="Exposure; several are taken in turn.")] = "10",
+    readout_ms: Annotated[float, typer.Option(metavar="MS", help="First row to one past the last.")] = 20.0,
+    direction: Annotated[
+        str | None,
+        typer.Option(metavar="DIRECTION", callback=_one_of(DIRECTIONS), help=f"Readout: {', '.join(DIRECTIONS)}."),
+    ] = None,
+    focal_px: Annotated[float | None, typer.Option(metavar="PX", help="Focal length.")] = None,
+    rate: Annotated[float, typer.Option(metavar="RAD_S", help="How fast the hand turns.")] = 1.0,
+    noise: Annotated[float, typer.Option(metavar="LEVELS", help="Noise of the picture, grey levels.")] = 1.5,
+    response: Annotated[
+        str, typer.Option(metavar="CURVE", help="srgb, linear, gamma:2.2, five_segment[:xb,yb,xc,yc,y_max].")
+    ] = "srgb",
+    depth_m: Annotated[float | None, typer.Option(metavar="M", help="Distance of the scene. [infinity]")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Take the camera from this profile.")] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=VALUE]", help="Hide this effect in the capture; may be repeated."),
+    ] = None,
+    reference: Annotated[
+        str, typer.Option(metavar="|".join(REFERENCES), callback=_one_of(REFERENCES), help="Of the truth pictures.")
+    ] = REFERENCES[0],
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="The same seed gives the same capture.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a simulated capture.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Write a capture with known truth: movie, logs, camera.yaml, and truth/ with sharp frames and the motion.
+
+    \b
+    $ virest simulate leaves --frames 20 --rate 1.5 --effect time_offset=0.012
+    leaves: 20 frames of 720x1280, blur 9.1 px, effects: time_offset (time_offset_s 0.012)
+    $ virest process leaves
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    exposures_ms = _parse_exposures(exposure_ms)
+    _one_thread_each()
+    from virest.app.simulate import simulate_command
+    from virest.camera.profile import read_profile
+
+    with console.progress_bar(frames, "simulate", quiet=quiet) as bar:
+        facts = simulate_command(
+            out,
+            scene=scene,
+            width=width,
+            height=height,
+            frames=frames,
+            fps=fps,
+            exposure_ms=exposures_ms,
+            readout_ms=readout_ms,
+            direction=direction,
+            focal_px=focal_px,
+            rate_rad_s=rate,
+            noise_levels=noise,
+            response=response,
+            depth_m=depth_m,
+            profile=read_profile(config) if config else None,
+            effects=effect or [],
+            reference=reference,
+            seed=seed,
+            overwrite=overwrite,
+            progress=(lambda _done, _total: bar.update(1)) if bar else None,
+        )
+    if json:
+        from virest.app.outputs import json_line
+
+        console.emit(json_line(facts))
+    else:
+        console.emit(_describe_simulation(facts))
+    return 0
 
 
 # ── help for the commands ────────────────────────────────────────────────────────────────────────────────────────

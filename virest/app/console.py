@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import sys
@@ -100,11 +99,6 @@ def emit(text: str) -> None:
     except OSError as error:
         silence_stdout()
         raise OutputError(f"standard output: {error.strerror}", hint="make room there, or write elsewhere") from error
-
-
-def emit_json(value: Any) -> None:
-    """Write one JSON object on one line."""
-    emit(json.dumps(value, allow_nan=False))
 
 
 def silence_stdout() -> None:

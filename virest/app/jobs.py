@@ -34,8 +34,7 @@ from virest.restoration.frame import RestoredFrame
 
 log = logging.getLogger(__name__)
 
-MIN_SEGMENT_FRAMES = 8
-MAX_SEGMENT_FRAMES = 16
+MIN_SEGMENT_FRAMES, USUAL_SEGMENT_FRAMES, MAX_SEGMENT_FRAMES = 5, 10, 30
 IMU_MARGIN_S = 1.0
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -65,20 +64,20 @@ class Segment:
 
 
 def cut_frames(frames: Sequence[Frame], keyframes: Iterable[int]) -> list[tuple[Frame, ...]]:
-    """Cut frames into runs of 8 to 16, at frames that the decoder can start from where there are some."""
-    starts = sorted(keyframes)
+    """Cut frames into runs of about ten, at frames that the decoder can start from where there are some.
+
+    Far from a key frame runs are longer, since a worker decodes everything from the key frame on.
+    """
+    starts = np.array(sorted({0, *keyframes}))
     parts: list[list[Frame]] = []
+    limit = 0
     for frame in frames:
-        if not parts or len(parts[-1]) >= MAX_SEGMENT_FRAMES or _cut_before(frame, parts[-1], starts):
+        key = int(starts[np.searchsorted(starts, frame.index, side="right") - 1])
+        if not parts or len(parts[-1]) >= limit or (len(parts[-1]) >= MIN_SEGMENT_FRAMES and key > parts[-1][-1].index):
             parts.append([])
+            limit = min(max(USUAL_SEGMENT_FRAMES, (frame.index - key) // 2), MAX_SEGMENT_FRAMES)
         parts[-1].append(frame)
     return [tuple(part) for part in parts]
-
-
-def _cut_before(frame: Frame, part: list[Frame], starts: list[int]) -> bool:
-    """Whether a key frame lies between the part's last frame and this one, and the part is long enough."""
-    at = int(np.searchsorted(starts, part[-1].index, side="right"))
-    return len(part) >= MIN_SEGMENT_FRAMES and at < len(starts) and starts[at] <= frame.index
 
 
 def cut_imu(imu: ImuSamples, frames: Sequence[Frame], plan: RestorationPlan) -> ImuSamples:

@@ -9,11 +9,13 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app import console
@@ -224,8 +226,13 @@ def _input_files(capture: Capture, config: Path | None) -> Iterator[Path]:
 
 def _plan(job: _Job, index: MovieIndex, settings: RestorationSettings) -> RestorationPlan:
     """Have what is unknown estimated; say what was found."""
-    read_movie_gray = partial(read_gray, job.capture.movie, index)
-    plan = plan_restoration(job.capture, job.profile, settings, read_movie_gray)
+
+    def read_decodable(numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        for number, picture in read_gray(job.capture.movie, index, numbers):
+            if picture is not None:
+                yield number, picture
+
+    plan = plan_restoration(job.capture, job.profile, settings, read_decodable)
     for name, estimate in plan.profile.estimates.items():
         if name not in job.profile.estimates:
             spread = "" if estimate.std is None else f" ± {estimate.std}"

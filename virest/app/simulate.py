@@ -108,7 +108,7 @@ def simulate_command(
 
 
 def parse_response(text: str) -> ResponseCurve:
-    """A curve from the command line: ``srgb``, ``linear``, ``gamma:2.2`` or ``five_segment[:xb,yb,xc,yc,y_max]``."""
+    """Parse a curve: ``srgb``, ``linear``, ``gamma:2.2`` or ``five_segment[:xb,yb,xc,yc,y_max]``."""
     kind, _, numbers = text.partition(":")
     kind = kind.strip().replace("-", "_")
     try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,8 @@ MIN_EXPLAINED = 0.5
 """Pictures follow the gyroscope if it explains this part of their rotation. Unrelated motion seldom reaches 0.3."""
 MIN_DISTINCT = 1.6
 """The best offset leaves less than 1 / this of what the second best leaves unexplained."""
+MAX_POINTS = 5000
+"""Tracked points used in the fine fit; evenly thinned beyond."""
 MIN_MOTION_PX = 0.4
 """Least rms of the pictures' changing rotation from frame to frame, at the focal length."""
 MAX_STD_S = 0.02
@@ -52,6 +54,8 @@ UNKNOWN_EXPOSURE_STD_S = 0.008
 TRANSLATION_RATIO = 1.25
 """Differences this much larger in all directions than across the best parallax mean that the camera moves."""
 COMMON_RATIO = 1.15
+MAX_BIAS_SIGMA = 4.0
+"""A bias further from the profile's than this many prior deviations is a sign of an unmodelled scene or lens."""
 AGREEMENT_SLACK_S = 0.03
 """An offset wrong by this is a matter for calibration, not a sign that pictures and gyroscope are strangers."""
 GUESSED_FOCAL = 0.8
@@ -229,7 +233,21 @@ def _observe(
     centre_s = shutter.first_row_start_s(time_s, exposure_s) + 0.5 * (shutter.true_exposure_s(exposure_s) + readout_s)
     lens = profile.intrinsics or _guessed_lens(profile)
     turns = picture_turns(lens, kept, centre_s[[pair.first for pair in kept]], centre_s[[pair.second for pair in kept]])
+    kept = _thinned(kept)
     return _Observed(kept, time_s, exposure_s, known, lens, profile, turns, integrate_gyro(imu, profile)), ""
+
+
+def _thinned(pairs: list[TrackPair]) -> list[TrackPair]:
+    stride = -(-sum(len(pair) for pair in pairs) // MAX_POINTS)
+    return [
+        replace(
+            pair,
+            points_first_px=pair.points_first_px[::stride],
+            points_second_px=pair.points_second_px[::stride],
+            forward_backward_px=None,
+        )
+        for pair in pairs
+    ]
 
 
 def _guessed_lens(profile: CameraProfile) -> Intrinsics:
@@ -261,19 +279,28 @@ def _distinct_peak(scan: OffsetScan, search_s: float) -> tuple[int | None, str]:
         )
     if best in (0, len(scan.offset_s) - 1):
         return None, f"the offset lies at the end of the search (±{search_s:g} s)"
-    if len(peaks) > 1:
-        other = int(peaks[1])
-        left, left_other = 1 - explained, 1 - float(scan.explained[other])
-        if left_other < MIN_DISTINCT * left:
+    others = peaks[~_same_valley(scan, best)[peaks]]
+    if len(others):
+        left_other = 1 - float(scan.explained[others[0]])
+        if left_other < MIN_DISTINCT * (1 - explained):
             return None, (
-                f"offsets of {scan.offset_s[best]:+.3f} and {scan.offset_s[other]:+.3f} s explain the pictures "
+                f"offsets of {scan.offset_s[best]:+.3f} and {scan.offset_s[others[0]]:+.3f} s explain the pictures "
                 f"about equally well ({explained:.0%}, {1 - left_other:.0%})"
             )
     return best, ""
 
 
-def _fit(observed: _Observed, offset_s: float, gain: float) -> tuple[PointFit, float, float]:
-    """The fit with the translation model that the differences ask for, the offset's variance, rotation-only noise."""
+def _same_valley(scan: OffsetScan, best: int) -> NDArray[np.bool_]:
+    """(k,) the offsets around the best one, up to where twice as much is left unexplained."""
+    worse = 1 - scan.explained > 2 * (1 - scan.explained[best])
+    numbers = np.arange(len(worse))
+    below = np.max(numbers[worse & (numbers < best)], initial=-1)
+    above = np.min(numbers[worse & (numbers > best)], initial=len(worse))
+    return (numbers > below) & (numbers < above)
+
+
+def _fit(observed: _Observed, offset_s: float, gain: float) -> tuple[PointFit, Array, float]:
+    """The fit with the translation model that the differences ask for, the variances (13,), rotation-only noise."""
     model, start = _point_model(observed, offset_s)
     active = mask("offset", "bias")
     if not observed.profile.readout_known:
@@ -281,20 +308,44 @@ def _fit(observed: _Observed, offset_s: float, gain: float) -> tuple[PointFit, f
     if observed.profile.intrinsics is None:
         active |= mask("log_focal")
         start[5] = np.log(gain)
+    chosen, other, rotation_noise = _chosen_model(model, start, active)
+    strange = np.abs(chosen.values - model.prior_mean)[1:4] > MAX_BIAS_SIGMA * model.prior_std[1:4]
+    if strange.any():
+        log.debug("bias %s is none that a gyroscope has: held", chosen.values[1:4])
+        active &= ~mask("bias")
+        chosen, other, rotation_noise = _chosen_model(model, start, active)
+    own = np.diag(chosen.covariance(chosen.active))
+    disagreement = _excess(chosen.values - other.values, np.diag(other.covariance(other.active)) - own)
+    disagreement = np.where(active, disagreement, 0.0)
+    left_open = {name: _excess_with(chosen, name) for name in ("readout", "drift", "tilt", "log_focal")}
+    variance = own + disagreement + np.where(active, sum(left_open.values()), 0.0)
+    _log_fit(chosen, own, disagreement, left_open)
+    return chosen, np.where(active | ~mask("bias"), variance, model.prior_std**2), rotation_noise
+
+
+def _chosen_model(model: PointModel, start: Array, active: NDArray[np.bool_]) -> tuple[PointFit, PointFit, float]:
+    """The fit with the simplest sufficient translation, the next best one, and the noise of the rotation-only fit."""
     rotation = _settled(model, start, active, "rotation")
-    pairwise = _settled(model, rotation.values, active, "pairwise")
+    moving = active | mask("flow")
+    pairwise = _settled(model, rotation.values, moving, "pairwise")
     if rotation.noise_px < TRANSLATION_RATIO * pairwise.noise_px:
-        chosen, other = rotation, pairwise
-    else:
-        common = _settled(model, rotation.values, active, "common")
-        chosen, other = (
-            (common, pairwise) if common.noise_px < COMMON_RATIO * pairwise.noise_px else (pairwise, rotation)
-        )
-    variance = chosen.covariance(active)[0, 0]
-    disagreement = _excess(chosen.values[0] - other.values[0], other.covariance(active)[0, 0] - variance)
-    open_questions = [_excess_with(chosen, names) for names in ("readout", "drift", "tilt", "log_focal")]
-    log.debug("offset: %s std %.2g, models %.2g, open %s", chosen.values, variance**0.5, disagreement, open_questions)
-    return chosen, float(variance + disagreement + sum(open_questions)), rotation.noise_px
+        return rotation, pairwise, rotation.noise_px
+    common = _settled(model, rotation.values, moving, "common")
+    if common.noise_px < COMMON_RATIO * pairwise.noise_px:
+        return common, pairwise, rotation.noise_px
+    return pairwise, common, rotation.noise_px
+
+
+def _log_fit(fit: PointFit, own: Array, disagreement: Array, left_open: dict[str, Array]) -> None:
+    parts = ", ".join(f"{name} {1e3 * np.sqrt(excess[0]):.3f}" for name, excess in left_open.items())
+    log.debug(
+        "offset %.3f ms (%s): own std %.3f, other translation model %.3f, left open: %s",
+        1e3 * fit.values[0],
+        fit.model,
+        1e3 * np.sqrt(own[0]),
+        1e3 * np.sqrt(disagreement[0]),
+        parts,
+    )
 
 
 def _point_model(observed: _Observed, offset_s: float) -> tuple[PointModel, Array]:
@@ -329,41 +380,41 @@ def _settled(model: PointModel, start: Array, active: NDArray[np.bool_], transla
     return fit_points(model, fit.values, active, translation, overdispersion=block_disagreement(fit))
 
 
-def _excess(shift: float, expected_variance: float) -> float:
-    """The part of a squared shift that the extra freedom's own noise does not explain."""
-    return max(shift**2 - max(expected_variance, 0.0), 0.0)
+def _excess(shift: Array, expected_variance: Array) -> Array:
+    """The part of squared shifts that the extra freedom's own noise does not explain."""
+    return np.maximum(shift**2 - np.maximum(expected_variance, 0.0), 0.0)
 
 
-def _excess_with(fit: PointFit, name: str) -> float:
-    """How far freeing one more quantity would move the offset, squared, beyond its noise; 0 where it is free already."""
+def _excess_with(fit: PointFit, name: str) -> Array:
+    """How far freeing one more quantity would move the others (13,), squared, beyond its noise; 0 if free already."""
     wider = fit.active | mask(name)
     if (wider == fit.active).all():
-        return 0.0
-    return _excess(fit.step(wider)[0], fit.covariance(wider)[0, 0] - fit.covariance(fit.active)[0, 0])
+        return np.zeros(len(wider))
+    return _excess(fit.step(wider), np.diag(fit.covariance(wider)) - np.diag(fit.covariance(fit.active)))
 
 
 def _conclude(
-    observed: _Observed, fit: PointFit, variance: float, rotation_noise_px: float, search_s: float
+    observed: _Observed, fit: PointFit, variance: Array, rotation_noise_px: float, search_s: float
 ) -> OffsetEstimate:
     profile, values = observed.profile, fit.values
-    covariance = fit.covariance(fit.active)
     notes = []
+    std_s = float(np.hypot(np.sqrt(variance[0]), SMALLEST_STD_S))
+    explained = _explained_at(observed, float(values[0]))
+    determined, problem = _verdict(values[0], std_s, explained, profile, search_s)
     if not observed.exposure_known:
-        variance += UNKNOWN_EXPOSURE_STD_S**2
+        std_s = float(np.hypot(std_s, UNKNOWN_EXPOSURE_STD_S))
         notes.append("exposure unknown: the offset contains half of it")
     if not profile.readout_known:
         notes.append("readout unknown: the offset and half the readout are determined together only")
     wider = fit.active | mask("drift")
     drift, drift_std = values[6] + fit.step(wider)[6], float(np.sqrt(fit.covariance(wider)[6, 6]))
     if abs(drift) > 4 * drift_std and abs(drift) > 5e-4:
+        std_s = float(np.hypot(std_s, drift * _rms_time_s(observed)))
         notes.append(f"the offset drifts by {1e3 * drift:.2f} ms a second: the clocks' rates differ")
-    explained = _explained_at(observed, float(values[0]))
-    std_s = float(np.hypot(np.sqrt(variance), SMALLEST_STD_S))
-    determined, problem = _verdict(values[0], std_s, explained, profile, search_s)
     to_imu = profile.rotation_cam_imu.T
     bias = np.array(profile.gyro_bias_rad_s) + np.array(profile.gyro_scale) * (to_imu @ values[1:4])
-    bias_std = np.sqrt(np.diag(to_imu @ covariance[1:4, 1:4] @ to_imu.T)) * np.abs(profile.gyro_scale)
-    focal, focal_std = _focal(observed, fit, covariance)
+    bias_std = np.sqrt(to_imu**2 @ variance[1:4]) * np.abs(profile.gyro_scale)
+    focal, focal_std = _focal(observed, fit, variance)
     return OffsetEstimate(
         time_offset_s=float(values[0]),
         std_s=std_s,
@@ -373,7 +424,7 @@ def _conclude(
         noise_px=fit.noise_px,
         explained=explained,
         readout_s=float(values[4]),
-        readout_std_s=float(np.sqrt(covariance[4, 4])),
+        readout_std_s=float(np.sqrt(variance[4])),
         drift_s_per_s=float(drift),
         drift_std_s_per_s=drift_std,
         focal_px=focal,
@@ -384,6 +435,11 @@ def _conclude(
         determined=determined,
         reason="; ".join(([problem] if problem else []) + notes),
     )
+
+
+def _rms_time_s(observed: _Observed) -> float:
+    """Typical distance of the pairs from stamp_0, from where a drifting offset is counted."""
+    return float(np.sqrt(np.mean(observed.turns.middle_s**2)))
 
 
 def _verdict(
@@ -406,8 +462,8 @@ def _explained_at(observed: _Observed, offset_s: float) -> float:
     )
 
 
-def _focal(observed: _Observed, fit: PointFit, covariance: Array) -> tuple[float | None, float | None]:
-    spread = float(np.sqrt(covariance[5, 5]))
+def _focal(observed: _Observed, fit: PointFit, variance: Array) -> tuple[float | None, float | None]:
+    spread = float(np.sqrt(variance[5]))
     if not fit.active[5] or spread > 0.25:
         return None, None
     focal = observed.lens.fx_px * float(np.exp(fit.values[5]))

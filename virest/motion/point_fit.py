@@ -22,13 +22,28 @@ from virest.motion.trajectory import Trajectory, rotation_from_vector
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-PARAMETERS = ("offset", "bias_x", "bias_y", "bias_z", "readout", "log_focal", "drift", "tilt_x", "tilt_y", "tilt_z")
-"""offset (s); used minus true rate, camera axes (rad/s); readout (s); log of the focal scale; drift of the offset (s/s);
-rotation vector on the left of R_cam_imu (rad)."""
-QUOTIENT_STEP = np.array([2e-4, 1e-3, 1e-3, 1e-3, 5e-4, 2e-3, 1e-4, 1e-3, 1e-3, 1e-3])
-PRIOR_STD = np.array([np.inf, 0.02, 0.02, 0.02, 0.002, 0.05, 0.005, 0.03, 0.03, 0.03])
+PARAMETERS = (
+    "offset",
+    "bias_x",
+    "bias_y",
+    "bias_z",
+    "readout",
+    "log_focal",
+    "drift",
+    "tilt_x",
+    "tilt_y",
+    "tilt_z",
+    "flow_x",
+    "flow_y",
+    "flow_z",
+)
+"""offset (s); bias: used minus true rate, camera axes (rad/s); readout (s); log of the focal scale; drift of the offset
+(s/s); tilt: rotation vector on the left of R_cam_imu (rad); flow: minus the mean velocity over the typical depth (1/s),
+without which a steady parallax would be taken for bias."""
+QUOTIENT_STEP = np.array([2e-4, 1e-3, 1e-3, 1e-3, 5e-4, 2e-3, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])
+PRIOR_STD = np.array([np.inf, 0.02, 0.02, 0.02, 0.002, 0.05, 0.005, 0.03, 0.03, 0.03, 0.3, 0.3, 0.3])
 """About zero, and about the profile's readout; an unknown readout or focal length has its own."""
-LARGEST_STEP = np.array([0.01, 0.05, 0.05, 0.05, 0.01, 0.2, 0.005, 0.05, 0.05, 0.05])
+LARGEST_STEP = np.array([0.01, 0.05, 0.05, 0.05, 0.01, 0.2, 0.005, 0.05, 0.05, 0.05, 0.3, 0.3, 0.3])
 READOUT_RANGE_S = (0.0, 1 / 30)
 """Of an unknown readout: evenly spread, so its prior is the middle with the standard deviation of a flat one."""
 UNKNOWN_FOCAL_STD = 0.35
@@ -39,9 +54,10 @@ CAUCHY = 2.4
 QUANTILE = 0.4
 NORMAL_QUANTILE, RAYLEIGH_QUANTILE = 0.5244, 1.0108
 """What 40 % of |x| and of √(x² + y²) stay below, for x and y of unit variance; 40 % bears more outliers than the median."""
+INDEPENDENT_DEPTHS = 5
 DIRECTION_PASSES = 4
 MAX_ITERATIONS = 15
-CONVERGED_S = 2e-7
+CONVERGED_S = 1e-6
 SMALLEST_NOISE_PX = 1e-3
 
 
@@ -81,9 +97,9 @@ class PointModel:
     lens: Intrinsics
     clock_skew: float
     prior_mean: Array
-    """(10,) PARAMETERS before the pictures were seen, and where the fit of what is held stays."""
+    """(13,) PARAMETERS before the pictures were seen, and where the fit of what is held stays."""
     prior_std: Array
-    """(10,)."""
+    """(13,)."""
 
     def lens_at(self, values: Array) -> Intrinsics:
         """The lens with the fitted focal scale."""
@@ -100,6 +116,7 @@ class PointModel:
         half = rotation_from_vector(0.5 * (second - first)[:, None] * bias)
         rays = _turned(half, lens.rays(points.first_px) @ tilt)
         rays = _turned(half, _turned(np.swapaxes(after, -1, -2), _turned(before, rays))) @ tilt.T
+        rays = rays + (second - first)[:, None] * values[10:13]
         rays[:, 2] = np.maximum(rays[:, 2], 0.05)
         return lens.project(rays), rays
 
@@ -117,26 +134,26 @@ class PointFit:
 
     model: str
     values: Array
-    """(10,) PARAMETERS."""
+    """(13,) PARAMETERS."""
     active: Mask
-    """(10,) which were fitted; the others were held."""
+    """(13,) which were fitted; the others were held."""
     noise_px: float
     """Robust standard deviation of the differences per coordinate; across the parallax where that is modelled."""
     along_px: float
     """The same along the parallax."""
     hessian: Array
-    """(b, 10, 10) one summand for each block of consecutive pairs, in units of the noise."""
+    """(b, 13, 13) one summand for each block of consecutive pairs, in units of the noise."""
     gradient: Array
-    """(b, 10)."""
+    """(b, 13)."""
     prior_mean: Array
-    """(10,)."""
+    """(13,)."""
     prior_information: Array
-    """(10,) 1 / variance."""
+    """(13,) 1 / variance."""
     overdispersion: float
     """How much more the blocks disagree than independent points would; at least 1."""
 
     def step(self, active: Mask, without: int | None = None) -> Array:
-        """The Gauss-Newton step from here (10,), perhaps with other parameters active, or without one block."""
+        """The Gauss-Newton step from here (13,), perhaps with other parameters active, or without one block."""
         hessian, gradient = self.hessian.sum(axis=0), self.gradient.sum(axis=0)
         if without is not None:
             hessian, gradient = hessian - self.hessian[without], gradient - self.gradient[without]
@@ -148,7 +165,7 @@ class PointFit:
         return step
 
     def covariance(self, active: Mask) -> Array:
-        """(10, 10), zero for what is held: the curvature's with the priors, raised to the delete-a-block jackknife's."""
+        """(13, 13), zero for what is held: the curvature's with the priors, raised to the delete-a-block jackknife's."""
         matrix = self.hessian.sum(axis=0) / self.overdispersion + np.diag(self.prior_information)
         full = np.zeros_like(matrix)
         full[np.ix_(active, active)] = np.linalg.pinv(matrix[np.ix_(active, active)], rcond=1e-13, hermitian=True)
@@ -162,12 +179,12 @@ class PointFit:
 
 
 def mask(*names: str) -> Mask:
-    """(10,) true for the named PARAMETERS; ``bias`` and ``tilt`` name all three axes."""
+    """(13,) true for the named PARAMETERS; ``bias``, ``tilt`` and ``flow`` name all three axes."""
     return np.array([name in names or name.rsplit("_", 1)[0] in names for name in PARAMETERS])
 
 
 def priors(profile: CameraProfile) -> tuple[Array, Array]:
-    """Mean and standard deviation (10,) of the PARAMETERS for a profile."""
+    """Mean and standard deviation (13,) of the PARAMETERS for a profile."""
     mean, std = np.zeros(len(PARAMETERS)), PRIOR_STD.copy()
     mean[4] = profile.shutter.readout_time_s
     if not profile.readout_known:
@@ -209,7 +226,7 @@ def fit_points(
 ) -> PointFit:
     """Gauss-Newton with Cauchy weights at the noise as measured in each iteration.
 
-    start: (10,) PARAMETERS to begin from.  translation: one of MODELS; its directions are fitted with the rest.
+    start: (13,) PARAMETERS to begin from.  translation: one of MODELS; its directions are fitted with the rest.
     overdispersion: from an earlier fit, so that the priors weigh as they should against the data.
     """
     values, directions = start.copy(), None
@@ -283,7 +300,7 @@ def _linearised(
 def _split(
     difference: Array, slope: Array, flow: Array, directions: Array, group: NDArray[np.intp], pair: NDArray[np.intp]
 ) -> tuple[Array, Array, Array, float, float]:
-    """Rows (n, 2, 10), differences (n, 2) and weights (n, 2): across and along the parallax, directions eliminated."""
+    """Rows (n, 2, 13), differences (n, 2) and weights (n, 2): across and along the parallax, directions eliminated."""
     way = np.einsum("nij,nj->ni", flow, directions[group])
     way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
     normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
@@ -300,12 +317,16 @@ def _split(
 
 
 def _pair_spread(along: Array, pair: NDArray[np.intp], noise: float) -> Array:
-    """(n,) robust standard deviation along the parallax in the point's pair, at least the noise."""
+    """(n,) standard deviation along the parallax that gives the point's pair its due weight.
+
+    Depth is shared by neighbours: a pair's points tell along the parallax as much as INDEPENDENT_DEPTHS points do.
+    """
     spread = np.full(len(along), noise)
     for number in range(int(pair[-1]) + 1):
         own = pair == number
         if own.any():
-            spread[own] = max(_noise(np.abs(along[own]), NORMAL_QUANTILE), noise)
+            parallax = max(_noise(np.abs(along[own]), NORMAL_QUANTILE) ** 2 - noise**2, 0.0)
+            spread[own] = np.sqrt(noise**2 + parallax * max(own.sum() / INDEPENDENT_DEPTHS, 1.0))
     return spread
 
 
@@ -322,7 +343,7 @@ def _direction_columns(along: Array, flow: Array, directions: Array, group: NDAr
 def _without_directions(
     rows: Array, left: Array, turning: Array, weight: Array, group: NDArray[np.intp]
 ) -> tuple[Array, Array]:
-    """Rows (n, 10) and differences (n,) less what turning the group's direction explains (Schur complement)."""
+    """Rows (n, 13) and differences (n,) less what turning the group's direction explains (Schur complement)."""
     both = np.concatenate([rows, left[:, None]], axis=1)
     groups = int(group.max()) + 1
     square = _group_sum(turning[:, :, None] * (turning * weight[:, None])[:, None, :], group, groups) + np.eye(2)

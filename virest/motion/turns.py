@@ -14,7 +14,7 @@ from virest.motion.trajectory import Trajectory, vector_from_rotation
 
 Array = NDArray[np.float64]
 REWEIGHTINGS = 8
-SOFT_CAP = 0.5
+SOFT_CAP = 1.0
 """A pair's deviation counts fully up to about this part of the typical turn; beyond it ever less (moving objects)."""
 
 

@@ -26,6 +26,10 @@ _SIDE = 128
 _WINDOW = np.outer(np.hanning(_SIDE + 2)[1:-1], np.hanning(_SIDE + 2)[1:-1]).astype(np.float32)
 _ROUNDING_POWER = 1 / 12
 _FIT_STEPS = 6
+_MUST_CANCEL = 0.45
+"""Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
+_NOISE_SLOPE = 0.7
+"""Towards low frequencies the power of a coded movie's error grows about like f^−0.7."""
 _NEAR_CLIPPING = 250
 _MAX_CLIPPED = 0.002
 """Tiles with a larger part of clipped pixels are no linear blur and tell nothing of the noise."""
@@ -157,17 +161,19 @@ def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> Pi
         signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
     spread = np.sqrt(np.maximum(total(k * k) / count - mean_k**2, 0))
-    return _settled(signal, noise, mean_k, determined=(spread > 0.1) & (count > 20))
+    return _settled(signal, noise, mean_k, determined=(spread > 0.1) & (mean_k < _MUST_CANCEL) & (count > 20))
 
 
 def _settled(signal: Array, noise: Array, passed: Array, determined: NDArray[np.bool_]) -> PictureStatistics:
-    """Rings that cannot tell S from N borrow the noise of the nearest that can; S never rises with frequency."""
+    """Rings that cannot tell S from N borrow the noise of those that can; S never rises with frequency."""
     frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
     if not determined.any():
         return _unknown_picture()
     through = passed * signal + noise
     noise = np.interp(frequency, frequency[determined], noise[determined])
     noise = np.maximum.accumulate(noise[::-1])[::-1]
+    lowest = frequency[determined][0]
+    noise *= np.maximum(lowest / frequency, 1.0) ** _NOISE_SLOPE
     signal = np.where(determined, signal, np.maximum(through - noise, 0.05 * through) / np.maximum(passed, 0.05))
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
     return PictureStatistics(frequency, signal, noise, passed)

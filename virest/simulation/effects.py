@@ -1,7 +1,7 @@
 """Hidden effects: what the true camera does and its nominal profile does not say (contract, section 4).
 
-An effect is one line here: where its value goes in the profile, and what size it takes when none is given.  The simulator
-then renders with the true profile and writes the nominal one beside the movie.
+An effect is one line here: where its value goes in the profile, and what size it takes when none is given.  The
+simulator then renders with the true profile and writes the nominal one beside the movie.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def effect_names() -> tuple[str, ...]:
 def hide_effects(
     nominal: CameraProfile, texts: list[str] | tuple[str, ...], context: EffectContext
 ) -> tuple[CameraProfile, tuple[AppliedEffect, ...]]:
-    """The true profile, from a nominal one and effects as ``NAME`` or ``NAME=VALUE[,VALUE…]``.
+    """Make the true profile from a nominal one and effects as ``NAME`` or ``NAME=VALUE[,VALUE…]``.
 
     Sizes of effects without VALUE are drawn from the context's rng.
     """
@@ -113,7 +113,9 @@ def _parse_values(name: str, effect: Effect, text: str, drawn: list[Any], contex
         return _gain_walk(context, numbers[0]) if len(numbers) == 1 else numbers
     wanted = len(drawn)
     if not wanted - effect.optional <= len(numbers) <= wanted:
-        raise SettingsError(f"effect {name} takes {wanted} number(s), got {len(numbers)}", hint=", ".join(effect.parameters))
+        raise SettingsError(
+            f"effect {name} takes {wanted} number(s), got {len(numbers)}", hint=", ".join(effect.parameters)
+        )
     return numbers + drawn[len(numbers) :]
 
 
@@ -121,7 +123,7 @@ def _parse_values(name: str, effect: Effect, text: str, drawn: list[Any], contex
 
 
 def _signed(context: EffectContext, low: float, high: float) -> float:
-    """A value of random sign whose size lies between low and high."""
+    """Draw a value of random sign whose size lies between low and high."""
     return round(float(context.rng.uniform(low, high) * context.rng.choice((-1, 1))), 6)
 
 
@@ -179,7 +181,7 @@ def _draw_frame_lag(_: CameraProfile, context: EffectContext) -> list[float]:
 
 
 def _gain_walk(context: EffectContext, rms: float) -> list[float]:
-    """A smooth brightness drift of the given RMS in log light, median 1."""
+    """Draw a smooth brightness drift of the given RMS in log light, median 1."""
     k = np.arange(context.frames)
     drift = sum(
         np.cos(2 * np.pi * k / period + context.rng.uniform(0, 2 * np.pi)) for period in (7.0, 17.0, 41.0)
@@ -201,7 +203,9 @@ EFFECTS: dict[str, Effect] = {
         lambda p, v: replace(p, time_offset_s=(p.time_offset_s or 0.0) + v[0]),
     ),
     "clock_skew": Effect(
-        ("clock_skew",), lambda p, c: [_signed(c, 0.002, 0.005)], lambda p, v: replace(p, clock_skew=p.clock_skew + v[0])
+        ("clock_skew",),
+        lambda p, c: [_signed(c, 0.002, 0.005)],
+        lambda p, v: replace(p, clock_skew=p.clock_skew + v[0]),
     ),
     "readout_time": Effect(
         ("readout_time_s",),
@@ -235,9 +239,7 @@ EFFECTS: dict[str, Effect] = {
         lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)],
         lambda p, v: replace(p, gyro_scale=tuple(s * v[0] for s in p.gyro_scale)),
     ),
-    "imu_rotation": Effect(
-        ("x", "y", "z"), lambda p, c: [_signed(c, 0.015, 0.04) for _ in range(3)], _rotate_imu
-    ),
+    "imu_rotation": Effect(("x", "y", "z"), lambda p, c: [_signed(c, 0.015, 0.04) for _ in range(3)], _rotate_imu),
     "focal_length": Effect(("focal_scale",), lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)], _scale_focal),
     "focal_drift": Effect(
         ("focal_drift_per_s",),
@@ -256,9 +258,7 @@ EFFECTS: dict[str, Effect] = {
         lambda p, v: _extend(p, stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
         optional=1,
     ),
-    "scene_depth": Effect(
-        ("depth_m",), lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0])
-    ),
+    "scene_depth": Effect(("depth_m",), lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0])),
     "frame_lag": Effect(
         ("lag_s", "frames"),
         _draw_frame_lag,
@@ -266,9 +266,13 @@ EFFECTS: dict[str, Effect] = {
         optional=1,
     ),
     "response_curve": Effect(
-        ("gamma",), lambda p, c: [round(float(np.exp(_signed(c, 0.15, 0.3))), 4)], lambda p, v: _curve(p, extra_gamma=v[0])
+        ("gamma",),
+        lambda p, c: [round(float(np.exp(_signed(c, 0.15, 0.3))), 4)],
+        lambda p, v: _curve(p, extra_gamma=v[0]),
     ),
-    "black_level": Effect(("black_level",), lambda p, c: [_between(c, 0.03, 0.08)], lambda p, v: _curve(p, black_level=v[0])),
+    "black_level": Effect(
+        ("black_level",), lambda p, c: [_between(c, 0.03, 0.08)], lambda p, v: _curve(p, black_level=v[0])
+    ),
     "vignetting": Effect(
         ("corner_loss",), lambda p, c: [_between(c, 0.3, 0.6)], lambda p, v: _extend(p, vignetting_corner_loss=v[0])
     ),

@@ -10,8 +10,8 @@ Row order, lens and stabiliser are derived here, from the profile's numbers only
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +22,7 @@ from virest.simulation.hand_motion import HandMotion
 from virest.simulation.scenes import Scene
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
+Image = NDArray[Any]
 
 STEP_PX = 0.4
 """How far the picture may move between two instants."""
@@ -64,7 +64,7 @@ class View:
 
 
 def make_view(profile: CameraProfile, motion: HandMotion, *, rest_s: float | None = None) -> View:
-    """The rays of a profile's pixels, and the path of its stabiliser along a motion, at rest at ``rest_s``."""
+    """Work out the rays of a profile's pixels and the path of its stabiliser along a motion, at rest at ``rest_s``."""
     lens = _require_lens(profile)
     x, y = pixel_rays(lens)
     x_rate = y_rate = None
@@ -115,7 +115,7 @@ def expose(scene: Scene, motion: HandMotion, view: View, first_row_start_s: floa
 
 
 def instant(scene: Scene, motion: HandMotion, view: View, time_s: float) -> Image:
-    """The light of the whole picture at one time, as a global shutter would see it, without flicker: (h, w, 3)."""
+    """Light of the whole picture at one time, as a global shutter would see it, without flicker: (h, w, 3)."""
     homography = _homographies(scene, motion, np.array([time_s]))[0]
     return scene.sample(homography, *view.rays(time_s, slice(None), slice(None)))
 
@@ -177,7 +177,7 @@ def _require_lens(profile: CameraProfile) -> Intrinsics:
 
 
 def _part(plane: Image, rows: slice, columns: slice) -> Image:
-    """A part of an array that may have a single row or column which stands for all."""
+    """Cut a part of an array that may have a single row or column which stands for all."""
     return plane[rows if plane.shape[0] > 1 else slice(None), columns if plane.shape[1] > 1 else slice(None)]
 
 
@@ -196,7 +196,9 @@ def _picture_speed(scene: Scene, motion: HandMotion, view: View, begin: float, e
     lens = _require_lens(view.profile)
     times = np.linspace(begin, end, 9)
     rate = motion.rate_rad_s(times)
-    speed = lens.fx_px * np.hypot(rate[:, 0], rate[:, 1]) + 0.25 * np.hypot(lens.width, lens.height) * np.abs(rate[:, 2])
+    speed = lens.fx_px * np.hypot(rate[:, 0], rate[:, 1]) + 0.25 * np.hypot(lens.width, lens.height) * np.abs(
+        rate[:, 2]
+    )
     if np.isfinite(scene.depth_m):
         speed = speed + lens.fx_px * np.linalg.norm(motion.sway.at(times, 1), axis=1) / scene.depth_m
     return float(speed.max())

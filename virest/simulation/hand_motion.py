@@ -10,6 +10,7 @@ counted from the first stamp.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,13 +38,13 @@ class Waves:
     """(3, n)."""
 
     def at(self, time_s: Array, derivative: int = 0) -> Array:
-        """The sum or its time derivative of the given order at times (...,): (..., 3)."""
+        """Sum, or its time derivative of the given order at times (...,): (..., 3)."""
         omega = 2 * np.pi * self.frequency_hz
         angle = np.asarray(time_s, float)[..., None, None] * omega + self.phase_rad + derivative * np.pi / 2
         return np.sum(self.amplitude * omega**derivative * np.cos(angle), axis=-1)
 
     def scaled(self, factor: float) -> Waves:
-        """The same motion, ``factor`` times as large."""
+        """Return the same motion, ``factor`` times as large."""
         return Waves(self.frequency_hz, self.amplitude * factor, self.phase_rad)
 
 
@@ -91,7 +92,7 @@ class HandMotion:
         return self.sway.at(time_s)
 
     def specific_force_m_s2(self, time_s: Array, arm_cam_m: Array, gravity_world_m_s2: Array) -> Array:
-        """What an accelerometer at ``arm_cam_m`` in camera axes feels, in camera axes, at times (n,): (n, 3).
+        """Specific force on an accelerometer at ``arm_cam_m`` in camera axes, in camera axes, at times (n,): (n, 3).
 
         ``f = Rᵀ (p'' − g) + ω' × r + ω × (ω × r)``; at rest −g, so +9.8 upwards.
         """
@@ -113,8 +114,8 @@ def random_hand_motion(
 ) -> HandMotion:
     """Hand tremor whose rate has the given RMS (of the vector's length) over [0, duration_s].
 
-    The rate's spectrum rises to about 2 Hz, is flat, and falls above 8 Hz.  Orientations cover ``margin_s`` more on both
-    sides.  ``sway_rms_m`` adds a translation between 0.3 and 2.5 Hz of that RMS length.
+    The rate's spectrum rises to about 2 Hz, is flat, and falls above 8 Hz.  Orientations cover ``margin_s`` more on
+    both sides.  ``sway_rms_m`` adds a translation between 0.3 and 2.5 Hz of that RMS length.
     """
     rate = _random_waves(rng, band_hz, lambda f: (f / 2) / (1 + f / 2) / (1 + (f / 8) ** 2))
     rate = _with_rms(rate, np.array(SHARE_PER_AXIS) * rate_rms_rad_s, duration_s)
@@ -130,7 +131,7 @@ def constant_motion(
     end_s: float = 1.0,
     velocity_free_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> HandMotion:
-    """A constant rate in camera axes at a constant position; the world's axes are the camera's at time 0."""
+    """Turn at a constant rate in camera axes at a constant position; the world's axes are the camera's at time 0."""
     rate = Waves(np.zeros((3, 1)), np.array(rate_rad_s, float)[:, None], np.zeros((3, 1)))
     sway = Waves(np.zeros((3, 1)), np.array(velocity_free_position_m, float)[:, None], np.zeros((3, 1)))
     return integrate_motion(rate, sway, start_s, end_s, centre_on_s=(0.0, 0.0))
@@ -141,8 +142,8 @@ def integrate_motion(
 ) -> HandMotion:
     """Orientation at nodes over [start_s, end_s]; the mean orientation over ``centre_on_s`` is the world's axes."""
     count = int(np.ceil((end_s - start_s) / NODE_STEP_S)) + 1
-    node_s = start_s + NODE_STEP_S * np.arange(count)
-    steps = Rotation.from_rotvec(_magnus(rate, node_s[:-1], np.full(count - 1, NODE_STEP_S)))
+    node_s: Array = start_s + NODE_STEP_S * np.arange(count, dtype=float)
+    steps = Rotation.from_rotvec(_magnus(rate, node_s[:-1], np.full(count - 1, NODE_STEP_S, float)))
     quat = _running_product(steps.as_quat(scalar_first=True))
     inside = (node_s >= centre_on_s[0] - NODE_STEP_S / 2) & (node_s <= centre_on_s[1] + NODE_STEP_S / 2)
     chosen = quat[inside] if inside.any() else quat[:1]
@@ -175,7 +176,7 @@ def _running_product(steps: Array) -> Array:
     return result / np.linalg.norm(result, axis=1, keepdims=True)
 
 
-def _random_waves(rng: np.random.Generator, band_hz: tuple[float, float], spectrum) -> Waves:  # noqa: ANN001
+def _random_waves(rng: np.random.Generator, band_hz: tuple[float, float], spectrum: Callable[[Array], Array]) -> Waves:
     """One component in each of equal steps of log frequency, with random phase and a little random amplitude."""
     low, high = np.log(band_hz)
     place = (np.arange(_COMPONENTS) + rng.uniform(size=(3, _COMPONENTS))) / _COMPONENTS

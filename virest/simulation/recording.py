@@ -1,7 +1,7 @@
 """Write a session as a MARSLogger Android capture folder, with its truth beside it.
 
-Outside ``truth/`` stands only what a phone logs and what the nominal profile claims.  The folder appears whole or not at
-all.
+Outside ``truth/`` stands only what a phone logs and what the nominal profile claims.  The folder appears whole or
+not at all.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ _TRAJECTORY_STEP_S = 1e-3
 _EDGE_HEADER = """\
 #Camera frame timestamp source according to CameraCharacteristics.SENSOR_INFO_TIMESTAMP_SOURCE is \
 SENSOR_INFO_TIMESTAMP_SOURCE_{source}.
-#If SENSOR_INFO_TIMESTAMP_SOURCE is SENSOR_INFO_TIMESTAMP_SOURCE_REALTIME, then camera frame timestamps of the attribute \
-CaptureResult.SENSOR_TIMESTAMP
-#and IMU reading timestamps of the field SensorEvent.timestamp are on the same timebase CLOCK_BOOTTIME which is used by \
-elapsedRealtimeNanos().
+#If SENSOR_INFO_TIMESTAMP_SOURCE is SENSOR_INFO_TIMESTAMP_SOURCE_REALTIME, then camera frame timestamps of the \
+attribute CaptureResult.SENSOR_TIMESTAMP
+#and IMU reading timestamps of the field SensorEvent.timestamp are on the same timebase CLOCK_BOOTTIME which is used \
+by elapsedRealtimeNanos().
 #In this case, no offline sync is necessary.
 #Otherwise, the camera frame timestamp is assumed to be on the timebase of CLOCK_MONOTONIC which is generally used by \
 nanoTime().
@@ -246,7 +246,7 @@ def _unix_ns(boot_ns: int, delay_ns: int = 0) -> int:
 
 
 def _logged_ns(stamp_ns: int, options: RecordingOptions) -> int:
-    """A camera stamp on the clock that the phone logs it on."""
+    """Put a camera stamp on the clock that the phone logs it on."""
     return stamp_ns - (_SLEPT_NS if options.clock == "UNKNOWN" else 0)
 
 
@@ -267,7 +267,7 @@ def _write_stamps(folder: Path, session: Session, options: RecordingOptions) -> 
 
 
 def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -> None:
-    """What the phone claims: nominal focal length and readout, logged exposure; exposure times ISO stays the same."""
+    """Write what the phone claims: nominal focal length and readout, logged exposure; exposure × ISO stays."""
     nominal, lens = session.nominal, session.nominal.intrinsics
     fx, fy = (f"{lens.fx_px:.7g}", f"{lens.fy_px:.7g}") if lens else ("1.0", "1.0")
     readout = round(nominal.shutter.readout_time_s * 1e9)
@@ -275,18 +275,32 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
     rows = []
     for k, stamp in enumerate(session.stamp_ns.tolist()):
         exposure = session.logged_exposure_s(k)
-        numbers = [_logged_ns(stamp, options), fx, fy, 205 + k, round(exposure * 1e9), round(1e9 / session.settings.fps)]
+        numbers = [
+            _logged_ns(stamp, options),
+            fx,
+            fy,
+            205 + k,
+            round(exposure * 1e9),
+            round(1e9 / session.settings.fps),
+        ]
         numbers += [readout, round(144 * first / exposure), nominal.focal_length_mm or 3.95, 0.16422288, 3]
         rows.append([str(n) for n in [*numbers, _unix_ns(stamp, 50_000_000)]])
     columns = ["Timestamp[nanosec]", "fx[px]", "fy[px]", "Frame No.", "Exposure time[nanosec]"]
-    columns += ["Sensor frame duration[nanosec]", "Frame readout time[nanosec]", "ISO", "Focal length", "Focus distance"]
+    columns += [
+        "Sensor frame duration[nanosec]",
+        "Frame readout time[nanosec]",
+        "ISO",
+        "Focal length",
+        "Focus distance",
+    ]
     _write_table(folder / "movie_metadata.csv", [*columns, "AF mode", "Unix time[nanosec]"], rows, options)
 
 
 def _write_imu(folder: Path, imu: ImuLog, options: RecordingOptions) -> None:
     values = np.concatenate([imu.gyro_rad_s, imu.accel_m_s2], axis=1).tolist()
     rows = (
-        [str(t), *(f"{v:.8g}" for v in row), str(_unix_ns(t))] for t, row in zip(imu.time_ns.tolist(), values, strict=True)
+        [str(t), *(f"{v:.8g}" for v in row), str(_unix_ns(t))]
+        for t, row in zip(imu.time_ns.tolist(), values, strict=True)
     )
     columns = ["Timestamp[nanosec]", *(f"g{a}[rad/s]" for a in "xyz"), *(f"a{a}[m/s^2]" for a in "xyz")]
     _write_table(folder / "gyro_accel.csv", [*columns, "Unix time[nanosec]"], rows, options)
@@ -325,7 +339,10 @@ def _write_effects(truth: Path, session: Session, applied: tuple[AppliedEffect, 
     content = {
         "effects": [{"name": a.name, "parameters": a.parameters} for a in applied],
         "settings": asdict(session.settings),
-        "scene_plane": {"depth_m": scene.depth_m if np.isfinite(scene.depth_m) else "inf", "normal": list(scene.normal)},
+        "scene_plane": {
+            "depth_m": scene.depth_m if np.isfinite(scene.depth_m) else "inf",
+            "normal": list(scene.normal),
+        },
         "times": "seconds on the IMU clock from stamp_0",
         "slots": slots,
     }

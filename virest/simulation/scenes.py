@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,11 +40,11 @@ _TEXT = (
 class Scene:
     """A chart on a plane.
 
-    In world axes the plane passes through ``centre_m`` with the given normal; its chart axes are the world's x and y laid
-    into the plane.  With ``depth_m`` infinite only directions count: the plane z = 1 seen from the origin.
+    In world axes the plane passes through (0, 0, depth_m) with the given normal; its chart axes are the world's x and y
+    laid into the plane.  With ``depth_m`` infinite only directions count: the plane z = 1 seen from the origin.
     """
 
-    chart: NDArray[np.float32]
+    chart: NDArray[Any]
     """(rows, columns, 3) linear light."""
     chart_focal_px: float
     """Chart pixels per unit of x/z: at the chart's middle, that many times finer than a camera of focal length 1 px."""
@@ -52,10 +53,13 @@ class Scene:
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit normal of the plane, world axes."""
 
-    def chart_from_ray(self, rotation_world_cam: NDArray[np.float64], position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def chart_from_ray(
+        self, rotation_world_cam: NDArray[np.float64], position_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Homography from rays (x, y, 1) in camera axes to homogeneous chart pixels, for poses (..., 3, 3), (..., 3).
 
-        A ray d from p meets the plane n·X = n·X0 at ``X = p + d n·(X0 − p)/(n·d)``; dividing nothing keeps it linear in d.
+        A ray d from p meets the plane n·X = n·X0 at ``X = p + d n·(X0 − p)/(n·d)``, linear in d up
+        to the division.
         """
         rotation = np.asarray(rotation_world_cam, float)
         position = np.asarray(position_m, float)
@@ -78,10 +82,10 @@ class Scene:
         return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
 
     def at_plane(self, depth_m: float, normal: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Scene:
-        """The same chart on a plane at another depth; it looks as large as before from the origin."""
+        """Put the same chart on a plane at another depth; it looks as large as before from the origin."""
         return Scene(self.chart, self.chart_focal_px, depth_m, normal)
 
-    def sample(self, homography: NDArray[np.float64], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+    def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
         """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside the chart: (h, w, 3)."""
         h = homography.astype(np.float32)
         weight = 1.0 / (h[2, 0] * x + (h[2, 1] * y + h[2, 2]))
@@ -104,8 +108,8 @@ def make_scene(
 ) -> Scene:
     """Draw a scene of one of KINDS for a camera of ``focal_px``.
 
-    half_extent: how far x/z and y/z reach from the middle of the chart.  oversampling: chart pixels per picture pixel at
-    the middle; it is lowered (with a log message) where the chart would exceed MAX_CHART_PX.
+    half_extent: how far x/z and y/z reach from the middle of the chart.  oversampling: chart pixels per picture pixel
+    at the middle; it is lowered (with a log message) where the chart would exceed MAX_CHART_PX.
     """
     if kind not in KINDS:
         raise SettingsError(f"scene '{kind}' is not known", hint=f"use one of {', '.join(KINDS)}")
@@ -125,14 +129,14 @@ def make_scene(
 # ── drawings: linear light, (height, width, 3) float32, not yet blurred ────────────────────────────────────────────
 
 
-def _draw_leaves(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
+def _draw_leaves(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
     """Dead leaves with texture and shading; darkest about 0.01, brightest about 0.9."""
     labels, count = _leaf_labels(rng, width, height, scale)
     colour = _natural_colours(rng, count)
     return np.clip(_textured(rng, labels, colour), 0.004, 0.9)
 
 
-def _draw_bright(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
+def _draw_bright(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
     """Dead leaves with lamps and glints of 2 to 12 times the clip level on about 3 % of the area."""
     light = _draw_leaves(rng, width, height, scale)
     target, covered, tries = 0.03 * width * height, 0.0, 0
@@ -146,14 +150,16 @@ def _draw_bright(rng: np.random.Generator, width: int, height: int, scale: float
     return light
 
 
-def _draw_board(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
-    """A chessboard on a white sheet before a grey wall, with solid tag-like squares in its white fields."""
+def _draw_board(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
+    """Draw a chessboard on a white sheet before a grey wall, with solid tag-like squares in its white fields."""
     light = np.full((height, width, 3), 0.25, np.float32)
     columns, rows = (7, 10) if height >= width else (10, 7)
     side = int(0.55 * min(width / columns, height / rows))
     left, top = (width - columns * side) // 2, (height - rows * side) // 2
     margin = side
-    light[max(top - margin, 0) : top + rows * side + margin, max(left - margin, 0) : left + columns * side + margin] = 0.8
+    light[max(top - margin, 0) : top + rows * side + margin, max(left - margin, 0) : left + columns * side + margin] = (
+        0.8
+    )
     for row in range(rows):
         for column in range(columns):
             y, x = top + row * side, left + column * side
@@ -164,8 +170,8 @@ def _draw_board(rng: np.random.Generator, width: int, height: int, scale: float)
     return light * np.array([1.0, 0.98, 0.94], np.float32)
 
 
-def _draw_tag(light: NDArray[np.float32], rng: np.random.Generator, x: int, y: int, side: int) -> None:
-    """A square code of 6 x 6 black and white cells with a black border."""
+def _draw_tag(light: NDArray[Any], rng: np.random.Generator, x: int, y: int, side: int) -> None:
+    """Draw a square code of 6 x 6 black and white cells with a black border."""
     cell = max(side // 8, 1)
     light[y : y + 8 * cell, x : x + 8 * cell] = 0.03
     bits = rng.integers(0, 2, (6, 6))
@@ -174,8 +180,8 @@ def _draw_tag(light: NDArray[np.float32], rng: np.random.Generator, x: int, y: i
         light[top : top + cell, left : left + cell] = 0.8
 
 
-def _draw_text(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[np.float32]:
-    """Printed pages: dark text of several sizes on off-white paper, shaded slowly."""
+def _draw_text(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
+    """Draw printed pages: dark text of several sizes on off-white paper, shaded slowly."""
     ink = np.zeros((height, width), np.uint8)
     y = int(20 * scale)
     while y < height + 10:
@@ -220,7 +226,7 @@ def _power_radii(rng: np.random.Generator, count: int, small: float, large: floa
     return 1.0 / np.sqrt((1 - u) / small**2 + u / large**2)
 
 
-def _fill_leaf(canvas: NDArray, rng: np.random.Generator, centre: NDArray, radius: float, value: object) -> None:
+def _fill_leaf(canvas: NDArray[Any], rng: np.random.Generator, centre: NDArray[Any], radius: float, value: Any) -> None:
     """Fill a disc, an ellipse or a polygon, to 1/16 pixel."""
     shape, angle, aspect = rng.uniform(size=3)
     at = (int(centre[0] * 16), int(centre[1] * 16))
@@ -237,7 +243,7 @@ def _fill_leaf(canvas: NDArray, rng: np.random.Generator, centre: NDArray, radiu
     cv2.fillPoly(canvas, [points.astype(np.int32)], value, cv2.LINE_8, 4)
 
 
-def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[Any]:
     """Linear RGB (count, 3): log-normal luminance around 0.16, muted hues along blue-yellow and red-green."""
     luminance = np.clip(0.16 * np.exp(rng.normal(0, 0.85, count)), 0.012, 0.8)
     yellow, red = rng.normal(0, 0.22, count), rng.normal(0, 0.09, count)
@@ -245,7 +251,7 @@ def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[np.float32
     return (luminance[:, None] * tint).astype(np.float32)
 
 
-def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArray[np.float32]) -> NDArray[np.float32]:
+def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArray[Any]) -> NDArray[Any]:
     """Each leaf's colour times its own cut of a 1/f texture and of a slow shading field."""
     height, width = labels.shape
     texture = _one_over_f(rng, _TEXTURE_SIDE)
@@ -263,8 +269,8 @@ def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArr
     return light
 
 
-def _one_over_f(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
-    """A periodic texture whose amplitude falls as 1/f, mean 0, standard deviation 1: (side, side)."""
+def _one_over_f(rng: np.random.Generator, side: int) -> NDArray[Any]:
+    """Draw a periodic texture whose amplitude falls as 1/f, mean 0, standard deviation 1: (side, side)."""
     fy, fx = np.meshgrid(np.fft.fftfreq(side), np.fft.rfftfreq(side), indexing="ij")
     radius = np.hypot(fx, fy)
     radius[0, 0] = np.inf
@@ -273,7 +279,7 @@ def _one_over_f(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
     return (field / field.std()).astype(np.float32)
 
 
-def _smooth_field(rng: np.random.Generator, width: int, height: int) -> NDArray[np.float32]:
+def _smooth_field(rng: np.random.Generator, width: int, height: int) -> NDArray[Any]:
     """Slow variation over the chart, of about unit size."""
     coarse = rng.normal(size=(6, 6)).astype(np.float32)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)

@@ -1,9 +1,11 @@
-"""From light to grey levels (contract, section 4, "Order"): defocus, vignetting, gain, curve, gamma, black level, noise.
+"""From light to grey levels, in the contract's order: defocus, vignetting, gain, curve, gamma, black level, noise.
 
 The curve is written down here once more, from the paper's equations 21 and 22, so that the judge has its own.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 
-Image = NDArray[np.float32]
+Image = NDArray[Any]
 
 
 def sensor_light(light: Image, profile: CameraProfile, slot_gain: float, *, defocus: bool) -> Image:

@@ -1,7 +1,7 @@
 """One simulated recording session: what is looked at, how the hand moves, when each frame is exposed, what is logged.
 
-Clocks (contract, section 4): ``t_imu − stamp_0 = (t_cam − stamp_0)(1 + clock_skew) + time_offset_s``; a stamp that means
-the middle or the end lies half or one true exposure after the start.  Rows follow on the IMU's clock.
+Clocks (contract, section 4): ``t_imu − stamp_0 = (t_cam − stamp_0)(1 + clock_skew) + time_offset_s``; a stamp that
+means the middle or the end lies half or one true exposure after the start.  Rows follow on the IMU's clock.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def nominal_camera(
     distortion: tuple[str, tuple[float, ...]] = ("none", ()),
     depth_m: float = np.inf,
 ) -> CameraProfile:
-    """A phone held upright (height > width) or on its side, focal length 0.8 of the long side unless given.
+    """Describe a phone held upright (height > width) or on its side, focal length 0.8 of the long side unless given.
 
     readout_direction: right_to_left for an upright phone and top_to_bottom for one on its side, unless given.
     """
@@ -162,13 +162,14 @@ def plan_session(
     depth = np.inf if true.depth_m is None else true.depth_m
     if motion is None:
         sway = settings.sway_m if settings.sway_m is not None else (DEFAULT_SWAY_M if np.isfinite(depth) else 0.0)
-        spare = lead + 0.6 + true.extensions.frame_lag_s + abs(true.clock_skew) * duration
+        # whole seconds: a small effect must not change where the integration starts, nor its last digits
+        spare = np.ceil(lead + 0.6 + true.extensions.frame_lag_s + abs(true.clock_skew) * duration)
         motion = random_hand_motion(
             np.random.default_rng([settings.seed, 1]),
             rate_rms_rad_s=settings.rate_rad_s,
             duration_s=duration,
             sway_rms_m=sway,
-            margin_s=spare,
+            margin_s=float(spare),
         )
     shows = _shown_captures(true, settings)
     if scene is None:
@@ -176,7 +177,7 @@ def plan_session(
         if np.isfinite(depth):
             tilt = Rotation.from_rotvec([*settings.tilt_rad, 0.0]).as_matrix()[:, 2]
             scene = _at_median_depth(scene.at_plane(depth, tuple(tilt.tolist())), motion, true, settings, shows)
-    base_ns = 1_000 * int(np.random.default_rng([settings.seed, 2]).integers(20_000_000_000, 40_000_000_000))
+    base_ns = 1_000 * int(np.random.default_rng([settings.seed, 2]).integers(40_000_000_000, 60_000_000_000))
     ticks = np.array([_stamp_tick(k, settings.fps) for k in range(settings.frames)])
     stamps = base_ns + np.array([round(_stamp_s(k, settings.fps) * 1e9) for k in range(settings.frames)])
     view = make_view(true, motion, rest_s=span[0])
@@ -184,10 +185,14 @@ def plan_session(
 
 
 def render_picture(session: Session, slot: int) -> Picture:
-    """What the camera takes for a slot of the movie, before the encoder: (h, w, 3) RGB."""
+    """Take the picture for a slot of the movie, before the encoder: (h, w, 3) RGB."""
     capture = int(session.shows[slot])
     light = expose(
-        session.scene, session.motion, session.view, session.first_row_start_s(capture), session.true_exposure_s(capture)
+        session.scene,
+        session.motion,
+        session.view,
+        session.first_row_start_s(capture),
+        session.true_exposure_s(capture),
     )
     light = sensor_light(light, session.true, _gain(session, slot), defocus=True)
     rng = np.random.default_rng([session.settings.seed, 3, capture])
@@ -195,7 +200,7 @@ def render_picture(session: Session, slot: int) -> Picture:
 
 
 def render_truth(session: Session, slot: int, *, middle: bool = False) -> Picture:
-    """What a global shutter without blur, defocus, flicker and noise takes at the slot's reference time: (h, w, 3)."""
+    """Take what a global shutter without blur, defocus, flicker, noise sees at the slot's reference time: (h, w, 3)."""
     capture = int(session.shows[slot])
     time_s = session.middle_s(capture) if middle else session.first_row_start_s(capture)
     light = instant(session.scene, session.motion, session.view, time_s)
@@ -206,9 +211,9 @@ def render_truth(session: Session, slot: int, *, middle: bool = False) -> Pictur
 def sample_imu(session: Session) -> ImuLog:
     """Gyroscope (scale × true + bias + noise) and accelerometer, at the IMU's place and in its axes."""
     settings, true = session.settings, session.true
-    time_ns = np.arange(session.imu_span_s[0], session.imu_span_s[1], 1 / settings.imu_rate_hz) * 1e9
-    time_ns = np.rint(time_ns).astype(np.int64)
-    time_s = time_ns * 1e-9
+    grid_s = np.arange(session.imu_span_s[0], session.imu_span_s[1], 1 / settings.imu_rate_hz)
+    time_ns: NDArray[np.int64] = np.rint(grid_s * 1e9).astype(np.int64)
+    time_s: Array = time_ns.astype(float) * 1e-9
     rng = np.random.default_rng([settings.seed, 4])
     imu_from_cam = np.array(true.r_cam_imu).T
     gyro = session.motion.rate_rad_s(time_s) @ imu_from_cam.T
@@ -267,7 +272,7 @@ def _shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[n
 
 
 def _draw_scene(nominal: CameraProfile, motion: HandMotion, settings: SessionSettings, duration_s: float) -> Scene:
-    """A chart that covers all that an upright view of the motion sees, half a second before and after too."""
+    """Draw a chart that covers all that the motion shows, half a second before and after too."""
     lens = nominal.intrinsics
     if lens is None:
         raise SettingsError("a simulated camera needs a focal length", hint="set intrinsics.fx_px")
@@ -290,7 +295,7 @@ def _draw_scene(nominal: CameraProfile, motion: HandMotion, settings: SessionSet
 def _at_median_depth(
     scene: Scene, motion: HandMotion, true: CameraProfile, settings: SessionSettings, shows: NDArray[np.int64]
 ) -> Scene:
-    """The plane moved so that the median over the frames of the distance along the optical axis is its depth."""
+    """Move the plane so that the median over the frames of the distance along the optical axis is its depth."""
     exposure = settings.exposure_s[0] * true.shutter.exposure_scale
     times = np.array([_first_row_start_s(true, _stamp_s(int(k), settings.fps), exposure) for k in shows])
     axis = motion.rotation(times).as_matrix()[:, :, 2]

@@ -1,0 +1,65 @@
+"""``virest simulate`` and what becomes of its captures."""
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from virest.app import sample
+
+Virest = Callable[..., "subprocess.CompletedProcess[str]"]
+SMALL = ("--width", 160, "--height", 120, "--frames", 3)
+
+
+def test_a_simulated_capture_can_be_inspected_and_processed(virest: Virest, tmp_path: Path) -> None:
+    """Simulate, inspect, process: each takes what the one before wrote."""
+    made = virest("simulate", "trip", *SMALL, "--effect", "time_offset=0.004", "--json", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    facts = json.loads(made.stdout)
+    assert facts["effects"] == [{"name": "time_offset", "parameters": {"time_offset_s": 0.004}}]
+    assert (tmp_path / "trip/truth/frames/000002.png").is_file()
+    assert virest("inspect", "trip", cwd=tmp_path).returncode == 0
+    done = virest("process", "trip", "--preset", "fast", "--jobs", 1, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert [json.loads(line)["frame"] for line in done.stdout.splitlines()] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("--effect", "time_ofset=1"), 3, "time_offset"),
+        (("--scene", "moon"), 3, "leaves"),
+        (("--frames", 0), 3, "frames"),
+        (("--exposure-ms", "10;20"), 2, "milliseconds"),
+        (("--direction", "up"), 2, "top_to_bottom"),
+    ],
+)
+def test_a_wrong_wish_is_one_line(virest: Virest, tmp_path: Path, arguments: tuple[object, ...], code: int, says: str):
+    """Nothing is written."""
+    result = virest("simulate", "trip", *SMALL, *arguments, cwd=tmp_path)
+    assert result.returncode == code
+    assert len(result.stderr.splitlines()) == 1
+    assert says in result.stderr
+    assert not (tmp_path / "trip").exists()
+
+
+def test_a_folder_that_is_no_simulated_capture_is_kept(virest: Virest, tmp_path: Path) -> None:
+    """Exit 8, even with --overwrite."""
+    (tmp_path / "trip").mkdir()
+    (tmp_path / "trip/holiday.jpg").write_text("mine")
+    for options in ((), ("--overwrite",)):
+        assert virest("simulate", "trip", *SMALL, *options, cwd=tmp_path).returncode == 8
+    assert [path.name for path in (tmp_path / "trip").iterdir()] == ["holiday.jpg"]
+
+
+def test_the_sample_captures_are_small_and_whole() -> None:
+    """sample_data/ holds what `make sample` writes, together under 12 MB."""
+    folder = Path(__file__).resolve().parents[2] / "sample_data"
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    assert {path.parent.name for path in folder.glob("*/movie.mp4")} == set(sample.SAMPLES)
+    assert sum(path.stat().st_size for path in files) < 12e6
+    for name in sample.SAMPLES:
+        kept = {f"{i:06d}.png" for i in sample.KEPT_TRUTH}
+        assert {path.name for path in (folder / name / "truth/frames").iterdir()} == kept

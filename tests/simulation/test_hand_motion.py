@@ -1,0 +1,58 @@
+"""The hand: rates, orientations integrated from them, and what an accelerometer feels."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from virest.simulation.hand_motion import constant_motion, random_hand_motion
+
+GRAVITY = np.array([0.0, 9.81, 0.0])
+
+
+def test_a_constant_rate_turns_by_rate_times_time():
+    """Orientation at any time is the rotation vector ω t."""
+    motion = constant_motion((0.3, -0.8, 1.1))
+    times = np.array([-0.71234, 0.0, 0.12345, 0.9999])
+    assert motion.rotation(times).as_rotvec() == pytest.approx(times[:, None] * [0.3, -0.8, 1.1], abs=1e-9)
+
+
+def test_orientation_agrees_with_a_general_solver(rng):
+    """Over 1.3 s of 2 rad/s tremor the pose is that of a high-order Runge-Kutta solution to a microradian."""
+    motion = random_hand_motion(rng, rate_rms_rad_s=2.0, duration_s=1.0)
+
+    def turning(time_s, q):
+        w, v = q[0], q[1:]
+        rate = motion.rate_rad_s(np.array(time_s))
+        return 0.5 * np.concatenate([[-v @ rate], w * rate + np.cross(v, rate)])
+
+    start = motion.quat_world_cam(np.array([-0.2]))[0]
+    solved = solve_ivp(turning, (-0.2, 1.1234), start, method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+    difference = Rotation.from_quat(solved, scalar_first=True).inv() * motion.rotation(np.array([1.1234]))
+    assert difference.magnitude()[0] < 1e-6
+
+
+def test_the_rate_has_the_size_asked_for_and_all_three_axes(rng):
+    """The RMS length over the duration is as asked; every axis takes part; poses stay near the mean."""
+    motion = random_hand_motion(rng, rate_rms_rad_s=0.7, duration_s=2.0)
+    times = np.linspace(0, 2, 3000)
+    rate = motion.rate_rad_s(times)
+    assert np.sqrt((rate**2).sum(axis=1).mean()) == pytest.approx(0.7, rel=0.02)
+    assert np.sqrt((rate**2).mean(axis=0)).min() > 0.2
+    assert motion.rotation(times).mean().magnitude() < 1e-3
+
+
+def test_at_rest_the_accelerometer_reads_gravity_upwards():
+    """World y points down, so an upright camera feels −9.81 along its y."""
+    motion = constant_motion((0.0, 0.0, 0.0))
+    assert motion.specific_force_m_s2(np.zeros(1), np.zeros(3), GRAVITY)[0] == pytest.approx([0, -9.81, 0])
+
+
+def test_specific_force_is_the_second_derivative_of_the_path(rng):
+    """At an arm from the camera: Rᵀ(p'' − g) with p the arm's end, differentiated numerically."""
+    motion = random_hand_motion(rng, rate_rms_rad_s=1.0, duration_s=1.0, sway_rms_m=0.02)
+    arm, step, time_s = np.array([0.03, -0.01, 0.02]), 1e-3, np.array([0.4321])
+    path = [motion.position_m(t) + motion.rotation(t).apply(arm) for t in (time_s - step, time_s, time_s + step)]
+    second = (path[0] - 2 * path[1] + path[2]) / step**2
+    expected = motion.rotation(time_s).inv().apply(second - GRAVITY)
+    assert motion.specific_force_m_s2(time_s, arm, GRAVITY) == pytest.approx(expected, abs=5e-3)

@@ -1,0 +1,190 @@
+"""Hidden effects: each changes its own place in the profile, and nothing that a reader of the capture may see."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from capture_files import SMALL, read_imu, read_movie
+
+from virest.camera.profile import profile_mapping, read_profile
+from virest.errors import SettingsError
+from virest.simulation.effects import EffectContext, effect_names, hide_effects
+from virest.simulation.session import nominal_camera
+
+CHANGES = {
+    "time_offset": "imu.time_offset_s",
+    "clock_skew": "imu.clock_skew",
+    "readout_time": "shutter.readout_time_s",
+    "readout_direction": "shutter.readout_direction",
+    "timestamp_reference": "shutter.timestamp",
+    "exposure_time": "shutter.exposure_scale",
+    "gyro_bias": "imu.gyro_bias_rad_s",
+    "gyro_scale": "imu.gyro_scale",
+    "imu_rotation": "imu.T_cam_imu",
+    "focal_length": "intrinsics.fx_px intrinsics.fy_px",
+    "focal_drift": "extensions.focal_drift",
+    "radial_distortion": "intrinsics.distortion",
+    "principal_point": "intrinsics.cx_px intrinsics.cy_px",
+    "stabilisation": "extensions.stabilisation",
+    "scene_depth": "scene.depth_m",
+    "frame_lag": "extensions.frame_lag",
+    "response_curve": "extensions.response_gamma",
+    "black_level": "extensions.black_level",
+    "vignetting": "extensions.vignetting",
+    "flicker": "extensions.flicker",
+    "gain_drift": "extensions.gain",
+    "defocus": "extensions.defocus",
+}
+"""The contract's table of effects."""
+SEEN_OUTSIDE = ("camera.yaml", "edge_epochs.txt", "frame_timestamps.txt", "movie_metadata.csv")
+
+
+def context(seed=0, frames=20):
+    """Make what default sizes depend on."""
+    return EffectContext(frames, 30.0, np.random.default_rng(seed))
+
+
+def flat(profile):
+    """List the profile's keys, two levels deep, as text."""
+    keys = {}
+    for name, block in profile_mapping(profile).items():
+        for key, value in block.items() if isinstance(block, dict) else [("", block)]:
+            keys[f"{name}.{key}"] = str(value)
+    return keys
+
+
+def test_every_name_of_the_contract_is_known():
+    """And no other."""
+    assert set(effect_names()) == set(CHANGES)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_an_effect_changes_its_own_place_in_the_profile_only(name):
+    """The true profile differs from the nominal one at the contract's place, whatever the seed."""
+    nominal = nominal_camera(360, 640)
+    for seed in range(5):
+        true, applied = hide_effects(nominal, [name], context(seed))
+        before, after = flat(nominal), flat(true)
+        changed = {key for key in before.keys() | after.keys() if before.get(key) != after.get(key)}
+        assert changed == set(CHANGES[name].split())
+        assert applied[0].name == name
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "value"),
+    [
+        ("time_offset=-0.0123", "imu.time_offset_s", "-0.0123"),
+        ("readout-time=0.031", "shutter.readout_time_s", "0.031"),
+        ("gyro_bias=0.01,-0.02,0.03", "imu.gyro_bias_rad_s", "[0.01, -0.02, 0.03]"),
+        ("gyro_scale=1.05", "imu.gyro_scale", "[1.05, 1.05, 1.05]"),
+        ("timestamp_reference=exposure_end", "shutter.timestamp", "exposure_end"),
+        ("focal_length=0.9", "intrinsics.fx_px", str(0.9 * 512.0)),
+        ("scene_depth=inf", "scene.depth_m", "inf"),
+        ("frame_lag=0.2,15", "extensions.frame_lag", "{'lag_s': 0.2, 'frames': 15}"),
+        ("gain_drift=1,1.5,0.8", "extensions.gain", "[1.0, 1.5, 0.8]"),
+    ],
+)
+def test_given_values_are_taken_as_they_are(text, place, value):
+    """``NAME=VALUE`` sets exactly that value."""
+    assert flat(hide_effects(nominal_camera(360, 640), [text], context())[0])[place] == value
+
+
+def test_imu_rotation_stands_on_the_left():
+    """A turn of 90° about camera z takes the camera's x to y: R = exp(r) R_nominal."""
+    true, _ = hide_effects(nominal_camera(360, 640), ["imu_rotation=0,0,1.5707963267948966"], context())
+    assert np.array(true.r_cam_imu) == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("time_ofset", "did you mean 'time_offset'"),
+        ("gyro_bias=0.1", "takes 3"),
+        ("readout_direction=sideways", "top_to_bottom"),
+        ("flicker=much", "no number"),
+    ],
+)
+def test_a_wrong_effect_says_what_is_right(text, part):
+    """Unknown names, counts and words end in a settings error with a hint."""
+    with pytest.raises(SettingsError) as caught:
+        hide_effects(nominal_camera(360, 640), [text], context())
+    assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [n for n in CHANGES if n not in ("scene_depth", "readout_direction")])
+def test_a_hidden_effect_cannot_be_read_outside_truth(name, plain_capture, simulate):
+    """Profile, stamps, metadata and clocks are byte for byte those of the capture without it; truth names it."""
+    folder = simulate("hidden", effects=[name], frames=5)
+    for file in SEEN_OUTSIDE:
+        assert (folder / file).read_bytes() == (plain_capture / file).read_bytes(), file
+    told = json.loads((folder / "truth" / "effects.json").read_text())
+    assert [effect["name"] for effect in told["effects"]] == [name]
+    assert read_profile(folder / "truth" / "camera.yaml") != read_profile(folder / "camera.yaml")
+
+
+@pytest.mark.parametrize("name", ["gyro_bias", "gyro_scale", "imu_rotation"])
+def test_effects_of_the_imu_leave_the_pictures_alone(name, plain_capture, simulate):
+    """The movie is the same to the byte, the gyroscope is not."""
+    folder = simulate("imu", effects=[name])
+    assert (folder / "movie.mp4").read_bytes() == (plain_capture / "movie.mp4").read_bytes()
+    assert np.abs(read_imu(folder)[1] - read_imu(plain_capture)[1]).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    "name", ["time_offset", "readout_time", "timestamp_reference", "exposure_time", "focal_length", "radial_distortion",
+             "stabilisation", "vignetting", "flicker", "gain_drift", "defocus", "black_level", "clock_skew=0.02"]
+)  # fmt: skip
+def test_effects_of_the_camera_leave_the_imu_alone(name, plain_capture, simulate):
+    """The inertial data are the same to the byte, the pictures are not."""
+    folder = simulate("camera", effects=[name])
+    assert (folder / "gyro_accel.csv").read_bytes() == (plain_capture / "gyro_accel.csv").read_bytes()
+    assert (folder / "movie.mp4").read_bytes() != (plain_capture / "movie.mp4").read_bytes()
+
+
+def test_gyro_is_scale_times_true_plus_bias(plain_capture, simulate):
+    """Measured = scale × true + bias, sample by sample."""
+    folder = simulate("gyro", effects=["gyro_scale=1.1", "gyro_bias=0.1,-0.2,0.3"])
+    assert read_imu(folder)[1] == pytest.approx(1.1 * read_imu(plain_capture)[1] + [0.1, -0.2, 0.3], abs=1e-6)
+
+
+def test_frames_are_taken_at_the_times_that_the_clocks_say(simulate):
+    """(t_cam − half the true exposure)(1 + skew) + offset, by hand for frame 3 at 100 ms."""
+    effects = ["time_offset=0.05", "clock_skew=0.01", "timestamp_reference=exposure_middle", "exposure_time=1.5"]
+    told = json.loads((simulate("clock", effects=effects) / "truth" / "effects.json").read_text())
+    assert told["slots"][3]["exposure_s"] == pytest.approx(0.012)
+    assert told["slots"][3]["first_row_start_s"] == pytest.approx((0.1 - 0.006) * 1.01 + 0.05, abs=1e-9)
+    assert told["slots"][3]["middle_s"] == pytest.approx(told["slots"][3]["first_row_start_s"] + 0.009 + 0.006)
+
+
+def test_start_up_lag_shows_later_frames_and_uses_them_up_by_repeats(simulate):
+    """Lag of 3 frames over 6 slots: repeats at slots 2, 4 and 6; repeated pictures are the same."""
+    folder = simulate("lag", effects=["frame_lag=0.1,6"], frames=9, noise_levels=3.0)
+    told = json.loads((folder / "truth" / "effects.json").read_text())
+    assert [slot["shows"] for slot in told["slots"]] == [3, 4, 4, 5, 5, 6, 6, 7, 8]
+    luma = read_movie(folder)[0].astype(float)
+    change = np.abs(np.diff(luma, axis=0)).mean(axis=(1, 2))
+    assert change[[1, 3, 5]].max() < 0.3 * change[[0, 2, 4, 6, 7]].min()
+
+
+def test_scene_depth_makes_the_hand_sway_at_that_distance(simulate):
+    """The median over the frames of the distance along the optical axis is the effect's depth."""
+    folder = simulate("depth", effects=["scene_depth=0.6"])
+    told = json.loads((folder / "truth" / "effects.json").read_text())
+    path = np.loadtxt(folder / "truth" / "trajectory.csv", delimiter=",", skiprows=1)
+    distances = []
+    for slot in told["slots"]:
+        row = path[np.argmin(np.abs(path[:, 0] - slot["first_row_start_s"]))]
+        x, y = row[5:7]
+        distances.append((told["scene_plane"]["depth_m"] - row[3]) / (1 - 2 * (x * x + y * y)))
+    assert np.median(distances) == pytest.approx(0.6, abs=1e-3)
+    assert np.ptp(path[:, 1:4], axis=0).max() > 0.005
+    assert dataclasses.asdict(read_profile(folder / "camera.yaml"))["depth_m"] == np.inf
+
+
+def test_two_effects_do_not_disturb_each_other(simulate):
+    """Both stand in the true profile."""
+    folder = simulate("two", effects=["time_offset=0.01", "vignetting=0.4"])
+    true = read_profile(folder / "truth" / "camera.yaml")
+    assert (true.time_offset_s, true.extensions.vignetting_corner_loss) == (0.01, 0.4)
+    assert SMALL["frames"] == len(list((folder / "truth" / "frames").iterdir()))
