@@ -1,8 +1,8 @@
 """Pictures and gyroscope on one clock: the time offset, the gyroscope's bias, and whether the two agree at all.
 
-Coarse: each pair's rotation against the gyroscope's at every offset within the search.  Fine: every tracked point at its
-own row's mid-exposure (motion.point_fit).  What the chosen model leaves open (parallax, a readout, an axis map or a clock
-rate that is a little off) enters the standard deviation by how far it would move the offset.
+Coarse: each pair's rotation against the gyroscope's at every offset within the search.  Fine: every tracked point at
+its own row's mid-exposure (motion.point_fit).  What the chosen model leaves open (parallax, a readout, an axis map or a
+clock rate that is a little off) enters the standard deviation by how far it would move the offset.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ MIN_TRACKS = 15
 """A pair with fewer tells too little."""
 MIN_PAIRS = 8
 MIN_EXPLAINED = 0.5
-"""Pictures follow the gyroscope if it explains this part of their rotation. Unrelated motion seldom reaches 0.3."""
+MIN_EXPLAINED_BY_PAIR = 5.0
+MAX_MIN_EXPLAINED = 0.9
+"""Pictures follow the gyroscope if it explains 0.5 + 5 / pairs, at most 0.9, of their rotation: with few pairs,
+unrelated motion reaches 0.7 at some offset within a second; with 40 it stays below 0.5."""
 MIN_DISTINCT = 1.6
 """The best offset leaves less than 1 / this of what the second best leaves unexplained."""
 MAX_POINTS = 5000
@@ -51,11 +54,14 @@ MAX_STD_S = 0.02
 SMALLEST_STD_S = 1e-4
 """Blur under a bent path and KLT's own bias are not modelled."""
 UNKNOWN_EXPOSURE_STD_S = 0.008
+UNKNOWN_READOUT_STD_S = 0.003
+"""At least, where the readout is fitted: lens and parallax shear pictures too."""
 TRANSLATION_RATIO = 1.25
 """Differences this much larger in all directions than across the best parallax mean that the camera moves."""
 COMMON_RATIO = 1.15
-MAX_BIAS_SIGMA = 4.0
-"""A bias further from the profile's than this many prior deviations is a sign of an unmodelled scene or lens."""
+MAX_BIAS_SIGMA = {"rotation": 4.0, "common": 2.0, "pairwise": 2.0}
+"""A bias further from the profile's than this many prior deviations is an unmodelled scene, lens or axis map and is not
+fitted.  A moving camera's steady parallax looks like bias."""
 AGREEMENT_SLACK_S = 0.03
 """An offset wrong by this is a matter for calibration, not a sign that pictures and gyroscope are strangers."""
 GUESSED_FOCAL = 0.8
@@ -104,7 +110,7 @@ class OffsetEstimate:
         return self.time_offset_s + 0.5 * self.readout_s
 
     def at_readout(self, readout_s: float) -> float:
-        """The time offset that goes with another readout time."""
+        """Return the time offset that goes with another readout time."""
         return self.centre_offset_s - 0.5 * readout_s
 
 
@@ -114,7 +120,7 @@ class Agreement:
 
     agrees: bool
     explained: float
-    """Part of the pictures' changing rotation that the gyroscope explains at the profile's offset; NaN: too little to tell."""
+    """Part of the pictures' changing rotation that the gyroscope explains at the profile's offset; NaN: unknown."""
     residual_px: float
     """rms of the pictures' rotation minus the gyroscope's from frame to frame, at the focal length."""
     motion_px: float
@@ -193,7 +199,7 @@ def estimate_time_offset(
 ) -> OffsetEstimate:
     """Find the time offset within ± search_s of the profile's (of 0 where that is unknown), and the gyroscope's bias.
 
-    frames_time_s, exposures_s: (frames,) by movie index, stamps from stamp_0 and logged exposures (None or NaN: unknown).
+    frames_time_s, exposures_s: (frames,) by movie index, stamps from stamp_0, logged exposures (None or NaN: unknown).
     Never raises for poor data: the result says that nothing is determined, and why.
     """
     observed, reason = _observe(pairs, frames_time_s, exposures_s, imu, profile)
@@ -204,11 +210,12 @@ def estimate_time_offset(
             profile, f"the pictures hardly turn ({observed.motion_px:.2f} px from frame to frame)", observed.pairs
         )
     scan = _scan(observed, search_s)
-    best, reason = _distinct_peak(scan, search_s)
+    best, reason = _distinct_peak(scan, search_s, _least_explained(observed))
     if best is None:
         return _undetermined(profile, reason, observed.pairs, float(np.max(scan.explained)))
-    fit, variance, rotation_noise = _fit(observed, float(scan.offset_s[best]), float(scan.gain[best]))
-    return _conclude(observed, fit, variance, rotation_noise, search_s)
+    model, start = _point_model(observed, float(scan.offset_s[best]), float(scan.gain[best]))
+    fitted = _fit(model, start, profile)
+    return _conclude(observed, fitted, _drift(model, fitted.fit), search_s)
 
 
 def _observe(
@@ -260,22 +267,22 @@ def _guessed_lens(profile: CameraProfile) -> Intrinsics:
 def _scan(observed: _Observed, search_s: float) -> OffsetScan:
     centre = observed.profile.time_offset_s or 0.0
     steps = int(np.ceil(search_s / COARSE_STEP_S))
-    offsets = centre + COARSE_STEP_S * np.arange(-steps, steps + 1)
+    offsets = centre + COARSE_STEP_S * np.arange(-steps, steps + 1, dtype=float)
     unknown_focal = observed.profile.intrinsics is None
     return scan_offsets(observed.turns, observed.trajectory, observed.profile.clock_skew, offsets, unknown_focal)
 
 
-def _distinct_peak(scan: OffsetScan, search_s: float) -> tuple[int | None, str]:
-    """The index of the one offset that explains the pictures, or None and the reason."""
+def _distinct_peak(scan: OffsetScan, search_s: float, least: float) -> tuple[int | None, str]:
+    """Find the index of the one offset that explains the pictures, or None and the reason."""
     peaks = scan.peaks()
     if not len(peaks) or not np.isfinite(scan.explained[peaks[0]]):
         return None, "the inertial data do not cover the frames at any offset searched"
     best = int(peaks[0])
     explained = float(scan.explained[best])
-    if explained < MIN_EXPLAINED:
+    if explained < least:
         return None, (
-            f"the pictures do not follow the gyroscope: at best it explains {max(explained, 0.0):.0%} of their rotation "
-            f"(stabilised pictures, or not of this recording?)"
+            f"the pictures do not follow the gyroscope: at best it explains {max(explained, 0.0):.0%} "
+            "of their rotation (stabilised pictures, or not of this recording?)"
         )
     if best in (0, len(scan.offset_s) - 1):
         return None, f"the offset lies at the end of the search (±{search_s:g} s)"
@@ -290,6 +297,10 @@ def _distinct_peak(scan: OffsetScan, search_s: float) -> tuple[int | None, str]:
     return best, ""
 
 
+def _least_explained(observed: _Observed) -> float:
+    return min(MIN_EXPLAINED + MIN_EXPLAINED_BY_PAIR / len(observed.pairs), MAX_MIN_EXPLAINED)
+
+
 def _same_valley(scan: OffsetScan, best: int) -> NDArray[np.bool_]:
     """(k,) the offsets around the best one, up to where twice as much is left unexplained."""
     worse = 1 - scan.explained > 2 * (1 - scan.explained[best])
@@ -299,32 +310,41 @@ def _same_valley(scan: OffsetScan, best: int) -> NDArray[np.bool_]:
     return (numbers > below) & (numbers < above)
 
 
-def _fit(observed: _Observed, offset_s: float, gain: float) -> tuple[PointFit, Array, float]:
-    """The fit with the translation model that the differences ask for, the variances (13,), rotation-only noise."""
-    model, start = _point_model(observed, offset_s)
+@dataclass(frozen=True, slots=True)
+class _Fitted:
+    fit: PointFit
+    variance: Array
+    """(13,) of its values, with what the model leaves open."""
+    rotation_noise_px: float
+    """What a fit without translation leaves."""
+
+
+def _fit(model: PointModel, start: Array, profile: CameraProfile) -> _Fitted:
+    """Fit with the simplest translation that the differences ask for."""
     active = mask("offset", "bias")
-    if not observed.profile.readout_known:
+    if not profile.readout_known:
         active |= mask("readout")
-    if observed.profile.intrinsics is None:
+    if profile.intrinsics is None:
         active |= mask("log_focal")
-        start[5] = np.log(gain)
     chosen, other, rotation_noise = _chosen_model(model, start, active)
-    strange = np.abs(chosen.values - model.prior_mean)[1:4] > MAX_BIAS_SIGMA * model.prior_std[1:4]
-    if strange.any():
-        log.debug("bias %s is none that a gyroscope has: held", chosen.values[1:4])
+    farthest = float(np.max(np.abs(chosen.values - model.prior_mean)[1:4] / model.prior_std[1:4]))
+    if farthest > MAX_BIAS_SIGMA[chosen.model]:
+        log.debug("bias %s rad/s is held", chosen.values[1:4])
         active &= ~mask("bias")
         chosen, other, rotation_noise = _chosen_model(model, start, active)
     own = np.diag(chosen.covariance(chosen.active))
     disagreement = _excess(chosen.values - other.values, np.diag(other.covariance(other.active)) - own)
-    disagreement = np.where(active, disagreement, 0.0)
     left_open = {name: _excess_with(chosen, name) for name in ("readout", "drift", "tilt", "log_focal")}
-    variance = own + disagreement + np.where(active, sum(left_open.values()), 0.0)
     _log_fit(chosen, own, disagreement, left_open)
-    return chosen, np.where(active | ~mask("bias"), variance, model.prior_std**2), rotation_noise
+    variance = own + np.where(active, disagreement + sum(left_open.values()), 0.0)
+    if active[4]:
+        variance = variance + UNKNOWN_READOUT_STD_S**2 * (mask("readout") + 0.25 * mask("offset"))
+    variance = np.where(mask("bias") & ~active, model.prior_std**2, variance)
+    return _Fitted(chosen, variance, rotation_noise)
 
 
 def _chosen_model(model: PointModel, start: Array, active: NDArray[np.bool_]) -> tuple[PointFit, PointFit, float]:
-    """The fit with the simplest sufficient translation, the next best one, and the noise of the rotation-only fit."""
+    """Return the fit with the simplest sufficient translation, the next best, and the rotation-only fit's noise."""
     rotation = _settled(model, start, active, "rotation")
     moving = active | mask("flow")
     pairwise = _settled(model, rotation.values, moving, "pairwise")
@@ -334,6 +354,16 @@ def _chosen_model(model: PointModel, start: Array, active: NDArray[np.bool_]) ->
     if common.noise_px < COMMON_RATIO * pairwise.noise_px:
         return common, pairwise, rotation.noise_px
     return pairwise, common, rotation.noise_px
+
+
+def _drift(model: PointModel, fit: PointFit) -> tuple[float, float]:
+    """Drift of the offset and its standard deviation, s/s; fitted anew where a first look finds any."""
+    wider = fit.active | mask("drift")
+    drift, std = fit.step(wider)[6], np.sqrt(fit.covariance(wider)[6, 6])
+    if abs(drift) > 2 * std:
+        free = fit_points(model, fit.values, wider, fit.model, overdispersion=fit.overdispersion)
+        drift, std = free.values[6], np.sqrt(free.covariance(wider)[6, 6])
+    return float(drift), float(std)
 
 
 def _log_fit(fit: PointFit, own: Array, disagreement: Array, left_open: dict[str, Array]) -> None:
@@ -348,8 +378,8 @@ def _log_fit(fit: PointFit, own: Array, disagreement: Array, left_open: dict[str
     )
 
 
-def _point_model(observed: _Observed, offset_s: float) -> tuple[PointModel, Array]:
-    """The model with the pairs that lie inside the inertial data at this offset, and its starting values."""
+def _point_model(observed: _Observed, offset_s: float, gain: float = 1.0) -> tuple[PointModel, Array]:
+    """Lay out the model with the pairs that lie inside the inertial data at this offset, and its starting values."""
     profile = observed.profile
     start_s, end_s = observed.trajectory.span_s
     margin_s = 0.02 + profile.shutter.readout_time_s
@@ -360,7 +390,7 @@ def _point_model(observed: _Observed, offset_s: float) -> tuple[PointModel, Arra
     mean, std = priors(profile)
     points = point_table(pairs, observed.frame_time_s, observed.exposure_s, profile)
     start = mean.copy()
-    start[0] = offset_s
+    start[0], start[5] = offset_s, np.log(gain)
     return PointModel(points, observed.trajectory, observed.lens, profile.clock_skew, mean, std), start
 
 
@@ -381,7 +411,7 @@ def _settled(model: PointModel, start: Array, active: NDArray[np.bool_], transla
 
 
 def _excess(shift: Array, expected_variance: Array) -> Array:
-    """The part of squared shifts that the extra freedom's own noise does not explain."""
+    """Return the part of squared shifts that the extra freedom's own noise does not explain."""
     return np.maximum(shift**2 - np.maximum(expected_variance, 0.0), 0.0)
 
 
@@ -394,9 +424,10 @@ def _excess_with(fit: PointFit, name: str) -> Array:
 
 
 def _conclude(
-    observed: _Observed, fit: PointFit, variance: Array, rotation_noise_px: float, search_s: float
+    observed: _Observed, fitted: _Fitted, drift_and_std: tuple[float, float], search_s: float
 ) -> OffsetEstimate:
-    profile, values = observed.profile, fit.values
+    profile, fit, variance, (drift, drift_std) = observed.profile, fitted.fit, fitted.variance, drift_and_std
+    values = fit.values
     notes = []
     std_s = float(np.hypot(np.sqrt(variance[0]), SMALLEST_STD_S))
     explained = _explained_at(observed, float(values[0]))
@@ -406,8 +437,6 @@ def _conclude(
         notes.append("exposure unknown: the offset contains half of it")
     if not profile.readout_known:
         notes.append("readout unknown: the offset and half the readout are determined together only")
-    wider = fit.active | mask("drift")
-    drift, drift_std = values[6] + fit.step(wider)[6], float(np.sqrt(fit.covariance(wider)[6, 6]))
     if abs(drift) > 4 * drift_std and abs(drift) > 5e-4:
         std_s = float(np.hypot(std_s, drift * _rms_time_s(observed)))
         notes.append(f"the offset drifts by {1e3 * drift:.2f} ms a second: the clocks' rates differ")
@@ -420,12 +449,12 @@ def _conclude(
         std_s=std_s,
         bias_rad_s=tuple(bias.tolist()),
         bias_std_rad_s=tuple(bias_std.tolist()),
-        residual_px=rotation_noise_px,
+        residual_px=fitted.rotation_noise_px,
         noise_px=fit.noise_px,
         explained=explained,
         readout_s=float(values[4]),
         readout_std_s=float(np.sqrt(variance[4])),
-        drift_s_per_s=float(drift),
+        drift_s_per_s=drift,
         drift_std_s_per_s=drift_std,
         focal_px=focal,
         focal_std_px=focal_std,
@@ -507,7 +536,7 @@ def check_agreement(
     profile: CameraProfile,
     search_s: float = 1.0,
 ) -> Agreement:
-    """Do the pictures turn as the gyroscope says, at the profile's offset (give or take AGREEMENT_SLACK_S)?
+    """Tell whether the pictures turn as the gyroscope says at the profile's offset, give or take AGREEMENT_SLACK_S.
 
     Arguments as for :func:`estimate_time_offset`.  Bias and steady drift are free, moving objects and parallax count
     little.  Too little to tell counts as agreement: nothing speaks against the gyroscope.
@@ -528,7 +557,7 @@ def check_agreement(
         return Agreement(True, nan, residual_px, motion_px, None, "too little to tell: no inertial data at the frames")
     if explained >= MIN_EXPLAINED:
         return Agreement(True, explained, residual_px, motion_px, None, "")
-    best, _ = _distinct_peak(scan, search_s)
+    best, _ = _distinct_peak(scan, search_s, _least_explained(observed))
     elsewhere = None if best is None else float(scan.offset_s[best])
     reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the pictures' rotation"
     hint = "stabilised pictures, or not of this recording?"
@@ -538,7 +567,7 @@ def check_agreement(
 
 
 def _changes_px(observed: _Observed, offset_s: float) -> tuple[Array, Array]:
-    """Changing rotation of pictures and gyroscope, (p, 3) each, in pixels at the focal length."""
+    """Compute the changing rotation of pictures and gyroscope, (p, 3) each, in pixels at the focal length."""
     turns = observed.turns
     expected = gyro_turns(
         observed.trajectory,

@@ -53,7 +53,7 @@ CAUCHY = 2.4
 """A point this many standard deviations away has half its weight."""
 QUANTILE = 0.4
 NORMAL_QUANTILE, RAYLEIGH_QUANTILE = 0.5244, 1.0108
-"""What 40 % of |x| and of √(x² + y²) stay below, for x and y of unit variance; 40 % bears more outliers than the median."""
+"""What 40 % of |x| and of √(x² + y²) stay below at unit variance; 40 % bears more outliers than the median."""
 INDEPENDENT_DEPTHS = 5
 DIRECTION_PASSES = 4
 MAX_ITERATIONS = 15
@@ -102,7 +102,7 @@ class PointModel:
     """(13,)."""
 
     def lens_at(self, values: Array) -> Intrinsics:
-        """The lens with the fitted focal scale."""
+        """Return the lens with the fitted focal scale."""
         return self.lens.scaled_focal(float(np.exp(values[5])))
 
     def predict(self, values: Array) -> tuple[Array, Array]:
@@ -153,7 +153,7 @@ class PointFit:
     """How much more the blocks disagree than independent points would; at least 1."""
 
     def step(self, active: Mask, without: int | None = None) -> Array:
-        """The Gauss-Newton step from here (13,), perhaps with other parameters active, or without one block."""
+        """Solve for the Gauss-Newton step from here (13,), with these parameters active, perhaps without one block."""
         hessian, gradient = self.hessian.sum(axis=0), self.gradient.sum(axis=0)
         if without is not None:
             hessian, gradient = hessian - self.hessian[without], gradient - self.gradient[without]
@@ -165,7 +165,7 @@ class PointFit:
         return step
 
     def covariance(self, active: Mask) -> Array:
-        """(13, 13), zero for what is held: the curvature's with the priors, raised to the delete-a-block jackknife's."""
+        """Covariance (13, 13), zero for what is held: from the curvature with the priors, raised to the jackknife's."""
         matrix = self.hessian.sum(axis=0) / self.overdispersion + np.diag(self.prior_information)
         full = np.zeros_like(matrix)
         full[np.ix_(active, active)] = np.linalg.pinv(matrix[np.ix_(active, active)], rcond=1e-13, hermitian=True)
@@ -359,7 +359,7 @@ def _translation_flow(lens: Intrinsics, rays: Array, expected_px: Array) -> Arra
 
 
 def _find_directions(difference: Array, flow: Array, group: NDArray[np.intp], start: Array | None) -> Array:
-    """(groups, 3) unit translations whose flow the differences follow best.
+    """Find unit translations (groups, 3) whose flow the differences follow best.
 
     Across the flow F t, a difference r measures t · (r × F) / |F t|: linear in t but for the length, which each pass
     takes from the one before; Cauchy weights at the noise across.  Without a start, all differences weigh alike.
@@ -383,13 +383,13 @@ def _find_directions(difference: Array, flow: Array, group: NDArray[np.intp], st
 
 
 def _least_directions(rows: Array, group: NDArray[np.intp], groups: int) -> Array:
-    """Unit vectors (groups, 3) with the least Σ (row · t)²."""
+    """Find unit vectors (groups, 3) with the least Σ (row · t)²."""
     return np.linalg.eigh(_group_sum(rows[:, :, None] * rows[:, None, :], group, groups))[1][..., 0]
 
 
 def _group_sum(values: Array, group: NDArray[np.intp], groups: int) -> Array:
     flat = values.reshape(len(values), -1)
-    total = np.stack([np.bincount(group, flat[:, k], groups) for k in range(flat.shape[1])], axis=-1)
+    total: Array = np.stack([np.bincount(group, flat[:, k], groups) for k in range(flat.shape[1])], axis=-1)
     return total.reshape(groups, *values.shape[1:])
 
 

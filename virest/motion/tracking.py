@@ -1,4 +1,4 @@
-"""Points followed from one frame to the next (pyramidal Lucas & Kanade 1981; Bouguet 2001), checked forwards and backwards."""
+"""Points followed from one frame to the next (pyramidal Lucas-Kanade, Bouguet 2001), checked forwards and back."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _halved(picture: NDArray[np.uint8], limit_px: int) -> tuple[NDArray[np.uint8], int]:
-    """The picture halved until it fits, by means of 2 x 2 pixels, and the factor."""
+    """Return the picture halved until it fits, by means of 2 x 2 pixels, and the factor."""
     factor = 1
     while max(picture.shape) > limit_px and min(picture.shape) >= 64:
         even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]

@@ -1,4 +1,4 @@
-"""How far the picture turned from frame to frame, and when the gyroscope says so: the coarse search for a time offset."""
+"""How far the pictures turned from frame to frame, and when the gyroscope did: the coarse search for a time offset."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class OffsetScan:
     """(k,) pitch and yaw in the pictures over those of the gyroscope; 1 where the focal length is known."""
 
     def peaks(self) -> NDArray[np.intp]:
-        """Indices of the local maxima, ends included, best first."""
+        """Find indices of the local maxima, ends included, best first."""
         held = np.concatenate([[-np.inf], self.explained, [-np.inf]])
         top = np.flatnonzero((held[1:-1] >= held[:-2]) & (held[1:-1] > held[2:]))
         return top[np.argsort(-self.explained[top])]
@@ -83,7 +83,7 @@ def picture_turns(lens: Intrinsics, pairs: Sequence[TrackPair], first_s: Array, 
 
 
 def gyro_turns(trajectory: Trajectory, first_s: Array, second_s: Array) -> Array:
-    """What the pictures' rotation vectors (..., 3) should be between times (...) on the IMU clock."""
+    """Predict what the pictures' rotation vectors (..., 3) should be between times (...) on the IMU clock."""
     after = trajectory.orientation(second_s)
     return vector_from_rotation(np.swapaxes(after, -1, -2) @ trajectory.orientation(first_s))
 

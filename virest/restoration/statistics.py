@@ -155,7 +155,7 @@ def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> Pi
     signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
     for _ in range(_FIT_STEPS):
         fitted = np.append(noise, 1.0)[ring] + np.append(signal, 1.0)[ring] * k
-        weight = 1.0 / np.maximum(fitted, 1e-6) ** 2
+        weight = 1.0 / np.maximum(fitted, 1e-6) ** 1.5
         w, wk, wkk, wg, wkg = (total(v) for v in (weight, weight * k, weight * k * k, weight * g, weight * k * g))
         determinant = np.maximum(w * wkk - wk * wk, 1e-30)
         signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)

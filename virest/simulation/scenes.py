@@ -209,7 +209,7 @@ _DRAWINGS = {"leaves": _draw_leaves, "bright": _draw_bright, "board": _draw_boar
 
 def _leaf_labels(rng: np.random.Generator, width: int, height: int, scale: float) -> tuple[NDArray[np.int32], int]:
     """Which leaf is on top at each chart pixel; leaf 0 is the ground."""
-    small, large = 2.2 * scale, 0.16 * min(width, height) + 3 * scale
+    small, large = 4.5 * scale, 0.25 * min(width, height) + 5 * scale
     mean_area = 2 * np.pi * small**2 * np.log(large / small) / (1 - (small / large) ** 2)
     count = int(min(4.0 * width * height / mean_area, 150_000))
     radii = _power_radii(rng, count, small, large)
@@ -245,7 +245,7 @@ def _fill_leaf(canvas: NDArray[Any], rng: np.random.Generator, centre: NDArray[A
 
 def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[Any]:
     """Linear RGB (count, 3): log-normal luminance around 0.16, muted hues along blue-yellow and red-green."""
-    luminance = np.clip(0.16 * np.exp(rng.normal(0, 0.85, count)), 0.012, 0.8)
+    luminance = np.clip(0.16 * np.exp(rng.normal(0, 0.7, count)), 0.012, 0.8)
     yellow, red = rng.normal(0, 0.22, count), rng.normal(0, 0.09, count)
     tint = np.exp(np.stack([0.5 * yellow + red, 0.15 * yellow - 0.5 * red, -yellow], axis=1))
     return (luminance[:, None] * tint).astype(np.float32)
@@ -255,7 +255,7 @@ def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArr
     """Each leaf's colour times its own cut of a 1/f texture and of a slow shading field."""
     height, width = labels.shape
     texture = _one_over_f(rng, _TEXTURE_SIDE)
-    strength = (rng.gamma(2.0, 0.09, len(colour))).astype(np.float32)
+    strength = (rng.gamma(2.0, 0.07, len(colour))).astype(np.float32)
     shift = rng.integers(0, _TEXTURE_SIDE, (2, len(colour)), dtype=np.int32)
     shade = np.exp(0.25 * _smooth_field(rng, width, height))
     light = np.empty((height, width, 3), np.float32)

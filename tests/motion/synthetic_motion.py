@@ -6,7 +6,7 @@ code under test is used but its records.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,10 +103,6 @@ class Synthetic:
     def arguments(self) -> tuple[list[TrackPair], Array, Array, ImuSamples, CameraProfile]:
         """In the order that estimators take them."""
         return self.pairs, self.frame_time_s, self.exposure_s, self.imu, self.profile
-
-    def with_gyro(self, gyro_rad_s: Array) -> Synthetic:
-        """The same with another gyroscope table."""
-        return replace(self, imu=replace(self.imu, gyro_rad_s=gyro_rad_s))
 
 
 def make(setup: Setup, imu_hz: float = 200.0) -> Synthetic:
