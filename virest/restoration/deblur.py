@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,8 +23,10 @@ from virest.restoration.deconvolution import (
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics import PictureStatistics, on_spectrum
 
-CLIP_MARGIN_LEVELS = 3.0
+CLIP_MARGIN_LEVELS = 8.0
 """A clipped pixel comes back from the movie's codec up to about this many levels below the top."""
+RESIDUAL_SHARE = 0.1
+"""Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
 
 
@@ -92,12 +94,14 @@ def _tile_deconvolution(blurred: BlurredPicture, side: int, overlap: int) -> til
 
 def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
     deconvolution = _tile_deconvolution(blurred, settings.tile_px, settings.tile_px // 4)
+    streaks = _streaks(blurred)
+    filled = _without_streaks(blurred.light, streaks)
     factors = [_tile_factors(deconvolution, settings, s) for s in (blurred.statistics, blurred.chroma)]
     sharp = []
-    for plane, factor in zip(_to_opponents(blurred.light), (factors[0], factors[1], factors[1]), strict=True):
+    for plane, factor in zip(_to_opponents(filled), (factors[0], factors[1], factors[1]), strict=True):
         spectra = deconvolution.back_projected(plane)
         sharp.append(deconvolution.blend([s * f for s, f in zip(spectra, factor, strict=True)]))
-    return _kept_near_censored(_from_opponents(sharp), blurred)
+    return _with_streaks(_from_opponents(sharp), blurred.light, streaks)
 
 
 def _tile_factors(
@@ -128,21 +132,44 @@ def _from_opponents(planes: list[Image]) -> list[Image]:
     return [luma + red, green.astype(np.float32), luma + blue]
 
 
-def _kept_near_censored(sharp: list[Image], blurred: BlurredPicture) -> list[Image]:
-    return [
-        _keep_near_censored(s, light, censored, blurred.longest_px)
-        for s, light, censored in zip(sharp, blurred.light, blurred.censored, strict=True)
-    ]
+def _streaks(blurred: BlurredPicture) -> Image | None:
+    """1 where a censored pixel's light may have gone or come from along the blur path, falling to 0 around it."""
+    masks = [c for c in blurred.censored if c is not None]
+    if not masks:
+        return None
+    return cv2.GaussianBlur(cv2.dilate(np.maximum.reduce(masks), _path_reach(blurred)), (0, 0), 1.5)
 
 
-def _keep_near_censored(sharp: Image, light: Image, censored: Image | None, reach_px: float) -> Image:
-    """A linear filter cannot leave pixels out: fade to the recorded light where clipped ones would have rung."""
-    if censored is None:
-        return sharp
-    reach = 2 * int(np.ceil(reach_px)) + 3
-    near = cv2.dilate(censored, np.ones((reach, reach), np.uint8))
-    fade = cv2.blur(near, (reach, reach))
-    return sharp + fade * (light - sharp)
+def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
+    """The blur path at the picture's middle, to both sides, as a structuring element."""
+    height, width = blurred.light[0].shape
+    path = blurred.field(np.array([[(width - 1) / 2, (height - 1) / 2]])).arrays(positive=True)[0]
+    return (path + path[::-1, ::-1] > 2e-3).astype(np.uint8)
+
+
+def _without_streaks(light: list[Image], streaks: Image | None) -> list[Image]:
+    """Clipped light is no linear blur, and a filter cannot leave pixels out: fill the streaks in from around them."""
+    if streaks is None:
+        return light
+    known = 1 - np.minimum(streaks * 4, 1)
+    return [_filled_in(plane, known) for plane in light]
+
+
+def _filled_in(plane: Image, known: Image) -> Image:
+    """Weighted means of what is known, over wider and wider neighbourhoods."""
+    filled, weight = plane * known, known
+    for side in (5, 15, 45, 135):
+        near = cv2.blur(weight, (side, side))
+        reached = near > 1e-2
+        mean = np.where(reached, cv2.blur(filled, (side, side)) / np.maximum(near, 1e-2), 0)
+        filled = filled + (1 - weight) * mean
+        weight = np.where(reached, np.float32(1), weight)
+    return filled
+
+
+def _with_streaks(sharp: list[Image], light: list[Image], streaks: Image | None) -> list[Image]:
+    """Put the recorded light back where the streaks were."""
+    return sharp if streaks is None else [s + streaks * (p - s) for s, p in zip(sharp, light, strict=True)]
 
 
 def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
@@ -150,12 +177,14 @@ def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSetti
     deconvolution = _tile_deconvolution(blurred, settings.tile_px, settings.tile_px // 4)
     first = _tile_factors(deconvolution, settings, blurred.statistics)
     colour = _tile_factors(deconvolution, settings, blurred.chroma)
-    luma, *differences = _to_opponents(blurred.light)
+    streaks = _streaks(blurred)
+    filled = _without_streaks(blurred.light, streaks)
+    luma, *differences = _to_opponents(filled)
     sharp = [_tile_hyper_laplacian(deconvolution, luma, first, blurred, settings)]
     for plane in differences:
         spectra = deconvolution.back_projected(plane)
         sharp.append(deconvolution.blend([s * f for s, f in zip(spectra, colour, strict=True)]))
-    return _kept_near_censored(_from_opponents(sharp), blurred)
+    return _with_streaks(_from_opponents(sharp), blurred.light, streaks)
 
 
 def _tile_hyper_laplacian(
@@ -176,7 +205,22 @@ def _tile_hyper_laplacian(
         factors = deconvolution.filters(lambda power, w=weight: 1.0 / (power * w + gradients))
         pull = _gradient_targets(sharp, scale, shrinkage_table(beta))
         sharp = _tile_solve(deconvolution, projected, pull, factors, weight)
-    return sharp
+    return sharp + _returned_residual(deconvolution, projected, sharp, blurred.statistics)
+
+
+def _returned_residual(
+    deconvolution: tiles.TileDeconvolution, projected: list[Image], sharp: Image, statistics: PictureStatistics
+) -> Image:
+    """Fine texture that the prior took for noise: the residual g − K f, filtered as a picture of a tenth the power."""
+    ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
+    padded = deconvolution.padded(sharp)
+    spectra = [
+        (back - power * cv2.dft(deconvolution.periodic(padded, top, left))) / (power + ratio)
+        for (top, left), back, power in zip(
+            deconvolution.grid.corners(), projected, deconvolution.powers, strict=True
+        )
+    ]
+    return deconvolution.blend(spectra)
 
 
 def _gradient_targets(sharp: Image, scale: Image, table: Image) -> Image:
@@ -202,7 +246,9 @@ def _tile_solve(
 
 def _beta_schedule(iterations: int) -> tuple[float, ...]:
     """Rising penalties of the half-quadratic splitting, in units of the gradients' own scale."""
-    return tuple(float(b) for b in np.geomspace(0.05, 8.0, max(iterations, 1)))
+    if iterations <= 2:
+        return (0.2, 2.0)[-max(iterations, 1) :]
+    return tuple(float(b) for b in np.geomspace(0.05, 12.0, iterations))
 
 
 # ── over the whole picture ───────────────────────────────────────────────────────────────────────────────────────
@@ -230,14 +276,18 @@ def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) 
 
 
 def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+    """Hyper-Laplacian over the whole operator; censored pixels have no weight, but where all is clipped, as a bound."""
     operator = _whole_operator(blurred)
     statistics = blurred.statistics
-    unit = statistics.gradient_scale
-    first = _by_tile_filter(blurred, RestorationSettings("fast", "gradient-wiener", tile_px=settings.tile_px))
-    betas = _beta_schedule(settings.iterations)
+    first = _by_tile_filter(blurred, replace(settings, deblur="gradient-wiener"))
+    reach = _path_reach(blurred) if any(c is not None for c in blurred.censored) else None
     sharp = []
     for light, slope, censored, start in zip(blurred.light, blurred.slope, blurred.censored, first, strict=True):
-        weight = slope if censored is None else slope * (1 - censored)
+        weight, bound = slope, None
+        if censored is not None and reach is not None:
+            bound = cv2.erode(censored, reach)
+            unseen = cv2.dilate(censored, np.ones((3, 3), np.uint8)) - bound
+            weight = slope * (1 - unseen)
         result = hyper_laplacian(
             light,
             operator.apply,
@@ -246,11 +296,13 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
             weight,
             _extended(slope, operator.border),
             (settings.strength * statistics.noise_levels) ** -2,
-            unit,
-            betas,
+            statistics.gradient_scale,
+            _beta_schedule(settings.iterations),
             settings.inner_iterations,
+            bound,
         )
-        sharp.append(_inner(result, operator.border))
+        inner = _inner(result, operator.border)
+        sharp.append(inner if bound is None else np.where(bound > 0, np.maximum(inner, light), inner))
     return sharp
 
 

@@ -207,8 +207,6 @@ def _deblurred(
         picture, curve, statistics, lambda centres: kernel_field(motion, centres, anchor), longest_px
     )
     restored = encode_picture(deblur(blurred, settings), curve)
-    censored = curve.censored_table()[picture]
-    np.copyto(restored, picture, where=censored)
     return restored, {
         "method": settings.deblur,
         "preset": settings.preset,

@@ -34,7 +34,7 @@ class RestorationSettings:
     """Of the whole-picture method: conjugate-gradient steps in each iteration."""
     tile_px: int = 128
     """Side of a tile; each has a kernel of its own."""
-    strength: float = 1.0
+    strength: float = 0.7
     """Multiplies the measured noise in the regularisation: 1 trusts it, more is smoother."""
     min_blur_px: float = 1.0
     """Frames whose longest blur path is shorter are not deblurred."""
@@ -43,7 +43,7 @@ class RestorationSettings:
 
 
 PRESETS: dict[str, RestorationSettings] = {
-    "fast": RestorationSettings("fast", "gradient-wiener", iterations=1),
-    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=4),
+    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=192),
+    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5),
     "best": RestorationSettings("best", "hyper-laplacian-global", iterations=6),
 }

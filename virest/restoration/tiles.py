@@ -30,11 +30,11 @@ class TileDeconvolution:
         self._windows = grid.windows()
         self._bridge = _bridge(self.size - self.patch)
         self._kernels = [self._kernel_spectrum(kernel) for kernel in kernels]
-        self._powers = [doubled(cv2.mulSpectrums(k, k, 0, conjB=True)) for k in self._kernels]
+        self.powers = [doubled(cv2.mulSpectrums(k, k, 0, conjB=True)) for k in self._kernels]
 
     def filters(self, make: Filter) -> list[Image]:
         """The packed real factor of each tile."""
-        return [make(power) for power in self._powers]
+        return [make(power) for power in self.powers]
 
     def back_projected(self, channel: Image) -> list[Image]:
         """Spectrum of Kᵀ g for each tile; channel (height, width) is extended, never wrapped."""
