@@ -360,7 +360,7 @@ def verdict(counts: dict[str, int], copy_reason: str | None) -> str:
     if counts.get("failed"):
         return "some frames failed"
     if copy_reason:
-        return "copied: pictures and gyroscope disagree"
+        return f"copied: {copy_reason}"
     if counts.get("restored"):
         return "restored"
     return (

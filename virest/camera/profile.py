@@ -102,6 +102,12 @@ class CameraProfile:
         return replace(self, estimates={**self.estimates, name: Estimate(value, std, source)}, **changes)
 
 
+    def with_focal(self, focal_px: float, std_px: float, source: str) -> CameraProfile:
+        """The profile with an estimated focal length, square pixels and the principal point in the middle."""
+        lens = Intrinsics(self.width, self.height, focal_px, focal_px, (self.width - 1) / 2, (self.height - 1) / 2)
+        return self.with_estimate("fx_px", focal_px, std_px, source, intrinsics=lens)
+
+
 # ── the YAML edge ────────────────────────────────────────────────────────────────────────────────────────────────
 
 

@@ -23,8 +23,10 @@ from virest.restoration.deconvolution import (
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics import PictureStatistics, on_spectrum
 
-CLIP_MARGIN_LEVELS = 8.0
-"""A clipped pixel comes back from the movie's codec up to about this many levels below the top."""
+CLIPPED_LEVELS = 2.0
+"""A pixel this close to the top was clipped."""
+PULLED_DOWN_LEVELS = 8.0
+"""Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
 RESIDUAL_SHARE = 0.1
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
@@ -61,10 +63,17 @@ def blurred_picture(
     reach = 2 * int(np.ceil(longest_px / 2)) + 3
     smooth = cv2.blur(picture, (reach, reach))
     slope = list(cv2.split(cv2.LUT(smooth, curve.slope_table())))
-    mask_table = curve.censored_table(CLIP_MARGIN_LEVELS).astype(np.uint8)
-    mask = cv2.LUT(picture, mask_table)
-    censored = [c.astype(np.float32) if c.any() else None for c in cv2.split(mask)]
+    censored = [_censored(channel, curve) for channel in cv2.split(picture)]
     return BlurredPicture(light, slope, censored, *statistics, field, longest_px)
+
+
+def _censored(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
+    """1.0 where the channel is clipped, and where its neighbours are and the codec has pulled it down a little."""
+    clipped = cv2.LUT(channel, curve.censored_table(CLIPPED_LEVELS).astype(np.uint8))
+    if not clipped.any():
+        return None
+    near = cv2.dilate(clipped, np.ones((5, 5), np.uint8))
+    return (near & cv2.LUT(channel, curve.censored_table(PULLED_DOWN_LEVELS).astype(np.uint8))).astype(np.float32)
 
 
 def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:

@@ -26,6 +26,14 @@ LOG_TILE_PX = 128
 """Spacing of the tiles in the log."""
 MIN_WARP_PX = 0.05
 """Straightening that moves no point further than this is left out."""
+SAMPLE_TILE_PX = 128
+"""Spacing of the tiles on which a picture's noise is measured."""
+MIN_GAIN_DB = 0.03
+"""A picture of which the measured noise promises less is left alone."""
+FULL_TRUST_DB = 0.5
+"""From this expected gain on, a restored picture is taken whole."""
+MANY_CLIPPED = 0.003
+"""With a larger part of clipped pixels the expected gain says nothing: they are no linear blur."""
 _ENCODE_STEPS = 8192
 
 
@@ -57,41 +65,37 @@ def restore_frame(
     picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.
     """
     clock = _Clock()
-    profile = motion.profile
-    curve = profile.response or ResponseCurve("srgb")
+    height, width = picture.shape[:2]
+    curve = motion.profile.response or ResponseCurve("srgb")
     parameters = degradation_parameters(motion, trajectory, settings)
     longest_px = max(tile["length_px"] for tile in parameters["blur"]["tiles"])
-    straighten, displacement_px = _straightening(motion, settings)
     method, why_not = _deblur_method(motion, settings, longest_px)
+    straighten = settings.shutter != "none"
     anchor = 0.5 if straighten or settings.reference == "frame-middle" or method == "none" else 0.0
     clock.lap("estimate")
-    restored = picture
-    details: dict[str, Any] = {"method": method}
+    restored, parameters["deblur"] = picture, {"method": "none"}
     if method != "none":
-        restored, details = _deblurred(picture, motion, curve, settings, anchor, parameters["blur"]["angle_rad"], longest_px)
+        restored, parameters["deblur"], why_not = _deblurred(picture, motion, curve, settings, anchor, longest_px)
     clock.lap("deblur")
-    source = None
-    if straighten:
-        source = (perspective_map if settings.shutter == "perspective" else rowwise_map)(motion, anchor)
-        if method == "none" and displacement_px < MIN_WARP_PX and np.abs(source - _identity(source)).max() < MIN_WARP_PX:
-            source = None
+    source = _source_map(motion, settings, anchor, parameters["deblur"]["method"]) if straighten else None
+    valid_px = (0, 0, width, height)
     if source is not None:
-        restored = warp(restored, source)
+        restored, valid_px = warp(restored, source), valid_rectangle(source)
     clock.lap("shutter")
-    height, width = picture.shape[:2]
-    parameters["deblur"] = details
     parameters["shutter"]["method"] = settings.shutter if source is not None else "none"
-    changed = method != "none" or source is not None
+    status = "copied" if restored is picture else "restored"
+    warnings = (*_limits(motion), *why_not)
     return RestoredFrame(
-        frame,
-        "restored" if changed else "copied",
-        restored,
-        why_not if not changed else tuple(w for w in why_not if "known" in w),
-        valid_rectangle(source) if source is not None else (0, 0, width, height),
-        motion.exposure_s or None,
-        parameters,
-        clock.seconds,
+        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds
     )
+
+
+def _limits(motion: RowMotion) -> tuple[str, ...]:
+    """What the model leaves out."""
+    depth_m = motion.profile.depth_m
+    if motion.translation_m is None and not (depth_m is not None and np.isinf(depth_m)):
+        return ("camera translation not known: rotation only",)
+    return ()
 
 
 def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: RestorationSettings) -> dict[str, Any]:
@@ -174,11 +178,15 @@ def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> ND
     return picture
 
 
-def _straightening(motion: RowMotion, settings: RestorationSettings) -> tuple[bool, float]:
-    width, height = motion.profile.width, motion.profile.height
-    corners = corner_points(width, height)
-    moved = np.linalg.norm(straightened_points(motion, corners, 0.5) - corners, axis=1).max()
-    return settings.shutter != "none", float(moved)
+def _source_map(
+    motion: RowMotion, settings: RestorationSettings, anchor: float, deblurred: str
+) -> NDArray[np.float32] | None:
+    """Where each pixel of the output was recorded; None where nothing would move."""
+    corners = corner_points(motion.profile.width, motion.profile.height)
+    moved_px = np.abs(straightened_points(motion, corners, anchor) - corners).max()
+    if deblurred == "none" and moved_px < MIN_WARP_PX:
+        return None
+    return perspective_map(motion, anchor) if settings.shutter == "perspective" else rowwise_map(motion, anchor)
 
 
 def _deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: float) -> tuple[str, tuple[str, ...]]:
@@ -197,30 +205,45 @@ def _deblurred(
     curve: ResponseCurve,
     settings: RestorationSettings,
     anchor: float,
-    angle_rad: float,
     longest_px: float,
-) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+) -> tuple[NDArray[np.uint8], dict[str, Any], tuple[str, ...]]:
+    """The deblurred picture and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
-    samples = tile_grid(height, width, 128, 0).centres_px
-    statistics = measure_picture(picture, kernel_field(motion, samples, anchor))
+    samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
+    luma, chroma = measure_picture(picture, samples)
+    clipped = bool(np.mean(curve.censored_table()[picture]) > MANY_CLIPPED)
+    if luma.expected_gain_db < MIN_GAIN_DB and not clipped:
+        reason = f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
+        return picture, {"method": "none"}, (reason,)
     blurred = blurred_picture(
-        picture, curve, statistics, lambda centres: kernel_field(motion, centres, anchor), longest_px
+        picture, curve, (luma, chroma), lambda centres: kernel_field(motion, centres, anchor), longest_px
     )
-    restored = encode_picture(deblur(blurred, settings), curve)
-    return restored, {
+    sharp = deblur(blurred, settings)
+    share = 1.0 if clipped or anchor != 0.5 else _trusted_share(luma.expected_gain_db, settings.deblur)
+    if share < 1.0:
+        sharp = [light + np.float32(share) * (s - light) for s, light in zip(sharp, blurred.light, strict=True)]
+    restored = encode_picture(sharp, curve)
+    details = {
         "method": settings.deblur,
         "preset": settings.preset,
         "iterations": settings.iterations,
         "strength": settings.strength,
         "tile_px": settings.tile_px,
-        "noise_grey_levels": statistics[0].noise_levels,
+        "noise_grey_levels": luma.noise_levels,
+        "expected_gain_db": luma.expected_gain_db,
+        "share": share,
     }
+    return restored, details, ()
 
 
-def _identity(source: NDArray[np.float32]) -> NDArray[np.float32]:
-    height, width = source.shape[:2]
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    return np.stack([x, y], -1)
+def _trusted_share(expected_gain_db: float, method: str) -> float:
+    """How much of a restored picture to take, the rest being the recorded one.
+
+    Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
+    both pictures is better than either.  A whole-picture solution errs less than a tiled one.
+    """
+    least = 0.7 if method == "hyper-laplacian-global" else 0.5
+    return float(np.clip(least + (1 - least) * expected_gain_db / FULL_TRUST_DB, least, 1.0))
 
 
 class _Clock:

@@ -1,0 +1,114 @@
+"""The lens: pixels and rays are each other's inverse, and OpenCV agrees."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from laws import FISHEYE, RADTAN, UNDISTORTED, assert_round_trip
+from numpy.typing import NDArray
+
+from virest.camera.intrinsics import Intrinsics
+from virest.errors import SettingsError
+
+LENSES = [
+    pytest.param(UNDISTORTED, id="none"),
+    pytest.param(RADTAN, id="radtan"),
+    pytest.param(("radtan", (0.09, -0.02, -0.002, 0.003, 0.005)), id="pincushion"),
+    pytest.param(FISHEYE, id="fisheye"),
+    pytest.param(("fisheye", (0.0, 0.0, 0.0, 0.0)), id="equidistant"),
+]
+Model = tuple[str, tuple[float, ...]]
+
+
+def _lens(lens: Model, focal_px: float = 412.0) -> Intrinsics:
+    return Intrinsics(640, 360, focal_px, 0.98 * focal_px, 331.2, 171.9, *lens)
+
+
+def _pixels() -> NDArray[np.float64]:
+    """The picture's corners, its edges and its inside."""
+    x, y = np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 359, 7))
+    return np.stack([x, y], -1)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_project_undoes_rays(lens: Model) -> None:
+    """The ray through a pixel lands on that pixel again, at the picture's corners too."""
+    camera = _lens(lens)
+    assert_round_trip(camera.rays, camera.project, _pixels(), atol=1e-6)
+
+
+def test_wide_fisheye_reaches_its_corners() -> None:
+    """A fisheye of 150 degrees across its diagonal still inverts at its corners."""
+    camera = _lens(FISHEYE, focal_px=280.0)
+    assert_round_trip(camera.rays, camera.project, _pixels(), atol=1e-6)
+    half_angle = np.degrees(np.arctan(np.linalg.norm(camera.rays(np.array([[0.0, 359.0]]))[0, :2])))
+    assert half_angle > 65
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    k1=st.floats(-0.12, 0.25), k2=st.floats(-0.02, 0.04), p1=st.floats(-0.004, 0.004), p2=st.floats(-0.004, 0.004)
+)
+def test_any_mild_lens_round_trips(k1: float, k2: float, p1: float, p2: float) -> None:
+    """Whatever mild distortion a phone has, rays and pixels are inverse over the whole picture."""
+    camera = _lens(("radtan", (k1, k2, p1, p2, 0.0)))
+    assert_round_trip(camera.rays, camera.project, _pixels(), atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", [UNDISTORTED, RADTAN])
+def test_project_is_opencvs(lens: Model) -> None:
+    """Brown's model has OpenCV's coefficients in OpenCV's order."""
+    camera = _lens(lens)
+    rays = np.random.default_rng(1).uniform((-0.7, -0.4, 0.8), (0.7, 0.4, 1.3), (50, 3))
+    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.matrix, np.array(lens[1] or [0.0] * 5))
+    np.testing.assert_allclose(camera.project(rays), expected[:, 0], atol=1e-8)
+
+
+def test_fisheye_is_opencvs() -> None:
+    """The fisheye has OpenCV's coefficients in OpenCV's order."""
+    camera = _lens(FISHEYE)
+    rays = np.random.default_rng(2).uniform((-2, -1, 0.8), (2, 1, 1.3), (50, 3))
+    expected, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(FISHEYE[1]))
+    np.testing.assert_allclose(camera.project(rays), expected[:, 0], atol=1e-8)
+
+
+def test_axes_are_x_right_y_down_z_forward() -> None:
+    """What lies right of and below the optical axis has larger pixel coordinates; the axis meets (cx, cy)."""
+    camera = _lens(RADTAN)
+    centre, right, below = camera.project(np.array([[0, 0, 2.0], [0.2, 0, 2.0], [0, 0.2, 2.0]]))
+    np.testing.assert_allclose(centre, (331.2, 171.9))
+    assert right[0] > centre[0] + 30
+    assert below[1] > centre[1] + 30
+
+
+def test_depth_does_not_matter_to_a_ray() -> None:
+    """A ray's length changes no pixel, and rays come with z = 1."""
+    camera = _lens(FISHEYE)
+    rays = camera.rays(_pixels())
+    np.testing.assert_array_equal(rays[..., 2], 1.0)
+    np.testing.assert_allclose(camera.project(3.7 * rays), _pixels(), atol=1e-6)
+
+
+def test_scaled_focal_scales_both_and_keeps_the_rest() -> None:
+    """A longer focal length moves pixels away from the principal point, and nothing else changes."""
+    camera = _lens(UNDISTORTED)
+    ray = np.array([[0.3, -0.2, 1.0]])
+    moved = camera.scaled_focal(1.1).project(ray) - (331.2, 171.9)
+    np.testing.assert_allclose(moved, 1.1 * (camera.project(ray) - (331.2, 171.9)))
+
+
+def test_only_a_lens_without_any_effect_counts_as_undistorted() -> None:
+    """A radtan lens of zeros bends nothing; an equidistant fisheye does, even with zero coefficients."""
+    assert not _lens(UNDISTORTED).is_distorted
+    assert not _lens(("radtan", (0.0,) * 5)).is_distorted
+    assert _lens(("fisheye", (0.0,) * 4)).is_distorted
+
+
+@pytest.mark.parametrize("lens", [("brown", ()), ("radtan", (0.1, 0.2)), ("none", (0.1,)), ("fisheye", (0.0,) * 5)])
+def test_unknown_models_and_wrong_counts_are_refused(lens: Model) -> None:
+    """A model that is not known, or too few or many coefficients, is a settings error that names the model."""
+    with pytest.raises(SettingsError, match=lens[0]):
+        _lens(lens)

@@ -1,0 +1,66 @@
+"""Simulate and process as a user does, and read what was written."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import cv2
+import numpy as np
+
+from virest.app.bench.measures import psnr_db
+
+Virest = Callable[..., CompletedProcess[str]]
+Picture = np.ndarray[Any, np.dtype[np.uint8]]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one ``virest process`` left behind."""
+
+    folder: Path
+    lines: list[dict[str, Any]]
+    account: dict[str, Any]
+    stderr: str
+
+    def picture(self, line: dict[str, Any]) -> Picture:
+        """The picture of a line, RGB."""
+        return read_png(self.folder / line["output"])
+
+
+def read_png(path: Path) -> Picture:
+    """An RGB picture."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    assert picture is not None, path
+    return picture[..., ::-1].astype(np.uint8)
+
+
+def simulate(virest: Virest, folder: Path, *arguments: object) -> Path:
+    """Run ``virest simulate`` and return the capture's folder."""
+    done = virest("simulate", folder, "-q", *arguments)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def process(virest: Virest, capture: Path, out: Path, *arguments: object) -> Result:
+    """Run ``virest process``; it has to end with 0."""
+    done = virest("process", capture, "--out", out, "--jobs", 1, *arguments, timeout=300)
+    assert done.returncode == 0, done.stderr
+    folder = out / capture.name
+    lines = [json.loads(line) for line in (folder / "parameters.jsonl").read_text(encoding="utf-8").splitlines()]
+    return Result(folder, lines, json.loads((folder / "run.json").read_text(encoding="utf-8")), done.stderr)
+
+
+def truth_picture(capture: Path, frame: int, folder: str = "frames") -> Picture:
+    """The sharp picture that a global shutter would have taken."""
+    return read_png(capture / "truth" / folder / f"{frame:06d}.png")
+
+
+def psnrs_db(result: Result, base: Result, capture: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """PSNR of each frame against truth, where ``base`` has real data."""
+    pairs = zip(result.lines, base.lines, strict=True)
+    return np.array(
+        [psnr_db(result.picture(a), truth_picture(capture, a["frame"]), b["valid_px"]) for a, b in pairs]
+    )

@@ -1,0 +1,1 @@
+"""Quality, shutter, speed and memory tables: ``python -m virest.app.bench``."""

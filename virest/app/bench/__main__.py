@@ -1,0 +1,76 @@
+"""Print the tables and write bench-out/bench.json.
+
+$ python -m virest.app.bench --only quality --quick
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from virest import __version__
+from virest.app.bench.memory import memory_section
+from virest.app.bench.quality import quality_section
+from virest.app.bench.shutter import shutter_section
+from virest.app.bench.speed import speed_section
+from virest.app.bench.workload import Scale
+from virest.app.console import emit
+
+Section = Callable[[Path, Scale], tuple[dict[str, Any], str]]
+SECTIONS: dict[str, Section] = {
+    "quality": quality_section,
+    "shutter": shutter_section,
+    "speed": speed_section,
+    "memory": memory_section,
+}
+LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the chosen sections; figures of each are kept as soon as it is done."""
+    options = _parse(arguments)
+    scale = Scale(quick=options.quick, full=options.full)
+    options.out.mkdir(parents=True, exist_ok=True)
+    report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
+    work = Path(tempfile.mkdtemp(prefix="work-", dir=options.out))
+    try:
+        for name in options.only or SECTIONS:
+            report[name], text = SECTIONS[name](work, scale)
+            emit(text + "\n")
+            _write(options.out / "bench.json", report)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m virest.app.bench", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", action="append", choices=tuple(SECTIONS), help="this section; may be repeated")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="a few frames: a look, no measurement")
+    size.add_argument("--full", action="store_true", help="memory up to 3000 frames")
+    parser.add_argument("--out", type=Path, default=Path("bench-out"), help="folder of bench.json [bench-out]")
+    return parser.parse_args(arguments)
+
+
+def _versions() -> dict[str, Any]:
+    libraries = {name: version(name) for name in LIBRARIES}
+    machine = {"machine": platform.machine(), "cores": len(os.sched_getaffinity(0))}
+    return {"virest": __version__, "python": platform.python_version(), **libraries, **machine}
+
+
+def _write(path: Path, report: dict[str, Any]) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    os.replace(part, path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""PSNR gained over straightening alone, on simulated rotation-only captures with truth; presets and peers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from virest.app.bench.measures import psnr_db
+from virest.app.bench.peers import PEERS, frame_motions, peer_pictures
+from virest.app.bench.tables import table
+from virest.app.bench.workload import (
+    PRESETS,
+    Scale,
+    Workload,
+    quality_workloads,
+    recorded_frames,
+    run_process,
+    simulated,
+    truth_frame,
+)
+from virest.app.console import emit
+
+METHODS = (*PRESETS, *PEERS)
+KIND_TITLES = {
+    "ordinary": "ordinary: 5-20 px",
+    "long": "long blur, strong noise: 15-45 px",
+    "bright": "bright clipped areas: 5-20 px",
+}
+
+
+def quality_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
+    """Measure every frame of every capture. Gains in dB, above ``--deblur none`` and the same warp."""
+    rows = []
+    for workload in quality_workloads(scale):
+        rows += measure_workload(work, workload)
+        emit(f"measured {workload.name}: {len(rows)} frames so far")
+    summary = summarise(rows)
+    return {"frames": rows, "summary": summary}, _text(summary)
+
+
+def measure_workload(work: Path, workload: Workload) -> list[dict[str, Any]]:
+    """One record for each frame: blur, PSNR of straightening alone, gain of each preset and peer."""
+    capture = simulated(work, workload.name, **workload.options)
+    base = run_process(capture, work / "none", "--deblur", "none")
+    runs = {preset: run_process(capture, work / preset, "--preset", preset) for preset in PRESETS}
+    curve, motions = frame_motions(capture)
+    recorded = dict(recorded_frames(capture))
+    records = []
+    for position, line in enumerate(base.lines):
+        frame, valid = line["frame"], line["valid_px"]
+        truth = truth_frame(capture, frame)
+        base_db = psnr_db(base.picture(line), truth, valid)
+        gains = {p: psnr_db(run.picture(run.lines[position]), truth, valid) - base_db for p, run in runs.items()}
+        for peer in PEERS:
+            tried = [psnr_db(p, truth, valid) for p in peer_pictures(peer, recorded[frame], motions[frame], curve)]
+            gains[peer] = max(tried) - base_db
+        blur_px = line["blur"]["length_px"]
+        low, high = workload.blur_range_px
+        records.append(
+            {
+                "capture": workload.name,
+                "kind": workload.kind,
+                "frame": frame,
+                "blur_px": blur_px,
+                "in_range": low <= blur_px <= high,
+                "straightened_db": base_db,
+                "gain_db": gains,
+            }
+        )
+    return records
+
+
+def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Means over the frames in range by kind and capture; minima over all frames."""
+    groups: list[tuple[str, str | None]] = []
+    for kind in KIND_TITLES:
+        names = dict.fromkeys(row["capture"] for row in rows if row["kind"] == kind)
+        groups += [(kind, name) for name in names] + ([(kind, None)] if names else [])
+    return [_summary(kind, name, [r for r in rows if r["kind"] == kind and name in (None, r["capture"])])
+            for kind, name in groups]  # fmt: skip
+
+
+def _summary(kind: str, name: str | None, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    counted = [row for row in rows if row["in_range"]]
+
+    def over(chosen: list[dict[str, Any]], how: Any, method: str) -> float | None:
+        return float(how([row["gain_db"][method] for row in chosen])) if chosen else None
+
+    return {
+        "kind": kind,
+        "capture": name,
+        "frames": len(counted),
+        "of": len(rows),
+        "straightened_db": float(np.mean([row["straightened_db"] for row in counted])) if counted else None,
+        "mean_gain_db": {method: over(counted, np.mean, method) for method in METHODS},
+        "min_gain_db": {method: over(rows, np.min, method) for method in METHODS},
+    }
+
+
+def _text(summary: list[dict[str, Any]]) -> str:
+    header = ["capture", "frames", "straight dB", *METHODS, *(f"min {preset}" for preset in PRESETS)]
+    rows = []
+    for entry in summary:
+        name = entry["capture"] or f"ALL {KIND_TITLES[entry['kind']]}"
+        means = [_decibels(entry["mean_gain_db"][method]) for method in METHODS]
+        minima = [_decibels(entry["min_gain_db"][preset]) for preset in PRESETS]
+        straight = "-" if entry["straightened_db"] is None else f"{entry['straightened_db']:.2f}"
+        rows.append([name, f"{entry['frames']}/{entry['of']}", straight, *means, *minima])
+    return (
+        "QUALITY: mean PSNR gain in dB over straightening alone, inside valid_px less 16 px\n"
+        "(mean over the frames whose blur is in range; min over all frames; peers: true centre kernel, linear light,\n"
+        " blended border, same warp, best setting for each frame by PSNR against truth)\n" + table(header, rows)
+    )
+
+
+def _decibels(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.2f}"
