@@ -54,13 +54,11 @@ def process(virest: Virest, capture: Path, out: Path, *arguments: object) -> Res
 
 
 def truth_picture(capture: Path, frame: int, folder: str = "frames") -> Picture:
-    """The sharp picture that a global shutter would have taken."""
+    """Read the sharp picture that a global shutter would have taken."""
     return read_png(capture / "truth" / folder / f"{frame:06d}.png")
 
 
 def psnrs_db(result: Result, base: Result, capture: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
     """PSNR of each frame against truth, where ``base`` has real data."""
     pairs = zip(result.lines, base.lines, strict=True)
-    return np.array(
-        [psnr_db(result.picture(a), truth_picture(capture, a["frame"]), b["valid_px"]) for a, b in pairs]
-    )
+    return np.array([psnr_db(result.picture(a), truth_picture(capture, a["frame"]), b["valid_px"]) for a, b in pairs])

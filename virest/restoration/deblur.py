@@ -27,6 +27,7 @@ CLIPPED_LEVELS = 2.0
 """A pixel this close to the top was clipped."""
 PULLED_DOWN_LEVELS = 8.0
 """Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
+COLOUR_SCALE = 2.0
 RESIDUAL_SHARE = 0.1
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
@@ -38,8 +39,8 @@ class BlurredPicture:
 
     light: list[Image]
     """Linear light of each channel, (height, width)."""
-    slope: list[Image]
-    """Grey levels per unit of light, smoothed over the neighbourhood, of each channel."""
+    slope: Image
+    """Grey levels per unit of light, smoothed over the neighbourhood, (height, width, 3)."""
     censored: list[Image | None]
     """1.0 where a channel's light could not be measured; None: nowhere."""
     statistics: PictureStatistics
@@ -62,7 +63,7 @@ def blurred_picture(
     light = list(cv2.split(cv2.LUT(picture, curve.linear_table())))
     reach = 2 * int(np.ceil(longest_px / 2)) + 3
     smooth = cv2.blur(picture, (reach, reach))
-    slope = list(cv2.split(cv2.LUT(smooth, curve.slope_table())))
+    slope = cv2.LUT(smooth, curve.slope_table())
     censored = [_censored(channel, curve) for channel in cv2.split(picture)]
     return BlurredPicture(light, slope, censored, *statistics, field, longest_px)
 
@@ -93,28 +94,49 @@ def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image
 # ── tile by tile ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _tile_deconvolution(blurred: BlurredPicture, side: int, overlap: int) -> tiles.TileDeconvolution:
-    height, width = blurred.light[0].shape
-    grid = tile_grid(height, width, side, overlap)
-    field = blurred.field(grid.centres_px)
-    margin = int(np.clip(blurred.longest_px, 16, 96))
-    return tiles.TileDeconvolution(grid, field.arrays(), margin)
+def _tile_deconvolution(blurred: BlurredPicture, side: int, scale: float = 1.0) -> tiles.TileDeconvolution:
+    """Tiles over the picture, or over one that is ``scale`` times smaller, with kernels to its measure."""
+    height, width = (int(np.ceil(length / scale)) for length in blurred.light[0].shape)
+    grid = tile_grid(height, width, int(side / scale), int(side / scale) // 4)
+    field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
+    kernels = replace(field, paths_px=field.paths_px / scale).arrays()
+    return tiles.TileDeconvolution(grid, kernels, int(np.clip(blurred.longest_px / scale, 16 / scale, 96)))
 
 
 def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
-    deconvolution = _tile_deconvolution(blurred, settings.tile_px, settings.tile_px // 4)
     streaks = _streaks(blurred)
-    filled = _without_streaks(blurred.light, streaks)
-    factors = [_tile_factors(deconvolution, settings, s) for s in (blurred.statistics, blurred.chroma)]
-    sharp = []
-    for plane, factor in zip(_to_opponents(filled), (factors[0], factors[1], factors[1]), strict=True):
-        spectra = deconvolution.back_projected(plane)
-        sharp.append(deconvolution.blend([s * f for s, f in zip(spectra, factor, strict=True)]))
-    return _with_streaks(_from_opponents(sharp), blurred.light, streaks)
+    luma, *differences = _to_opponents(_without_streaks(blurred.light, streaks))
+    deconvolution = _tile_deconvolution(blurred, settings.tile_px)
+    sharp = _filtered(deconvolution, luma, _tile_factors(deconvolution, settings, blurred.statistics))
+    colour = _filtered_colour(blurred, differences, settings)
+    return _with_streaks(_from_opponents([sharp, *colour]), blurred.light, streaks)
+
+
+def _filtered(deconvolution: tiles.TileDeconvolution, plane: Image, factors: list[Image]) -> Image:
+    spectra = deconvolution.back_projected(plane)
+    return deconvolution.blend([np.multiply(s, f, out=s) for s, f in zip(spectra, factors, strict=True)])
+
+
+def _filtered_colour(
+    blurred: BlurredPicture, differences: list[Image], settings: RestorationSettings
+) -> list[Image]:
+    """The colour differences, filtered at half size: a movie stores no more of them."""
+    height, width = differences[0].shape
+    deconvolution = _tile_deconvolution(blurred, settings.tile_px, COLOUR_SCALE)
+    factors = _tile_factors(deconvolution, settings, blurred.chroma, COLOUR_SCALE)
+    size = (deconvolution.grid.width, deconvolution.grid.height)
+    small = [cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in differences]
+    return [
+        cv2.resize(_filtered(deconvolution, plane, factors), (width, height), interpolation=cv2.INTER_LINEAR)
+        for plane in small
+    ]
 
 
 def _tile_factors(
-    deconvolution: tiles.TileDeconvolution, settings: RestorationSettings, statistics: PictureStatistics
+    deconvolution: tiles.TileDeconvolution,
+    settings: RestorationSettings,
+    statistics: PictureStatistics,
+    scale: float = 1.0,
 ) -> list[Image]:
     """What follows conj(K) in each tile: by the method that the settings name, the measured N / S one by default."""
     match settings.deblur:
@@ -124,7 +146,8 @@ def _tile_factors(
             weight = statistics.frequency
             flat = float(np.sum(statistics.noise * weight) / np.sum(statistics.signal * weight))
             return deconvolution.filters(lambda power: tiles.wiener_filter(power, settings.strength**2 * flat))
-    ratio = on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size)
+    noise_to_signal = settings.strength**2 * statistics.noise_to_signal
+    ratio = on_spectrum(statistics, noise_to_signal, deconvolution.size, scale)
     return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
 
 
@@ -183,38 +206,30 @@ def _with_streaks(sharp: list[Image], light: list[Image], streaks: Image | None)
 
 def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences, which hold little detail."""
-    deconvolution = _tile_deconvolution(blurred, settings.tile_px, settings.tile_px // 4)
-    first = _tile_factors(deconvolution, settings, blurred.statistics)
-    colour = _tile_factors(deconvolution, settings, blurred.chroma)
     streaks = _streaks(blurred)
-    filled = _without_streaks(blurred.light, streaks)
-    luma, *differences = _to_opponents(filled)
-    sharp = [_tile_hyper_laplacian(deconvolution, luma, first, blurred, settings)]
-    for plane in differences:
-        spectra = deconvolution.back_projected(plane)
-        sharp.append(deconvolution.blend([s * f for s, f in zip(spectra, colour, strict=True)]))
-    return _with_streaks(_from_opponents(sharp), blurred.light, streaks)
+    luma, *differences = _to_opponents(_without_streaks(blurred.light, streaks))
+    sharp = _tile_hyper_laplacian(blurred, luma, settings)
+    colour = _filtered_colour(blurred, differences, settings)
+    return _with_streaks(_from_opponents([sharp, *colour]), blurred.light, streaks)
 
 
-def _tile_hyper_laplacian(
-    deconvolution: tiles.TileDeconvolution,
-    plane: Image,
-    first: list[Image],
-    blurred: BlurredPicture,
-    settings: RestorationSettings,
-) -> Image:
+def _tile_hyper_laplacian(blurred: BlurredPicture, plane: Image, settings: RestorationSettings) -> Image:
+    deconvolution = _tile_deconvolution(blurred, settings.tile_px)
+    first = _tile_factors(deconvolution, settings, blurred.statistics)
     unit = blurred.statistics.gradient_scale
     trust = (unit / (settings.strength * blurred.statistics.noise_levels)) ** 2
     gradients = tiles.gradient_power(deconvolution.size)
     projected = deconvolution.back_projected(plane)
     sharp = deconvolution.blend([s * f for s, f in zip(projected, first, strict=True)])
-    scale = blurred.slope[1] * np.float32(1.0 / unit)
+    scale = blurred.slope[..., 1] * np.float32(1.0 / unit)
     for beta in _beta_schedule(settings.iterations):
         weight = np.float32(trust / beta)
         factors = deconvolution.filters(lambda power, w=weight: 1.0 / (power * w + gradients))
         pull = _gradient_targets(sharp, scale, shrinkage_table(beta))
         sharp = _tile_solve(deconvolution, projected, pull, factors, weight)
-    return sharp + _returned_residual(deconvolution, projected, sharp, blurred.statistics)
+    if settings.iterations > 2:
+        sharp += _returned_residual(deconvolution, projected, sharp, blurred.statistics)
+    return sharp
 
 
 def _returned_residual(
@@ -288,10 +303,12 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
     """Hyper-Laplacian over the whole operator; censored pixels have no weight, but where all is clipped, as a bound."""
     operator = _whole_operator(blurred)
     statistics = blurred.statistics
-    first = _by_tile_filter(blurred, replace(settings, deblur="gradient-wiener"))
+    first = _by_tile_hyper_laplacian(blurred, replace(settings, iterations=4))
     reach = _path_reach(blurred) if any(c is not None for c in blurred.censored) else None
     sharp = []
-    for light, slope, censored, start in zip(blurred.light, blurred.slope, blurred.censored, first, strict=True):
+    for light, slope, censored, start in zip(
+        blurred.light, cv2.split(blurred.slope), blurred.censored, first, strict=True
+    ):
         weight, bound = slope, None
         if censored is not None and reach is not None:
             bound = cv2.erode(censored, reach)

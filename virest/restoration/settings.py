@@ -45,5 +45,5 @@ class RestorationSettings:
 PRESETS: dict[str, RestorationSettings] = {
     "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=192),
     "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5),
-    "best": RestorationSettings("best", "hyper-laplacian-global", iterations=6),
+    "best": RestorationSettings("best", "hyper-laplacian-global", iterations=6, inner_iterations=6, strength=0.6),
 }

@@ -33,15 +33,17 @@ def warp(picture: NDArray[np.uint8], source_px: NDArray[np.float32]) -> NDArray[
     return cv2.remap(picture, source_px, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
-def valid_rectangle(source_px: NDArray[np.float32]) -> tuple[int, int, int, int]:
+def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int, int, int, int]:
     """(x0, y0, x1, y1), x1 and y1 one past the end: a large rectangle whose every pixel was recorded.
 
-    Its sides move in from the picture's own, always the one with the largest part of missing pixels.
+    Its sides move in from the picture's own, always the one with the largest part of missing pixels.  The map is
+    smooth, so every ``step``-th pixel is looked at; the rectangle begins and ends on such pixels.
     """
     height, width = source_px.shape[:2]
-    x, y = source_px[..., 0], source_px[..., 1]
+    columns, rows = _every(width, step), _every(height, step)
+    x, y = np.moveaxis(source_px[np.ix_(rows, columns)], -1, 0)
     missing = (x < -0.5) | (x > width - 0.5) | (y < -0.5) | (y > height - 0.5)
-    x0, y0, x1, y1 = 0, 0, width, height
+    x0, y0, x1, y1 = 0, 0, len(columns), len(rows)
     while x1 - x0 > 1 and y1 - y0 > 1:
         sides = (
             missing[y0:y1, x0].mean(),
@@ -53,4 +55,8 @@ def valid_rectangle(source_px: NDArray[np.float32]) -> tuple[int, int, int, int]
         if sides[worst] == 0:
             break
         x0, y0, x1, y1 = x0 + (worst == 0), y0 + (worst == 1), x1 - (worst == 2), y1 - (worst == 3)
-    return x0, y0, x1, y1
+    return int(columns[x0]), int(rows[y0]), int(columns[x1 - 1]) + 1, int(rows[y1 - 1]) + 1
+
+
+def _every(length: int, step: int) -> NDArray[np.intp]:
+    return np.append(np.arange(0, length - 1, step), length - 1)

@@ -24,8 +24,12 @@ Array = NDArray[np.float64]
 RINGS = 24
 _SIDE = 128
 _WINDOW = np.outer(np.hanning(_SIDE + 2)[1:-1], np.hanning(_SIDE + 2)[1:-1]).astype(np.float32)
+_WINDOW_SUM = float(_WINDOW.sum())
+_WINDOW_POWER = np.float32((_WINDOW**2).sum())
 _ROUNDING_POWER = 1 / 12
 _FIT_STEPS = 6
+_CELLS = 64
+_MAX_TILES = 24
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _NOISE_SLOPE = 0.7
@@ -91,6 +95,7 @@ def measure_picture(picture: NDArray[np.uint8], field: KernelField) -> tuple[Pic
         return _unknown_picture(), _unknown_picture()
     clipped = np.array([np.mean(_cut(luma, corner) >= _NEAR_CLIPPING) for corner in corners])
     chosen = np.flatnonzero(clipped <= max(_MAX_CLIPPED, float(np.quantile(clipped, 0.25))))
+    chosen = chosen[:: int(np.ceil(len(chosen) / _MAX_TILES))]
     kernels = field.arrays()
     passed = np.stack([_passed(kernels[i]) for i in chosen])
 
@@ -118,7 +123,8 @@ def _cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]
 
 def _windowed_power(tile: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Power of a tile less its mean under a Hann window; white noise of variance σ² gives σ² everywhere."""
-    return _power((tile - np.average(tile, weights=_WINDOW)).astype(np.float32) * _WINDOW) / np.sum(_WINDOW**2)
+    mean = np.float32(np.vdot(tile.astype(np.float32), _WINDOW) / _WINDOW_SUM)
+    return _power((tile - mean) * _WINDOW) / _WINDOW_POWER
 
 
 def _passed(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -144,24 +150,28 @@ def _ring_index(side: int) -> NDArray[np.intp]:
 
 
 def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> PictureStatistics:
-    ring = np.broadcast_to(_ring_index(_SIDE), observed.shape).ravel()
-    g, k = observed.ravel().astype(float), passed.ravel().astype(float)
+    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
+    share = np.minimum((passed * _CELLS).astype(np.int32), _CELLS - 1)
+    cell = (_ring_index(_SIDE).astype(np.int32) * _CELLS + share).ravel()
 
-    def total(values: Array) -> Array:
-        return np.bincount(ring, values, RINGS + 1)[:RINGS]
+    def per_cell(values: NDArray[np.float32] | None) -> Array:
+        weights = None if values is None else values.ravel()
+        return np.bincount(cell, weights, (RINGS + 1) * _CELLS)[: RINGS * _CELLS].reshape(RINGS, _CELLS)
 
-    count = np.maximum(total(np.ones_like(g)), 1)
-    mean_k, mean_g = total(k) / count, total(g) / count
+    count = per_cell(None).astype(float)
+    g, k = (per_cell(v) / np.maximum(count, 1) for v in (observed, passed))
+    in_ring = np.maximum(count.sum(1), 1)
+    mean_k, mean_g = (count * k).sum(1) / in_ring, (count * g).sum(1) / in_ring
     signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
     for _ in range(_FIT_STEPS):
-        fitted = np.append(noise, 1.0)[ring] + np.append(signal, 1.0)[ring] * k
-        weight = 1.0 / np.maximum(fitted, 1e-6) ** 1.5
-        w, wk, wkk, wg, wkg = (total(v) for v in (weight, weight * k, weight * k * k, weight * g, weight * k * g))
+        weight = count / np.maximum(noise[:, None] + signal[:, None] * k, 1e-6) ** 1.5
+        w, wk, wkk, wg, wkg = (np.sum(weight * v, 1) for v in (np.ones_like(k), k, k * k, g, k * g))
         determinant = np.maximum(w * wkk - wk * wk, 1e-30)
         signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
-    spread = np.sqrt(np.maximum(total(k * k) / count - mean_k**2, 0))
-    return _settled(signal, noise, mean_k, determined=(spread > 0.1) & (mean_k < _MUST_CANCEL) & (count > 20))
+    spread = np.sqrt(np.maximum((count * k * k).sum(1) / in_ring - mean_k**2, 0))
+    determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
+    return _settled(signal, noise, mean_k, determined)
 
 
 def _settled(signal: Array, noise: Array, passed: Array, determined: NDArray[np.bool_]) -> PictureStatistics:
@@ -196,9 +206,14 @@ def packed_frequency(size: int) -> NDArray[np.float32]:
     return packed.astype(np.float32)
 
 
-def on_spectrum(statistics: PictureStatistics, ring_values: Array, size: int) -> NDArray[np.float32]:
-    """Noise-to-signal of the rings spread over a packed spectrum of a tile; falls as f² below the lowest ring."""
-    frequency = packed_frequency(size)
+def on_spectrum(
+    statistics: PictureStatistics, ring_values: Array, size: int, scale: float = 1.0
+) -> NDArray[np.float32]:
+    """Noise-to-signal of the rings spread over a packed spectrum of a tile; falls as f² below the lowest ring.
+
+    scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.
+    """
+    frequency = packed_frequency(size) / np.float32(scale)
     values = np.exp(np.interp(frequency, statistics.frequency, np.log(ring_values)))
     values *= np.minimum(frequency / statistics.frequency[0], 1.0) ** 2
     return values.astype(np.float32)

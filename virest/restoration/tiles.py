@@ -24,7 +24,7 @@ class TileDeconvolution:
 
     def __init__(self, grid: TileGrid, kernels: Image, margin: int) -> None:
         self.grid = grid
-        self.margin = margin
+        self.margin = margin = max(margin, kernels.shape[1] // 2 + 1)
         self.patch = grid.side + 2 * margin
         self.size = fast_size(self.patch + max(8, self.patch // 16))
         self._windows = grid.windows()

@@ -16,6 +16,7 @@ MARGIN_PX = 16
 TRACKING = TrackingSettings(grid=(16, 16), points_per_cell=4)
 WINDOW_PX, LEVELS = 31, 4
 MAX_FORWARD_BACKWARD_PX = 0.5
+SHIFT_SMOOTHING_PX, SHIFT_STEPS = 1.5, 6
 
 
 def psnr_db(picture: Picture, truth: Picture, valid_px: Sequence[int], margin_px: int = MARGIN_PX) -> float:
@@ -39,11 +40,25 @@ def point_distances_px(picture: Picture, truth: Picture, valid_px: Sequence[int]
 
 
 def shift_px(picture: Picture, truth: Picture, valid_px: Sequence[int], margin_px: int = MARGIN_PX) -> Array:
-    """How far the whole picture lies beside its truth, (x, y): the peak of phase correlation."""
+    """How far the whole picture lies beside its truth, (x, y): least squares of the smoothed pictures.
+
+    Phase correlation is no help here: blur turns the phases that it averages, and its peak jumps by whole pixels.
+    """
     inside = _inside(valid_px, margin_px)
-    planes = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY)[inside].astype(np.float32) for p in (truth, picture)]
-    window = cv2.createHanningWindow(planes[0].shape[::-1], cv2.CV_32F)
-    return np.array(cv2.phaseCorrelate(planes[0], planes[1], window)[0])
+    truth_grey, grey = (_smooth_grey(p) for p in (truth, picture))
+    slopes = np.stack([cv2.Sobel(truth_grey, cv2.CV_32F, *d)[inside].ravel() / 8 for d in ((1, 0), (0, 1))], axis=-1)
+    square = slopes.T.astype(float) @ slopes.astype(float)
+    shift = np.zeros(2)
+    for _ in range(SHIFT_STEPS):
+        back = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+        moved = cv2.warpAffine(grey, back, grey.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        shift -= np.linalg.solve(square, slopes.T.astype(float) @ (moved - truth_grey)[inside].ravel())
+    return shift
+
+
+def _smooth_grey(picture: Picture) -> NDArray[np.float32]:
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), SHIFT_SMOOTHING_PX), np.float32)
 
 
 def _inside(valid_px: Sequence[int], margin_px: int) -> tuple[slice, slice]:

@@ -1,0 +1,408 @@
+"""The camera profile: what is written is read back, what is wrong is refused in one line that says what to do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from virest.camera.intrinsics import COEFFICIENT_NAMES, Intrinsics
+from virest.camera.profile import (
+    CameraProfile,
+    Estimate,
+    Extensions,
+    format_profile,
+    load_yaml_mapping,
+    parse_profile,
+    profile_mapping,
+    read_profile,
+    write_profile,
+)
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import READOUT_DIRECTIONS, STAMP_FRACTION, Shutter
+from virest.errors import SettingsError
+
+CONTRACT_EXAMPLE = """
+virest_profile: 1
+device: Honor View 10
+image: {width: 720, height: 1280}            # pixels as stored in the movie
+intrinsics:
+  fx_px: 980.48
+  fy_px: 980.48
+  cx_px: 359.5                               # (0, 0) is the centre of the top-left pixel
+  cy_px: 639.5
+  distortion: {model: radtan, k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0}   # OpenCV
+shutter:
+  readout_time_s: 0.020733                   # start of the first row → start of one past the last row
+  readout_direction: right_to_left           # in the stored picture
+  timestamp: exposure_start                  # of the first row read; or exposure_middle | exposure_end
+  exposure_scale: 1.0                        # true exposure = logged exposure × this
+imu:
+  T_cam_imu: [[1,0,0,0],[0,-1,0,0],[0,0,-1,0],[0,0,0,1]]    # x_cam = T_cam_imu @ x_imu; metres
+  time_offset_s: 0.0                         # null: estimate
+  clock_skew: 0.0
+  gyro_bias_rad_s: [0, 0, 0]                 # measured = scale * true + bias
+  gyro_scale: [1, 1, 1]
+response:                                    # five-segment exposure characteristic curve
+  kind: five_segment
+  b: [0.12, 0.08]
+  c: [0.62, 0.80]
+  y_max: 1.0                                 # y_d
+sensor: {width_mm: null, height_mm: null, focal_length_mm: 4.75}      # eq 17, where no intrinsics are known
+scene: {depth_m: null}                       # null: triangulate; inf: rotation only
+estimates: {}                                # NAME: {value, std, source}
+extensions:                                  # what a diagnosis added; an absent one is off (§4)
+  focal_drift: {focal_drift_per_s: 0.0}
+  stabilisation: {fraction: 0.0, cutoff_hz: 1.0}
+  frame_lag: {lag_s: 0.0, frames: 0}
+  response_gamma: 1.0
+  black_level: 0.0
+  vignetting: {corner_loss: 0.0}
+  flicker: {amplitude: 0.0, frequency_hz: 100.0, phase_rad: 0.0}
+  gain: []
+  defocus: {sigma_px: 0.0}
+"""
+SMALL = "virest_profile: 1\nimage: {width: 64, height: 48}\n"
+FULL = CameraProfile(
+    width=720,
+    height=1280,
+    device="Füll 10: #1",
+    intrinsics=Intrinsics(720, 1280, 981.5, 979.25, 355.1, 641.7, "radtan", (-0.11, 0.02, 1e-3, -2e-4, 1e-5)),
+    shutter=Shutter(0.0207, "bottom_to_top", "exposure_end", 0.97),
+    r_cam_imu=((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    p_cam_imu_m=(0.011, -0.042, 0.003),
+    time_offset_s=-0.0123,
+    clock_skew=3e-5,
+    gyro_bias_rad_s=(1e-3, -2.5e-7, 0.02),
+    gyro_scale=(1.01, 0.99, 1.002),
+    response=ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.8), y_max=0.95, extra_gamma=1.1, black_level=0.02),
+    sensor_width_mm=4.1,
+    sensor_height_mm=5.6,
+    focal_length_mm=4.75,
+    depth_m=math.inf,
+    estimates={
+        "time_offset_s": Estimate(-0.0123, 1e-5, "tracks against gyroscope"),
+        "gyro_bias_rad_s": Estimate([1e-3, 0.0, 0.02], [1e-4, 1e-4, 2e-4], "the same"),
+        "readout_direction": Estimate("bottom_to_top", None, "likelihood"),
+    },
+    extensions=Extensions(0.01, 0.6, 2.5, 0.3, 17, 0.35, 0.1, 120.0, 0.7, (1.0, 0.97, 1.02), 0.8),
+)
+
+
+def _parse(text: str) -> CameraProfile:
+    return parse_profile(yaml.safe_load(SMALL + text))
+
+
+def _read(folder: Path, text: str | bytes) -> CameraProfile:
+    path = folder / "camera.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_profile(path)
+
+
+# ── what is read ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_contracts_example_is_read_literally(tmp_path: Path) -> None:
+    """The profile that the documentation shows parses, and every value lands where it belongs."""
+    profile = _read(tmp_path, CONTRACT_EXAMPLE)
+    assert profile == CameraProfile(
+        width=720,
+        height=1280,
+        device="Honor View 10",
+        intrinsics=Intrinsics(720, 1280, 980.48, 980.48, 359.5, 639.5, "radtan", (0.0,) * 5),
+        shutter=Shutter(0.020733, "right_to_left", "exposure_start", 1.0),
+        r_cam_imu=((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+        time_offset_s=0.0,
+        response=ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.80)),
+        focal_length_mm=4.75,
+    )
+    assert profile.readout_known
+
+
+def test_a_full_profile_survives_its_file(tmp_path: Path) -> None:
+    """Writing a profile with every key set and reading it again gives the same profile, and leaves no part file."""
+    write_profile(FULL, tmp_path / "full.yaml")
+    assert read_profile(tmp_path / "full.yaml") == FULL
+    assert [p.name for p in tmp_path.iterdir()] == ["full.yaml"]
+
+
+def test_an_empty_profile_survives_its_file() -> None:
+    """What is unknown stays unknown."""
+    empty = CameraProfile(64, 48, readout_known=False)
+    assert parse_profile(yaml.safe_load(format_profile(empty))) == replace(
+        empty, shutter=Shutter(0.0, "top_to_bottom")
+    )
+
+
+def _floats(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False)
+
+
+@st.composite
+def _profiles(draw: st.DrawFn) -> CameraProfile:
+    def some(low: float, high: float, count: int) -> tuple[float, ...]:
+        return tuple(draw(_floats(low, high)) for _ in range(count))
+
+    width, height = draw(st.integers(16, 4000)), draw(st.integers(16, 4000))
+    model = draw(st.sampled_from(sorted(COEFFICIENT_NAMES)))
+    lens = Intrinsics(width, height, *some(1, 1e5, 2), *some(-1e4, 1e4, 2), model, some(-1, 1, len(COEFFICIENT_NAMES[model])))
+    curve = ResponseCurve(
+        draw(st.sampled_from(["linear", "srgb", "gamma"])), extra_gamma=draw(_floats(0.2, 5)), black_level=draw(_floats(0, 0.8))
+    )
+    return CameraProfile(
+        width,
+        height,
+        draw(st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=20)),
+        draw(st.sampled_from([None, lens])),
+        Shutter(*some(0, 1, 1), draw(st.sampled_from(READOUT_DIRECTIONS)), draw(st.sampled_from(sorted(STAMP_FRACTION)))),
+        r_cam_imu=FULL.r_cam_imu,
+        p_cam_imu_m=some(-1, 1, 3),  # type: ignore[arg-type]
+        time_offset_s=draw(st.one_of(st.none(), _floats(-1e3, 1e3))),
+        clock_skew=draw(_floats(-0.4, 0.4)),
+        gyro_bias_rad_s=some(-1, 1, 3),  # type: ignore[arg-type]
+        gyro_scale=some(0.1, 2, 3),  # type: ignore[arg-type]
+        response=draw(st.sampled_from([None, curve])),
+        depth_m=draw(st.one_of(st.none(), st.just(math.inf), _floats(0.01, 1e4))),
+        extensions=replace(FULL.extensions, gain=some(0.1, 3, draw(st.integers(0, 5)))),
+    )
+
+
+@settings(max_examples=40, deadline=None)
+@given(profile=_profiles())
+def test_any_profile_survives_its_text(profile: CameraProfile) -> None:
+    """Whatever the values, the YAML text gives them back exactly."""
+    assert parse_profile(yaml.safe_load(format_profile(profile))) == profile
+
+
+def test_any_rotation_survives_its_text() -> None:
+    """A rotation that lies along no axis comes back to the last digits, and a second reading changes nothing."""
+    matrix = Rotation.from_rotvec([0.4, -1.3, 2.1]).as_matrix()
+    profile = replace(FULL, r_cam_imu=tuple(map(tuple, matrix.tolist())))
+    once = parse_profile(yaml.safe_load(format_profile(profile)))
+    np.testing.assert_allclose(once.rotation_cam_imu, matrix, atol=1e-14)
+    np.testing.assert_allclose(once.rotation_cam_imu @ once.rotation_cam_imu.T, np.eye(3), atol=1e-14)
+
+
+def test_a_rounded_rotation_is_made_orthogonal() -> None:
+    """A matrix written with four digits becomes the nearest rotation."""
+    matrix = np.round(Rotation.from_rotvec([0.4, -1.3, 2.1]).as_matrix(), 4)
+    rows = [[*row, 0.0] for row in matrix.tolist()] + [[0, 0, 0, 1]]
+    found = _parse(f"imu: {{T_cam_imu: {rows}}}\n").rotation_cam_imu
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(found, matrix, atol=1e-4)
+
+
+def test_numbers_of_other_dialects_are_numbers() -> None:
+    """YAML 1.1 takes 1e-3 for text; here it is a number, as JSON and people have it."""
+    profile = _parse("shutter: {readout_time_s: 1e-3}\nintrinsics: {fx_px: 1E3, cy_px: -2e+1}\n")
+    assert profile.shutter.readout_time_s == 0.001
+    assert profile.intrinsics is not None
+    assert (profile.intrinsics.fx_px, profile.intrinsics.cy_px) == (1000.0, -20.0)
+
+
+@pytest.mark.parametrize("word", ["inf", ".inf", "Infinity"])
+def test_an_infinite_depth_is_rotation_only(word: str) -> None:
+    """Depth alone may be infinite, in YAML's spelling and in the contract's, and it is written as inf."""
+    profile = _parse(f"scene: {{depth_m: {word}}}\n")
+    assert profile.depth_m == math.inf
+    assert profile_mapping(profile)["scene"] == {"depth_m": "inf"}
+
+
+def test_null_is_unknown() -> None:
+    """Values that are null are unknown: a readout that counts as none, an offset, a curve, a lens, a depth."""
+    profile = _parse(
+        "intrinsics: {fx_px: null, fy_px: null}\nshutter: {readout_time_s: null}\n"
+        "imu: {T_cam_imu: null, time_offset_s: null}\nresponse: null\nscene: {depth_m: null}\n"
+        "sensor: {width_mm: null}\nestimates: null\nextensions: null\n"
+    )
+    assert (profile.intrinsics, profile.response, profile.depth_m, profile.time_offset_s) == (None,) * 4
+    assert (profile.readout_known, profile.shutter.readout_time_s) == (False, 0.0)
+    assert profile.imu_time_s(2.0) == 2.0
+
+
+def test_what_is_left_out_has_its_default() -> None:
+    """One focal length serves both axes, the lens looks through the picture's middle, Android holds its axes."""
+    profile = _parse("intrinsics: {fy_px: 70}\n")
+    assert profile.intrinsics == Intrinsics(64, 48, 70.0, 70.0, 31.5, 23.5)
+    np.testing.assert_array_equal(profile.rotation_cam_imu, np.diag([1, -1, -1]))
+
+
+def test_focal_length_from_the_sensor_by_hand() -> None:
+    """Eq 17: 4 mm of focal length on a sensor of 6.4 mm x 4.0 mm are 40 px and 48 px at 64 x 48 px."""
+    lens = _parse("sensor: {width_mm: 6.4, height_mm: 4.0, focal_length_mm: 4}\n").intrinsics
+    assert lens is not None
+    assert (lens.fx_px, lens.fy_px) == (pytest.approx(40.0), pytest.approx(48.0))
+    square = _parse("sensor: {height_mm: 4.0, focal_length_mm: 4}\n").intrinsics
+    assert square is not None
+    assert (square.fx_px, square.fy_px) == (pytest.approx(48.0), pytest.approx(48.0))
+
+
+def test_curve_extensions_reach_an_unknown_curve() -> None:
+    """A black level without a response stands on the default, sRGB."""
+    profile = _parse("extensions: {black_level: 0.1, response_gamma: 1.2}\n")
+    assert profile.response == ResponseCurve("srgb", extra_gamma=1.2, black_level=0.1)
+
+
+def test_imu_time_is_skewed_then_shifted() -> None:
+    """t_imu = t_cam (1 + clock_skew) + time_offset_s, by hand: 10 s · 1.001 − 0.25 s."""
+    profile = CameraProfile(64, 48, clock_skew=1e-3, time_offset_s=-0.25)
+    assert profile.imu_time_s(10.0) == pytest.approx(9.76)
+
+
+def test_an_estimate_changes_the_value_and_says_whence() -> None:
+    """A fitted value travels with its deviation and source, beside those that were there."""
+    changed = FULL.with_estimate("clock_skew", 2e-5, 1e-6, "fit", clock_skew=2e-5)
+    assert changed.clock_skew == 2e-5
+    assert changed.estimates["clock_skew"] == Estimate(2e-5, 1e-6, "fit")
+    assert set(changed.estimates) == {*FULL.estimates, "clock_skew"}
+    assert "clock_skew" not in FULL.estimates
+
+
+# ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "nearest"),
+    [
+        ("devize: x", "devize", "device"),
+        ("shutter: {readout_s: 0.02}", "shutter.readout_s", "readout_time_s"),
+        ("imu: {time_ofset_s: 0.02}", "imu.time_ofset_s", "time_offset_s"),
+        ("intrinsics: {fx: 100}", "intrinsics.fx", "fx_px"),
+        ("intrinsics: {distortion: {model: radtan, k7: 1}}", "intrinsics.distortion.k7", "k"),
+        ("response: {kind: gamma, gama: 2}", "response.gama", "gamma"),
+        ("extensions: {flickr: {}}", "extensions.flickr", "flicker"),
+        ("extensions: {flicker: {amplitud: 0.1}}", "extensions.flicker.amplitud", "amplitude"),
+        ("estimates: {fx_px: {value: 1, sdt: 2}}", "estimates.fx_px.sdt", "std"),
+    ],
+)
+def test_an_unknown_key_names_its_nearest_neighbour(text: str, key: str, nearest: str) -> None:
+    """A misspelt key is refused with its place and the key that was probably meant."""
+    with pytest.raises(SettingsError) as caught:
+        _parse(text)
+    assert f"unknown key '{key}'" in str(caught.value)
+    assert f"did you mean '{nearest}" in str(caught.value)
+
+
+def test_a_key_like_no_other_lists_the_known_ones() -> None:
+    """Where nothing is near, the keys of that place are listed."""
+    with pytest.raises(SettingsError, match="known keys: depth_m"):
+        _parse("scene: {zzzzzz: 1}")
+
+
+WRONG = {
+    "number for text": "device: 5",
+    "date for text": "device: 2020-01-01",
+    "text for number": "intrinsics: {fx_px: wide}",
+    "list for number": "intrinsics: {fx_px: [1, 2]}",
+    "true for number": "shutter: {readout_time_s: true}",
+    "nan": "shutter: {readout_time_s: .nan}",
+    "infinite readout": "shutter: {readout_time_s: .inf}",
+    "infinite focal length as text": "intrinsics: {fx_px: inf}",
+    "nan depth": "scene: {depth_m: nan}",
+    "depth behind": "scene: {depth_m: -1}",
+    "negative readout": "shutter: {readout_time_s: -0.01}",
+    "readout in ms": "shutter: {readout_time_s: 20}",
+    "negative focal length": "intrinsics: {fx_px: -3}",
+    "no exposure": "shutter: {exposure_scale: 0}",
+    "endless number": "shutter: {readout_time_s: " + "9" * 400 + "}",
+    "direction": "shutter: {readout_direction: up}",
+    "stamp": "shutter: {timestamp: 17}",
+    "two biases": "imu: {gyro_bias_rad_s: [0, 0]}",
+    "text in bias": "imu: {gyro_bias_rad_s: [0, 0, x]}",
+    "skew": "imu: {clock_skew: 2}",
+    "zero gyro scale": "imu: {T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]], gyro_scale: [1, 0, 1]}",
+    "zero gyro scale, axes unknown": "imu: {gyro_scale: [1, 0, 1]}",
+    "three columns": "imu: {T_cam_imu: [[1,0,0],[0,1,0],[0,0,1]]}",
+    "scaled": "imu: {T_cam_imu: [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}",
+    "mirrored": "imu: {T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]}",
+    "ragged": "imu: {T_cam_imu: [[1,0,0,0],[0,1],[0,0,1,0],[0,0,0,1]]}",
+    "version": "virest_profile: 2",
+    "small picture": "image: {width: 4, height: 48}",
+    "no height": "image: {width: 64}",
+    "curve": "response: {kind: log}",
+    "curve without knots": "response: {kind: five_segment}",
+    "falling curve": "response: {kind: five_segment, b: [0.5, 0.1], c: [0.2, 0.8]}",
+    "table beyond 1": "response: {kind: table, x: [0, 1], y: [0, 255]}",
+    "table of one list": "response: {kind: table, x: [0, 1]}",
+    "foreign coefficient": "intrinsics: {fx_px: 9, distortion: {model: fisheye, p1: 0.1}}",
+    "lens": "intrinsics: {fx_px: 9, distortion: {model: brown}}",
+    "full black": "extensions: {black_level: 1}",
+    "negative gain": "extensions: {gain: [1, -1]}",
+    "gamma": "extensions: {response_gamma: 50}",
+    "lag in text": "extensions: {frame_lag: {frames: many}}",
+    "key that is a number": "1: 2",
+    "key of two lines": '"a\\nb": 1',
+    "value of two lines": 'shutter: {timestamp: "a\\nb"}',
+}
+
+
+@pytest.mark.parametrize("text", [pytest.param(text, id=name) for name, text in WRONG.items()])
+def test_wrong_values_are_refused_in_one_line(text: str, tmp_path: Path) -> None:
+    """A value of the wrong kind, shape or range is a settings error of one line that names the file."""
+    base = "\n".join(line for line in SMALL.splitlines() if line.split(":")[0] != text.split(":")[0])
+    with pytest.raises(SettingsError) as caught:
+        _read(tmp_path, f"{base}\n{text}\n")
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert message.startswith("camera.yaml")
+    assert len(message) < 400
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param("", id="empty"),
+        pytest.param("- 1\n- 2\n", id="list"),
+        pytest.param("just words", id="words"),
+        pytest.param("image: {width: 64\n", id="cut"),
+        pytest.param("a:\tb: c", id="not yaml"),
+        pytest.param(b"\x00\x01\x02", id="control bytes"),
+        pytest.param(b"\xff\xfe\xfa\xc3", id="binary"),
+        pytest.param(b"\x89PNG\r\n\x1a\n" + bytes(range(256)), id="png"),
+        pytest.param(SMALL + "---\n" + SMALL, id="two documents"),
+        pytest.param(SMALL + 'device: !!python/object/apply:os.system ["exit 1"]\n', id="python tag"),
+        pytest.param(SMALL + "device: !mine x\n", id="own tag"),
+        pytest.param(SMALL + "estimates: {a: &x {value: 1}, b: *x}\n", id="alias"),
+        pytest.param(SMALL + "estimates: {a: &x {value: 1}, b: {<<: *x}}\n", id="merge"),
+        pytest.param(SMALL + "device: 2020-13-99\n", id="impossible date"),
+        pytest.param(SMALL + "x: " + "{a: " * 2000 + "1" + "}" * 2000, id="deep"),
+    ],
+)
+def test_what_is_no_plain_profile_is_refused(content: str | bytes, tmp_path: Path) -> None:
+    """Empty, binary, cut and clever files end in one line, never in a traceback."""
+    with pytest.raises(SettingsError, match=r"camera\.yaml") as caught:
+        _read(tmp_path, content)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_bomb_of_aliases_does_not_go_off(tmp_path: Path) -> None:
+    """Ten levels of ten aliases would be ten thousand million values; the first alias is refused."""
+    levels = ["a0: &a0 [x]"] + [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 11)]
+    with pytest.raises(SettingsError, match="aliases"):
+        _read(tmp_path, "\n".join(levels))
+
+
+def test_files_that_are_too_large_missing_or_folders_are_refused(tmp_path: Path) -> None:
+    """The path and the reason are in the message."""
+    (tmp_path / "large.yaml").write_bytes(b"#" * 1_000_001)
+    with pytest.raises(SettingsError, match=r"large\.yaml: 1000001 bytes"):
+        read_profile(tmp_path / "large.yaml")
+    with pytest.raises(SettingsError, match=r"none\.yaml: no such file"):
+        read_profile(tmp_path / "none.yaml")
+    with pytest.raises(SettingsError, match="no such file"):
+        load_yaml_mapping(tmp_path)
+
+
+def test_reading_does_not_change_the_mapping() -> None:
+    """The caller's mapping stays as it was."""
+    content: dict[str, Any] = yaml.safe_load(CONTRACT_EXAMPLE)
+    parse_profile(content)
+    assert content == yaml.safe_load(CONTRACT_EXAMPLE)

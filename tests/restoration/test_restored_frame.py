@@ -1,0 +1,249 @@
+"""One frame, whole: sharper and in its place, in colour and grey; odd pictures neither crash nor change for the worse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from blurred_scene import FRAME, camera, record
+from laws import TurningCamera, phone, psnr_db
+from numpy.typing import NDArray
+
+from virest.camera.response import ResponseCurve
+from virest.restoration.frame import RestoredFrame, copied_frame, encode_picture, restore_frame
+from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
+
+BALANCED = RestorationSettings()
+METHODS = [m for m in DEBLUR_METHODS if m != "none"]
+CURVES = {
+    "linear": ResponseCurve("linear"),
+    "srgb": ResponseCurve("srgb"),
+    "gamma": ResponseCurve("gamma", gamma=2.2),
+    "five_segment": ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.80), y_max=0.93),
+    "table": ResponseCurve("table", x=(0.0, 0.02, 0.1, 0.35, 0.7, 1.0), y=(0.0, 0.11, 0.33, 0.66, 0.9, 1.0)),
+    "wide table": ResponseCurve("table", x=(0.01, 0.5, 4.0), y=(0.02, 0.6, 0.98)),
+    "extended": ResponseCurve("srgb", extra_gamma=1.2, black_level=0.06),
+    "extended five_segment": ResponseCurve("five_segment", b=(0.1, 0.1), c=(0.7, 0.9), extra_gamma=0.8, black_level=0.03),
+}
+
+
+def _restore(turning: TurningCamera, picture: NDArray[np.uint8], settings: RestorationSettings = BALANCED) -> RestoredFrame:
+    return restore_frame(FRAME, picture, turning.motion, turning.trajectory, settings)
+
+
+def _picture(result: RestoredFrame) -> NDArray[np.uint8]:
+    assert result.picture is not None
+    assert result.picture.dtype == np.uint8
+    return result.picture
+
+
+def _shift_px(picture: NDArray[np.uint8], truth: NDArray[np.uint8], border: int = 40) -> float:
+    """How far a picture lies from where it should, by phase correlation of its inside."""
+    one, two = (cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32)[border:-border, border:-border] for p in (picture, truth))
+    window = cv2.createHanningWindow(one.shape[::-1], cv2.CV_32F)
+    return float(np.hypot(*cv2.phaseCorrelate(one, two, window)[0]))
+
+
+# ── encoding ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("curve", [pytest.param(c, id=n) for n, c in CURVES.items()])
+def test_encoding_undoes_the_table_at_every_level(curve: ResponseCurve) -> None:
+    """All 256 levels, through the table to light and back, are themselves, held between black and the curve's top."""
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    picture = np.stack([levels, levels.T, levels[::-1]], -1)
+    low, high = np.rint(255 * curve.encode(np.array(curve.light_range)))
+    light = list(cv2.split(cv2.LUT(picture, curve.linear_table())))
+    np.testing.assert_array_equal(encode_picture(light, curve), np.clip(picture, low, high))
+
+
+def test_encoding_holds_light_that_no_curve_reaches() -> None:
+    """Light below nothing and beyond the brightest becomes black and the top, never a wrapped-around level."""
+    light = [np.array([[-5.0, -1e-3, 1.001, 40.0]], np.float32)] * 3
+    np.testing.assert_array_equal(encode_picture(light, ResponseCurve("srgb"))[..., 0], [[0, 0, 255, 255]])
+
+
+# ── sharper, and in its place ────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("reference", ["exposure-start", "frame-middle"])
+@pytest.mark.parametrize("shutter", ["none", "rowwise"])
+def test_a_deblurred_picture_is_sharper_and_not_shifted(reference: str, shutter: str) -> None:
+    """Anchored at the start or the middle, warped or not, the picture shows the reference time, within 0.12 px."""
+    turning = camera(reference=reference)
+    recorded = record(turning)
+    result = _restore(turning, recorded.picture, replace(BALANCED, reference=reference, shutter=shutter))
+    picture = _picture(result)
+    assert result.status == "restored"
+    assert _shift_px(picture, recorded.truth) < 0.12
+    if reference == "exposure-start":
+        assert _shift_px(recorded.picture, recorded.truth) > 3, "the recorded picture lies half a blur away"
+    own = record(replace(turning, reference="frame-middle"))
+    gain = psnr_db(picture, recorded.truth, 30) - psnr_db(own.picture, own.truth, 30)
+    assert gain > 2.0
+
+
+@pytest.mark.parametrize(("direction", "shutter"), [("right_to_left", "rowwise"), ("bottom_to_top", "perspective")])
+def test_a_sheared_picture_is_straightened_and_sharp(direction: str, shutter: str) -> None:
+    """With a rolling shutter too, the result is the global picture of the reference time."""
+    turning = camera((0.5, -1.1, 0.4), 0.02, direction, exposure_s=0.016)
+    recorded = record(turning)
+    result = _restore(turning, recorded.picture, replace(BALANCED, shutter=shutter))
+    x0, y0, x1, y1 = result.valid_px
+    assert (x1 - x0) * (y1 - y0) > 0.8 * 336 * 240
+    assert _shift_px(_picture(result), recorded.truth) < 0.2
+    straightened = _restore(turning, recorded.picture, replace(BALANCED, deblur="none"))
+    assert straightened.parameters["deblur"]["method"] == "none"
+    assert psnr_db(_picture(result), recorded.truth, 40) > psnr_db(_picture(straightened), recorded.truth, 40) + 1.5
+    assert psnr_db(_picture(straightened), recorded.truth, 40) > psnr_db(recorded.picture, recorded.truth, 40) + 1.5
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m != "inverse"])
+def test_every_method_gains(method: str) -> None:
+    """Whatever method is asked for, the picture gains over straightening alone."""
+    turning = camera()
+    recorded = record(turning)
+    iterations = 15 if method == "richardson-lucy" else 4
+    result = _restore(turning, recorded.picture, replace(BALANCED, deblur=method, iterations=iterations))
+    alone = _restore(turning, recorded.picture, replace(BALANCED, deblur="none"))
+    assert result.parameters["deblur"]["method"] == method
+    assert psnr_db(_picture(result), recorded.truth, 30) > psnr_db(_picture(alone), recorded.truth, 30) + 0.7
+    assert _shift_px(_picture(result), recorded.truth) < 0.2
+
+
+@pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
+def test_a_grey_picture_stays_grey(settings: RestorationSettings) -> None:
+    """Where red, green and blue are equal they stay so, within 2 levels, and sharpen alike."""
+    turning = camera()
+    recorded = record(turning, grey=True)
+    assert np.ptp(recorded.picture.astype(int), axis=-1).max() == 0
+    picture = _picture(_restore(turning, recorded.picture, settings)).astype(int)
+    assert np.ptp(picture, axis=-1).max() <= 2
+    assert psnr_db(picture, recorded.truth, 30) > psnr_db(recorded.picture, recorded.truth, 30) + 2
+
+
+def test_the_picture_handed_in_is_left_alone() -> None:
+    """Nothing is written into the caller's array."""
+    turning = camera()
+    picture = record(turning).picture.copy()
+    before = picture.copy()
+    _restore(turning, picture)
+    np.testing.assert_array_equal(picture, before)
+
+
+# ── what is left alone ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_still_camera_is_copied() -> None:
+    """Without motion the decoded pixels are returned unchanged, as `copied`, with the reason."""
+    turning = camera((0.0, 0.0, 0.0), 0.02)
+    picture = record(turning).picture
+    result = _restore(turning, picture)
+    assert result.status == "copied"
+    np.testing.assert_array_equal(_picture(result), picture)
+    assert any("blur of 0.00 px" in w for w in result.warnings)
+    assert result.valid_px == (0, 0, 336, 240)
+    assert (result.parameters["deblur"]["method"], result.parameters["shutter"]["method"]) == ("none", "none")
+
+
+def test_without_an_exposure_time_a_frame_is_only_straightened() -> None:
+    """An unknown exposure forbids deblurring, not straightening, and the log says so."""
+    turning = camera((0.5, -1.1, 0.4), 0.02)
+    recorded = record(turning)
+    blind = replace(turning, exposure_s=None)
+    result = _restore(blind, recorded.picture)
+    assert (result.status, result.exposure_s) == ("restored", None)
+    assert (result.parameters["deblur"]["method"], result.parameters["shutter"]["method"]) == ("none", "rowwise")
+    assert any("exposure" in w for w in result.warnings)
+
+
+def test_asking_for_nothing_copies() -> None:
+    """With neither deblurring nor straightening wanted the pixels come back unchanged."""
+    turning = camera()
+    picture = record(turning).picture
+    result = _restore(turning, picture, replace(BALANCED, deblur="none", shutter="none"))
+    assert result.status == "copied"
+    np.testing.assert_array_equal(_picture(result), picture)
+
+
+def test_a_copied_frame_says_why() -> None:
+    """A frame without motion has all of the log's keys, null where unknown."""
+    picture = np.full((48, 64, 3), 7, np.uint8)
+    result = copied_frame(FRAME, picture, phone(64, 48), "no focal length")
+    assert (result.status, result.warnings, result.valid_px) == ("copied", ("no focal length",), (0, 0, 64, 48))
+    assert result.picture is picture
+    assert result.exposure_s == pytest.approx(0.012)
+    assert set(result.parameters) == {"motion", "depth_m", "depth_source", "blur", "shutter", "response", "deblur"}
+
+
+# ── odd pictures ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (200, 40, 90), (128, 128, 128)])
+def test_one_colour_stays_that_colour(method: str, colour: tuple[int, int, int]) -> None:
+    """A black, white or single-coloured frame comes back as it was, without seams, by every method."""
+    turning = camera(readout_time_s=0.01, width=200, height=136)
+    picture = np.full((136, 200, 3), colour, np.uint8)
+    result = _picture(_restore(turning, picture, replace(BALANCED, deblur=method, iterations=3)))
+    np.testing.assert_allclose(result.astype(int), picture, atol=2)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (47, 65), (16, 16)])
+def test_tiny_pictures_are_restored_without_a_crash(method: str, width: int, height: int, rng: np.random.Generator) -> None:
+    """Pictures smaller than a tile, of odd sizes too, give pictures of the same size and no warning of NumPy's."""
+    turning = camera(readout_time_s=0.01, width=width, height=height)
+    picture = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
+    with np.errstate(invalid="raise", divide="raise"):
+        result = _restore(turning, picture, replace(BALANCED, deblur=method, iterations=2))
+    assert _picture(result).shape == picture.shape
+
+
+@pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
+def test_lights_in_the_dark_do_not_ring(settings: RestorationSettings) -> None:
+    """A clipped streak on black leaves the dark as dark as it was, farther than a blur length away."""
+    turning = camera()
+    picture = np.full((240, 336, 3), 4, np.uint8)
+    cv2.line(picture, (150, 100), (164, 112), (255, 255, 255), 5)
+    result = _picture(_restore(turning, picture, settings)).astype(int)
+    far = np.ones((240, 336), bool)
+    far[70:150, 110:210] = False
+    assert np.abs(result - picture)[far].max() <= 6
+
+
+# ── the log ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, dict):
+        return [n for v in value.values() for n in _numbers(v)]
+    if isinstance(value, list | tuple):
+        return [n for v in value for n in _numbers(v)]
+    return [value] if isinstance(value, int | float) else []
+
+
+def test_the_log_holds_the_contracts_figures() -> None:
+    """Motion, blur and shutter of a known turn: quaternion of ω e, blur against it, corners where eq 28 sends them."""
+    turning = camera((0.0, -2.0, 0.0), 0.02)
+    result = _restore(turning, record(turning).picture)
+    log = result.parameters
+    half = 0.5 * 2.0 * 0.012
+    np.testing.assert_allclose(log["motion"]["delta_q_wxyz"], [np.cos(half), 0, -np.sin(half), 0], atol=1e-7)
+    np.testing.assert_allclose(log["motion"]["rate_rad_s"], [0, -2, 0], atol=1e-6)
+    assert log["motion"]["velocity_m_s"] is None
+    assert abs(log["blur"]["angle_rad"]) < 0.01, "yaw to the left moves points to the right"
+    assert log["blur"]["length_px"] == pytest.approx(380 * 0.024, rel=0.01)
+    corners = np.array([[0, 0], [335, 0], [335, 239], [0, 239]], float)
+    motion = turning.motion
+    home = turning.seen(corners, turning.row_start_s(corners, motion.start_s), motion.reference_s, motion.reference_s)
+    np.testing.assert_allclose(log["shutter"]["corners_px"], home, atol=1e-4)
+    expected = np.linalg.norm(home - corners, axis=1).max()
+    assert log["shutter"]["max_displacement_px"] == pytest.approx(expected, abs=1e-3)
+    assert log["response"] == "srgb"
+    assert result.exposure_s == pytest.approx(0.012)
+    assert all(np.isfinite(_numbers(log)))
+    assert {"estimate", "deblur", "shutter"} <= set(result.seconds)

@@ -1,0 +1,109 @@
+"""What a blurred picture says of itself: noise and signal come back as they were put in."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from laws import texture
+from numpy.typing import NDArray
+
+from virest.degradation.kernels import KernelField
+from virest.restoration.statistics import PictureStatistics, measure_picture, on_spectrum
+
+HEIGHT, WIDTH = 420, 560
+
+
+def _field(length_px: float = 15.0, angle_rad: float = 0.4) -> KernelField:
+    """A bent stroke that is the same everywhere, held by a grid of centres."""
+    part = (np.arange(40) + 0.5) / 40
+    path = np.stack([length_px * part, 0.12 * length_px * part**2], -1) @ np.array(
+        [[np.cos(angle_rad), np.sin(angle_rad)], [-np.sin(angle_rad), np.cos(angle_rad)]]
+    )
+    x, y = np.meshgrid(np.arange(64, WIDTH, 128), np.arange(64, HEIGHT, 128))
+    centres = np.stack([x, y], -1).reshape(-1, 2).astype(float)
+    return KernelField(centres, np.repeat(path[None], len(centres), 0), 0.0)
+
+
+def _blurred(field: KernelField, noise_levels: float) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """A grey picture of a texture through the kernel with white noise, and the sharp texture; grey levels."""
+    sharp = 255 * (0.2 + 0.6 * texture(HEIGHT, WIDTH, seed=5))
+    blurred = cv2.filter2D(sharp, -1, field.arrays()[0].astype(float))
+    noisy = blurred + np.random.default_rng(8).normal(0, noise_levels, sharp.shape)
+    return np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, -1), sharp
+
+
+@pytest.mark.parametrize("noise_levels", [1.5, 4.0, 8.0])
+@pytest.mark.parametrize("angle_rad", [0.4, 1.9])
+def test_white_noise_is_measured(noise_levels: float, angle_rad: float) -> None:
+    """A known white noise comes back within 15 per cent, under a known blur."""
+    field = _field(angle_rad=angle_rad)
+    luma, _ = measure_picture(_blurred(field, noise_levels)[0], field)
+    assert luma.noise_levels == pytest.approx(noise_levels, rel=0.15)
+
+
+def test_noise_to_signal_is_of_the_right_order() -> None:
+    """Ring by ring, N / S is within a factor of 2.5 of what was put in where the two compete, and rises."""
+    field = _field()
+    picture, sharp = _blurred(field, 4.0)
+    luma, _ = measure_picture(picture, field)
+    fy, fx = np.fft.fftfreq(HEIGHT)[:, None], np.fft.fftfreq(WIDTH)[None]
+    power = np.abs(np.fft.fft2(sharp)) ** 2 / (HEIGHT * WIDTH)
+    radius = np.hypot(fx, fy)
+    truth = np.array([4.0**2 / np.mean(power[np.abs(radius - f) < 0.011]) for f in luma.frequency])
+    middle = (luma.frequency > 0.04) & (luma.frequency < 0.4)
+    ratio = luma.noise_to_signal[middle] / truth[middle]
+    assert ratio.min() > 1 / 2.5
+    assert ratio.max() < 2.5
+    assert luma.noise_to_signal[12] > 5 * luma.noise_to_signal[2]
+
+
+def test_more_noise_promises_less() -> None:
+    """The expected gain is positive under a clean blur and shrinks as noise grows."""
+    field = _field()
+    gains = [measure_picture(_blurred(field, n)[0], field)[0].expected_gain_db for n in (1.0, 4.0, 12.0)]
+    assert gains[0] > gains[1] > gains[2] >= 0
+    assert gains[0] > 1.5
+
+
+def test_a_blur_that_the_picture_does_not_show_comes_out_as_noise() -> None:
+    """A sharp picture under a predicted blur is judged as noisier than the same prediction where it is true."""
+    field = _field()
+    picture, sharp = _blurred(field, 1.5)
+    unblurred = np.repeat(np.rint(sharp).astype(np.uint8)[..., None], 3, -1)
+    assert measure_picture(unblurred, field)[0].noise_levels > 2 * measure_picture(picture, field)[0].noise_levels
+
+
+def test_a_grey_picture_has_no_colour_noise() -> None:
+    """Chroma has statistics of its own: where there is no colour, little but rounding is left of it."""
+    field = _field()
+    luma, chroma = measure_picture(_blurred(field, 4.0)[0], field)
+    assert np.all(chroma.signal < 0.05 * luma.signal)
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        pytest.param(np.full((60, 80, 3), 90, np.uint8), id="too small"),
+        pytest.param(np.zeros((HEIGHT, WIDTH, 3), np.uint8), id="black"),
+        pytest.param(np.full((HEIGHT, WIDTH, 3), 255, np.uint8), id="white"),
+        pytest.param(np.full((HEIGHT, WIDTH, 3), (200, 40, 90), np.uint8), id="one colour"),
+    ],
+)
+def test_a_picture_that_says_nothing_gives_finite_numbers(picture: NDArray[np.uint8]) -> None:
+    """Where nothing can be measured all figures are finite and positive."""
+    for statistics in measure_picture(picture, _field()):
+        for values in (statistics.signal, statistics.noise, statistics.noise_to_signal):
+            assert np.isfinite(values).all()
+            assert (values > 0).all()
+        assert np.isfinite([statistics.noise_levels, statistics.gradient_scale, statistics.expected_gain_db]).all()
+
+
+def test_rings_are_spread_over_a_packed_spectrum() -> None:
+    """Ring values stand at their frequencies, and fall to nothing at the mean, which needs no regularisation."""
+    frequency = (np.arange(24) + 0.5) / 48
+    statistics = PictureStatistics(frequency, np.ones(24), np.ones(24), np.ones(24))
+    spread = on_spectrum(statistics, 1 + frequency, 96)
+    assert spread[0, 0] == 0
+    assert spread[0, 2 * 30] == pytest.approx(1 + 30 / 96, rel=1e-3)
+    assert spread[2 * 20, 0] == pytest.approx(1 + 20 / 96, rel=1e-3)
