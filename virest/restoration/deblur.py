@@ -28,6 +28,8 @@ CLIPPED_LEVELS = 2.0
 PULLED_DOWN_LEVELS = 8.0
 """Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
 COLOUR_SCALE = 2.0
+BORDER_NOISE_TO_SIGNAL = 0.003
+"""Least N / S of tiles that see beyond the picture."""
 RESIDUAL_SHARE = 0.1
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
@@ -148,7 +150,11 @@ def _tile_factors(
             return deconvolution.filters(lambda power: tiles.wiener_filter(power, settings.strength**2 * flat))
     noise_to_signal = settings.strength**2 * statistics.noise_to_signal
     ratio = on_spectrum(statistics, noise_to_signal, deconvolution.size, scale)
-    return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
+    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)
+    guarded[0, 0] = ratio[0, 0]
+    return deconvolution.filters(
+        lambda power: tiles.wiener_filter(power, ratio), lambda power: tiles.wiener_filter(power, guarded)
+    )
 
 
 def _to_opponents(light: list[Image]) -> list[Image]:
@@ -216,20 +222,36 @@ def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSetti
 def _tile_hyper_laplacian(blurred: BlurredPicture, plane: Image, settings: RestorationSettings) -> Image:
     deconvolution = _tile_deconvolution(blurred, settings.tile_px)
     first = _tile_factors(deconvolution, settings, blurred.statistics)
-    unit = blurred.statistics.gradient_scale
-    trust = (unit / (settings.strength * blurred.statistics.noise_levels)) ** 2
+    statistics = blurred.statistics
+    unit = statistics.gradient_scale
+    noise = settings.strength * np.array([statistics.noise_levels, _border_noise(blurred)])
+    trust, guarded = ((unit / noise) ** 2).astype(np.float32)
     gradients = tiles.gradient_power(deconvolution.size)
     projected = deconvolution.back_projected(plane)
     sharp = deconvolution.blend([s * f for s, f in zip(projected, first, strict=True)])
     scale = blurred.slope[..., 1] * np.float32(1.0 / unit)
     for beta in _beta_schedule(settings.iterations):
-        weight = np.float32(trust / beta)
-        factors = deconvolution.filters(lambda power, w=weight: 1.0 / (power * w + gradients))
+        inverse = np.float32(1.0 / beta)
+        factors = deconvolution.filters(
+            lambda power, w=trust * inverse: 1.0 / (power * w + gradients),
+            lambda power, w=guarded * inverse: 1.0 / (power * w + gradients),
+        )
         pull = _gradient_targets(sharp, scale, shrinkage_table(beta))
-        sharp = _tile_solve(deconvolution, projected, pull, factors, weight)
+        weights = [(guarded if border else trust) * inverse for border in deconvolution.at_border]
+        sharp = _tile_solve(deconvolution, projected, pull, factors, weights)
     if settings.iterations > 2:
-        sharp += _returned_residual(deconvolution, projected, sharp, blurred.statistics)
+        sharp += _returned_residual(deconvolution, projected, sharp, statistics)
     return sharp
+
+
+def _border_noise(blurred: BlurredPicture) -> float:
+    """Noise to assume where tiles see beyond the picture, grey levels: what is guessed there is a rough guess.
+
+    A weakly regularised inverse would carry the guess's error many blur lengths inwards.
+    """
+    statistics = blurred.statistics
+    power = np.interp(2.0 / max(blurred.longest_px, 4.0), statistics.frequency, statistics.signal)
+    return max(statistics.noise_levels, float(np.sqrt(BORDER_NOISE_TO_SIGNAL * power)))
 
 
 def _returned_residual(
@@ -237,11 +259,13 @@ def _returned_residual(
 ) -> Image:
     """Fine texture that the prior took for noise: the residual g − K f, filtered as a picture of a tenth the power."""
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
+    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
+    factors = deconvolution.filters(lambda power: 1.0 / (power + ratio), lambda power: 1.0 / (power + guarded))
     padded = deconvolution.padded(sharp)
     spectra = [
-        (back - power * cv2.dft(deconvolution.periodic(padded, top, left))) / (power + ratio)
-        for (top, left), back, power in zip(
-            deconvolution.grid.corners(), projected, deconvolution.powers, strict=True
+        (back - power * cv2.dft(deconvolution.periodic(padded, top, left))) * factor
+        for (top, left), back, power, factor in zip(
+            deconvolution.grid.corners(), projected, deconvolution.powers, factors, strict=True
         )
     ]
     return deconvolution.blend(spectra)
@@ -258,12 +282,14 @@ def _gradient_targets(sharp: Image, scale: Image, table: Image) -> Image:
 
 
 def _tile_solve(
-    deconvolution: tiles.TileDeconvolution, projected: list[Image], pull: Image, factors: list[Image], trust: np.float32
+    deconvolution: tiles.TileDeconvolution, projected: list[Image], pull: Image, factors: list[Image], weights: list[np.float32]
 ) -> Image:
     padded = deconvolution.padded(pull, cv2.BORDER_CONSTANT)
     spectra = [
-        (trust * back + cv2.dft(deconvolution.periodic(padded, top, left))) * factor
-        for (top, left), back, factor in zip(deconvolution.grid.corners(), projected, factors, strict=True)
+        (weight * back + cv2.dft(deconvolution.periodic(padded, top, left))) * factor
+        for (top, left), back, factor, weight in zip(
+            deconvolution.grid.corners(), projected, factors, weights, strict=True
+        )
     ]
     return deconvolution.blend(spectra)
 

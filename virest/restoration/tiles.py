@@ -27,14 +27,21 @@ class TileDeconvolution:
         self.margin = margin = max(margin, kernels.shape[1] // 2 + 1)
         self.patch = grid.side + 2 * margin
         self.size = fast_size(self.patch + max(8, self.patch // 16))
+        self.at_border = [
+            top < margin or left < margin or top + grid.side > grid.height - margin or left + grid.side > grid.width - margin
+            for top, left in grid.corners()
+        ]
         self._windows = grid.windows()
         self._bridge = _bridge(self.size - self.patch)
         self._kernels = [self._kernel_spectrum(kernel) for kernel in kernels]
         self.powers = [doubled(cv2.mulSpectrums(k, k, 0, conjB=True)) for k in self._kernels]
 
-    def filters(self, make: Filter) -> list[Image]:
-        """The packed real factor of each tile."""
-        return [make(power) for power in self.powers]
+    def filters(self, make: Filter, at_border: Filter | None = None) -> list[Image]:
+        """The packed real factor of each tile; ``at_border`` makes those of tiles that see beyond the picture."""
+        return [
+            (at_border or make)(power) if border else make(power)
+            for power, border in zip(self.powers, self.at_border, strict=True)
+        ]
 
     def back_projected(self, channel: Image) -> list[Image]:
         """Spectrum of Kᵀ g for each tile; channel (height, width) is extended, never wrapped."""
