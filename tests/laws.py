@@ -42,7 +42,7 @@ def random_picture(shape: Shape, rng: np.random.Generator) -> NDArray[np.float32
 
 
 def assert_linear(operator: Operator, shape: Shape, rng: np.random.Generator, rtol: float = 1e-4) -> None:
-    """A(2.5 x − 0.7 y) = 2.5 A x − 0.7 A y."""
+    """Hold A(2.5 x − 0.7 y) = 2.5 A x − 0.7 A y."""
     x, y = random_picture(shape, rng), random_picture(shape, rng)
     a, b = np.float32(2.5), np.float32(-0.7)
     expected = a * operator(x) + b * operator(y)
@@ -52,7 +52,7 @@ def assert_linear(operator: Operator, shape: Shape, rng: np.random.Generator, rt
 def assert_adjoint(
     apply: Operator, adjoint: Operator, x_shape: Shape, y_shape: Shape, rng: np.random.Generator, rtol: float = 1e-4
 ) -> None:
-    """<A x, y> = <x, Aᵀ y>, with the shapes that are claimed."""
+    """Hold <A x, y> = <x, Aᵀ y>, with the shapes that are claimed."""
     x, y = random_picture(x_shape, rng), random_picture(y_shape, rng)
     forward, back = apply(x), adjoint(y)
     assert forward.shape == y_shape
@@ -62,14 +62,14 @@ def assert_adjoint(
 
 
 def assert_round_trip(there: Operator, back: Operator, values: Array, atol: float) -> None:
-    """Going there and coming back changes nothing."""
+    """Go there and come back: nothing changes."""
     np.testing.assert_allclose(back(there(values)), values, rtol=0, atol=atol)
 
 
 def assert_energy(
     apply: Operator, adjoint: Operator, x_shape: Shape, y_shape: Shape, rng: np.random.Generator, rtol: float = 1e-4
 ) -> None:
-    """Light is neither made nor lost: a constant stays, and the adjoint keeps the sum."""
+    """Make and lose no light: a constant stays, and the adjoint keeps the sum."""
     np.testing.assert_allclose(apply(np.full(x_shape, 0.37, np.float32)), np.full(y_shape, 0.37), rtol=rtol)
     y = random_picture(y_shape, rng)
     assert abs(float(adjoint(y).sum(dtype=float) - y.sum(dtype=float))) <= rtol * float(np.abs(y).sum(dtype=float))
@@ -145,7 +145,7 @@ def phone(
     readout_direction: str = "top_to_bottom",
     **changes: Any,
 ) -> CameraProfile:
-    """A phone with an off-centre lens, pixels that are not square, and a gyroscope with bias and scale."""
+    """Make a phone with an off-centre lens, pixels that are not square, and a gyroscope with bias and scale."""
     model, coefficients = lens
     centre = (0.52 * width, 0.47 * height)
     return CameraProfile(
@@ -165,7 +165,7 @@ def phone(
 
 
 def texture(height: int, width: int, seed: int = 7, slope: float = 1.1) -> NDArray[np.float64]:
-    """A picture with the spectrum of a natural one, in [0.03, 0.9]."""
+    """Make a picture with the spectrum of a natural one, in [0.03, 0.9]."""
     rng = np.random.default_rng(seed)
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
     frequency[0, 0] = 1.0

@@ -45,7 +45,9 @@ def test_the_drawn_tree_shows_every_error() -> None:
 
 def test_video_imu_and_clock_errors_are_capture_errors() -> None:
     """Whoever catches a capture's error catches those of its parts."""
-    assert all(issubclass(kind, errors.CaptureError) for kind in (errors.VideoError, errors.ImuError, errors.ClockError))
+    assert all(
+        issubclass(kind, errors.CaptureError) for kind in (errors.VideoError, errors.ImuError, errors.ClockError)
+    )
 
 
 @pytest.mark.parametrize("kind", _tree())

@@ -28,7 +28,7 @@ def _lens(lens: Model, focal_px: float = 412.0) -> Intrinsics:
 
 
 def _pixels() -> NDArray[np.float64]:
-    """The picture's corners, its edges and its inside."""
+    """Give the picture's corners, its edges and its inside."""
     x, y = np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 359, 7))
     return np.stack([x, y], -1)
 
@@ -49,9 +49,7 @@ def test_wide_fisheye_reaches_its_corners() -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    k1=st.floats(-0.12, 0.25), k2=st.floats(-0.02, 0.04), p1=st.floats(-0.004, 0.004), p2=st.floats(-0.004, 0.004)
-)
+@given(k1=st.floats(-0.12, 0.25), k2=st.floats(-0.02, 0.04), p1=st.floats(-0.004, 0.004), p2=st.floats(-0.004, 0.004))
 def test_any_mild_lens_round_trips(k1: float, k2: float, p1: float, p2: float) -> None:
     """Whatever mild distortion a phone has, rays and pixels are inverse over the whole picture."""
     camera = _lens(("radtan", (k1, k2, p1, p2, 0.0)))
@@ -71,7 +69,9 @@ def test_fisheye_is_opencvs() -> None:
     """The fisheye has OpenCV's coefficients in OpenCV's order."""
     camera = _lens(FISHEYE)
     rays = np.random.default_rng(2).uniform((-2, -1, 0.8), (2, 1, 1.3), (50, 3))
-    expected, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(FISHEYE[1]))
+    expected, _ = cv2.fisheye.projectPoints(
+        rays[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(FISHEYE[1])
+    )
     np.testing.assert_allclose(camera.project(rays), expected[:, 0], atol=1e-8)
 
 

@@ -83,7 +83,9 @@ FULL = CameraProfile(
     clock_skew=3e-5,
     gyro_bias_rad_s=(1e-3, -2.5e-7, 0.02),
     gyro_scale=(1.01, 0.99, 1.002),
-    response=ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.8), y_max=0.95, extra_gamma=1.1, black_level=0.02),
+    response=ResponseCurve(
+        "five_segment", b=(0.12, 0.08), c=(0.62, 0.8), y_max=0.95, extra_gamma=1.1, black_level=0.02
+    ),
     sensor_width_mm=4.1,
     sensor_height_mm=5.6,
     focal_length_mm=4.75,
@@ -137,9 +139,7 @@ def test_a_full_profile_survives_its_file(tmp_path: Path) -> None:
 def test_an_empty_profile_survives_its_file() -> None:
     """What is unknown stays unknown."""
     empty = CameraProfile(64, 48, readout_known=False)
-    assert parse_profile(yaml.safe_load(format_profile(empty))) == replace(
-        empty, shutter=Shutter(0.0, "top_to_bottom")
-    )
+    assert parse_profile(yaml.safe_load(format_profile(empty))) == replace(empty, shutter=Shutter(0.0, "top_to_bottom"))
 
 
 def _floats(low: float, high: float) -> st.SearchStrategy[float]:
@@ -153,16 +153,22 @@ def _profiles(draw: st.DrawFn) -> CameraProfile:
 
     width, height = draw(st.integers(16, 4000)), draw(st.integers(16, 4000))
     model = draw(st.sampled_from(sorted(COEFFICIENT_NAMES)))
-    lens = Intrinsics(width, height, *some(1, 1e5, 2), *some(-1e4, 1e4, 2), model, some(-1, 1, len(COEFFICIENT_NAMES[model])))
+    lens = Intrinsics(
+        width, height, *some(1, 1e5, 2), *some(-1e4, 1e4, 2), model, some(-1, 1, len(COEFFICIENT_NAMES[model]))
+    )
     curve = ResponseCurve(
-        draw(st.sampled_from(["linear", "srgb", "gamma"])), extra_gamma=draw(_floats(0.2, 5)), black_level=draw(_floats(0, 0.8))
+        draw(st.sampled_from(["linear", "srgb", "gamma"])),
+        extra_gamma=draw(_floats(0.2, 5)),
+        black_level=draw(_floats(0, 0.8)),
     )
     return CameraProfile(
         width,
         height,
         draw(st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=20)),
         draw(st.sampled_from([None, lens])),
-        Shutter(*some(0, 1, 1), draw(st.sampled_from(READOUT_DIRECTIONS)), draw(st.sampled_from(sorted(STAMP_FRACTION)))),
+        Shutter(
+            *some(0, 1, 1), draw(st.sampled_from(READOUT_DIRECTIONS)), draw(st.sampled_from(sorted(STAMP_FRACTION)))
+        ),
         r_cam_imu=FULL.r_cam_imu,
         p_cam_imu_m=some(-1, 1, 3),  # type: ignore[arg-type]
         time_offset_s=draw(st.one_of(st.none(), _floats(-1e3, 1e3))),

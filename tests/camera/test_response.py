@@ -109,7 +109,7 @@ def test_five_segments_worked_by_hand() -> None:
 
 
 def test_extensions_come_on_top() -> None:
-    """grey = black + (1 − black) curve(light)^gamma, worked by hand: 0.1 + 0.9 · 0.5^1.5."""
+    """Grey = black + (1 − black) curve(light)^gamma, worked by hand: 0.1 + 0.9 · 0.5^1.5."""
     curve = ResponseCurve("linear", extra_gamma=1.5, black_level=0.1)
     assert curve.encode(np.array(0.5)) == pytest.approx(0.1 + 0.9 * 0.5**1.5)
     assert curve.encode(np.array(0.0)) == pytest.approx(0.1)

@@ -24,7 +24,7 @@ def _fraction(direction: str, point: tuple[float, float]) -> float:
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
 def test_readout_fractions_worked_by_hand(direction: str) -> None:
-    """A pixel's part of the readout is that of the formulas: 0 for the first row read, one row short of 1 for the last."""
+    """A pixel's part of the readout is the formulas': 0 for the first row read, one row short of 1 for the last."""
     inside, first, last, at_last = TABLE[direction]
     assert _fraction(direction, (3, 1)) == pytest.approx(inside)
     assert _fraction(direction, first) == pytest.approx(0.0)

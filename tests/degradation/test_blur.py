@@ -93,7 +93,7 @@ def test_a_kernel_gathers_from_where_it_is_set() -> None:
 
 
 def test_different_kernels_are_blended_by_the_windows(rng: np.random.Generator) -> None:
-    """g = Σ_r w_r (k_r ⋆ f), by one plain correlation of the whole picture for each tile."""
+    """G = Σ_r w_r (k_r ⋆ f), by one plain correlation of the whole picture for each tile."""
     sizes = (75, 118, 48, 12)
     grid = tile_grid(*sizes)
     kernels = _kernels(len(grid.centres_px), 6, rng)

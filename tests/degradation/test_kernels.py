@@ -52,7 +52,14 @@ def test_chords_belong_to_the_exposure_of_their_own_row(direction: str) -> None:
 
 @pytest.mark.parametrize(
     ("chord", "angle"),
-    [((3, 0), 0), ((0, 2), np.pi / 2), ((0, -2), -np.pi / 2), ((-4, 0.0), np.pi), ((-4, -0.0), np.pi), ((-1, -1), -0.75 * np.pi)],
+    [
+        ((3, 0), 0),
+        ((0, 2), np.pi / 2),
+        ((0, -2), -np.pi / 2),
+        ((-4, 0.0), np.pi),
+        ((-4, -0.0), np.pi),
+        ((-1, -1), -0.75 * np.pi),
+    ],
 )
 def test_angles_are_in_the_half_open_turn(chord: tuple[float, float], angle: float) -> None:
     """Angles run from x right towards y down, in (−π, π]: straight left is +π, from either side of zero."""
@@ -100,8 +107,10 @@ def test_the_anchor_moves_the_kernel_by_its_part_of_the_chord() -> None:
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
 @pytest.mark.parametrize("anchor", [0.0, 0.5])
 @pytest.mark.parametrize("lens", [pytest.param(lens, id=lens[0]) for lens in (UNDISTORTED, RADTAN)])
-def test_kernel_fields_are_explicit_projections(direction: str, anchor: float, lens: tuple[str, tuple[float, ...]]) -> None:
-    """What pixel p gathers at each instant is found again, by brute force, in the picture of all rows at their anchors."""
+def test_kernel_fields_are_explicit_projections(
+    direction: str, anchor: float, lens: tuple[str, tuple[float, ...]]
+) -> None:
+    """What a pixel gathers at each instant is found again, by brute force, in the picture of anchored rows."""
     camera = TurningCamera(phone(lens=lens, readout_direction=direction), rate_rad_s=(0.9, -1.6, 0.7))
     motion = camera.motion
     field = kernel_field(motion, CENTRES, anchor)
@@ -137,7 +146,7 @@ def test_a_still_camera_has_points_for_kernels() -> None:
 
 
 def test_a_kernel_blurs_as_the_mean_over_its_path() -> None:
-    """Correlating a smooth blob with a kernel is the mean of the blob seen along the bent path: g(p) = mean f(p + d)."""
+    """Correlating a blob with a kernel is the mean of the blob along the bent path: g(p) = mean f(p + d)."""
     part = (np.arange(60) + 0.5) / 60
     path = np.stack([9.3 * part - 2.2, 5.1 * part**2 - 4.4], -1)
     field = KernelField(np.array([[30.0, 30.0]]), path[None], 0.0)

@@ -42,7 +42,7 @@ def camera(
     height: int = 240,
     **changes: object,
 ) -> TurningCamera:
-    """A phone with a plain lens, off-centre, turning about all three axes: some 10 px of blur."""
+    """Make a phone with a plain lens, off-centre, turning about all three axes: some 10 px of blur."""
     profile = phone(
         width, height, 380.0, readout_time_s=readout_time_s, readout_direction=readout_direction,
         response=ResponseCurve("srgb"),
@@ -82,6 +82,8 @@ def _canvas(height: int, width: int, grey: bool) -> NDArray[np.float32]:
     return np.stack(planes, -1).astype(np.float32)
 
 
-def _stored(light: NDArray[np.float64], curve: ResponseCurve | None, noise: NDArray[np.float64] | float) -> NDArray[np.uint8]:
+def _stored(
+    light: NDArray[np.float64], curve: ResponseCurve | None, noise: NDArray[np.float64] | float
+) -> NDArray[np.uint8]:
     assert curve is not None
     return np.clip(np.rint(255 * curve.encode(np.clip(light, 0, 1)) + noise), 0, 255).astype(np.uint8)

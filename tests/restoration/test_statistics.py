@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 420, 560
 
 
 def _field(length_px: float = 15.0, angle_rad: float = 0.4) -> KernelField:
-    """A bent stroke that is the same everywhere, held by a grid of centres."""
+    """Make a bent stroke that is the same everywhere, held by a grid of centres."""
     part = (np.arange(40) + 0.5) / 40
     path = np.stack([length_px * part, 0.12 * length_px * part**2], -1) @ np.array(
         [[np.cos(angle_rad), np.sin(angle_rad)], [-np.sin(angle_rad), np.cos(angle_rad)]]
@@ -26,7 +26,7 @@ def _field(length_px: float = 15.0, angle_rad: float = 0.4) -> KernelField:
 
 
 def _blurred(field: KernelField, noise_levels: float) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """A grey picture of a texture through the kernel with white noise, and the sharp texture; grey levels."""
+    """Blur a grey texture by the kernel and add white noise; return it and the sharp texture, grey levels."""
     sharp = 255 * (0.2 + 0.6 * texture(HEIGHT, WIDTH, seed=5))
     blurred = cv2.filter2D(sharp, -1, field.arrays()[0].astype(float))
     noisy = blurred + np.random.default_rng(8).normal(0, noise_levels, sharp.shape)

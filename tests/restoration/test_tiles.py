@@ -30,7 +30,7 @@ def _filtered_by_numpy(
 
 
 def _lopsided_kernel(size: int = 15) -> NDArray[np.float32]:
-    """A bent stroke that starts off the middle, sums to 1."""
+    """Make a bent stroke that starts off the middle, sums to 1."""
     kernel = np.zeros((size, size), np.float32)
     points = np.array([[4, 5], [7, 6], [10, 8], [12, 11]], np.int32)
     cv2.polylines(kernel, [points[:, None]], False, 1.0)

@@ -8,12 +8,12 @@ from story import simulate
 
 @pytest.fixture(scope="session")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder for captures and runs."""
+    """Make a folder for captures and runs."""
     return tmp_path_factory.mktemp("scenarios")
 
 
 @pytest.fixture(scope="session")
 def hand_held(virest, work: Path) -> Path:
-    """A small upright capture of a hand-held phone: three frames, sixteenth of a megapixel, seven pixels of blur."""
+    """Simulate a hand-held phone held upright: four small frames with some ten pixels of blur."""
     options = "--width 360 --height 480 --frames 4 --exposure-ms 14 --rate 2 --noise 2 --seed 5"
     return simulate(virest, work / "hand_held", *options.split())

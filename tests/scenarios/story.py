@@ -26,12 +26,12 @@ class Result:
     stderr: str
 
     def picture(self, line: dict[str, Any]) -> Picture:
-        """The picture of a line, RGB."""
+        """Read the picture of a line, RGB."""
         return read_png(self.folder / line["output"])
 
 
 def read_png(path: Path) -> Picture:
-    """An RGB picture."""
+    """Read an RGB picture."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     assert picture is not None, path
     return picture[..., ::-1].astype(np.uint8)

@@ -24,6 +24,7 @@ from virest.errors import SettingsError
 
 MAX_PROFILE_BYTES = 1_000_000
 MAX_SIDE_PX = 20_000
+MAX_DEPTH = 20
 ANDROID_R_CAM_IMU = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """Stored portrait picture of an Android phone's rear camera against the device axes."""
 
@@ -184,6 +185,8 @@ class _Imu(_Strict):
 
     @model_validator(mode="after")
     def _rigid(self) -> _Imu:
+        if any(s <= 0 for s in self.gyro_scale):
+            raise ValueError("gyro_scale must be positive")
         if self.T_cam_imu is None:
             return self
         if len(self.T_cam_imu) not in (3, 4) or any(len(row) != 4 for row in self.T_cam_imu):
@@ -194,8 +197,8 @@ class _Imu(_Strict):
             raise ValueError(
                 f"T_cam_imu is no rotation: R Rᵀ is off by {error:.2g}, determinant {np.linalg.det(rotation):.2f}"
             )
-        if any(s <= 0 for s in self.gyro_scale):
-            raise ValueError("gyro_scale must be positive")
+        if len(self.T_cam_imu) == 4 and self.T_cam_imu[3] != [0, 0, 0, 1]:
+            raise ValueError("the last row of T_cam_imu must be 0, 0, 0, 1")
         return self
 
 
@@ -293,8 +296,7 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
         if size > MAX_PROFILE_BYTES:
             raise SettingsError(f"{path.name}: {size} bytes, more than {MAX_PROFILE_BYTES}", hint="is it a profile?")
         text = path.read_text(encoding="utf-8")
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            raise SettingsError(f"{path.name}: YAML aliases are not accepted", hint="write the values out")
+        _require_plain(text, path.name)
         content = yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -310,28 +312,52 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
     return content
 
 
+def _require_plain(text: str, name: str) -> None:
+    """Refuse aliases and deep nesting before anything is built of them."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise SettingsError(f"{name}: YAML aliases are not accepted", hint="write the values out")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH:
+            raise SettingsError(f"{name}: nested more than {MAX_DEPTH} deep", hint="is it a profile?")
+
+
 def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfile:
     """Build a profile from the YAML's mapping; ``name`` is used in messages."""
     try:
         model = _Profile.model_validate(content)
     except ValidationError as error:
         raise explain_validation(error, _Profile, name) from None
-    return _from_model(model)
+    try:
+        return _from_model(model)
+    except SettingsError as error:
+        raise SettingsError(f"{name}: {error.message}", hint=error.hint) from None
 
 
 def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
     """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
     first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
     path = [str(part) for part in first["loc"] if not str(part).startswith(("_", "literal", "function-", "constrained"))]
-    where = ".".join(path)
+    where = _printable(".".join(path))
     if first["type"] == "extra_forbidden":
         known = _keys_at(model, path[:-1])
-        near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
-        hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"
+        near = _nearest(path[-1], known)
+        hint = f"did you mean '{near}'?" if near else f"known keys: {', '.join(known)}"
         return SettingsError(f"{name}: unknown key '{where[:80]}', {hint}")
     value = "" if isinstance(first.get("input"), dict) else f", got {str(first.get('input'))[:60]!r}"
-    message = first["msg"].removeprefix("Value error, ")
+    message = first["msg"].removeprefix("Value error, ").split(" or instance of")[0]
     return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see the profile in README")
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _nearest(key: str, known: list[str]) -> str | None:
+    """The known key that is meant: one that begins alike before one that only looks alike."""
+    alike = [k for k in known if k.startswith(key) or key.startswith(k)]
+    return next(iter(alike or difflib.get_close_matches(key, known, n=1, cutoff=0.5)), None)
 
 
 def _keys_at(model: Any, path: list[str]) -> list[str]:
@@ -340,6 +366,7 @@ def _keys_at(model: Any, path: list[str]) -> list[str]:
         if found is None:
             continue
         candidates = [found.annotation, *getattr(found.annotation, "__args__", ())]
+        candidates += [inner for c in candidates for inner in getattr(c, "__args__", ())]
         model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), model)
     return sorted(model.model_fields)
 
@@ -426,9 +453,9 @@ def _response(block: _Response | None, extensions: _Extensions) -> ResponseCurve
     if block is None:
         return None
     if block.kind == "five_segment" and (block.b is None or block.c is None):
-        raise SettingsError("profile: response: five_segment needs b and c", hint="see the profile in README")
+        raise SettingsError("response: five_segment needs b and c", hint="see the profile in README")
     if block.kind == "table" and (block.x is None or block.y is None):
-        raise SettingsError("profile: response: table needs x and y", hint="see the profile in README")
+        raise SettingsError("response: table needs x and y", hint="see the profile in README")
     return ResponseCurve(
         block.kind,
         block.gamma,

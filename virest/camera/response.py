@@ -171,3 +171,5 @@ def _require_curve(curve: ResponseCurve) -> None:
         x, y = np.asarray(curve.x), np.asarray(curve.y)
         if x.size < 2 or x.size != y.size or not (np.all(np.diff(x) > 0) and np.all(np.diff(y) > 0)):
             refuse("table needs two lists x and y of one length, at least two values, both strictly rising")
+        if y[0] < 0 or y[-1] > 1:
+            refuse(f"table: y runs from {y[0]:g} to {y[-1]:g}, outside 0 to 1")

@@ -147,7 +147,9 @@ def _tile_factors(
         case "wiener":
             weight = statistics.frequency
             flat = float(np.sum(statistics.noise * weight) / np.sum(statistics.signal * weight))
-            return deconvolution.filters(lambda power: tiles.wiener_filter(power, settings.strength**2 * flat))
+            ratio = np.full((deconvolution.size,) * 2, settings.strength**2 * flat, np.float32)
+            ratio[0, 0] = 0.0  # the mean is no noise
+            return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
     noise_to_signal = settings.strength**2 * statistics.noise_to_signal
     ratio = on_spectrum(statistics, noise_to_signal, deconvolution.size, scale)
     guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)

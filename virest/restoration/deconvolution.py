@@ -15,6 +15,8 @@ Image = NDArray[np.float32]
 Operator = Callable[[Image], Image]
 ALPHA = 2.0 / 3.0
 """Exponent of the gradients' hyper-Laplacian (Krishnan & Fergus 2009)."""
+_UNSEEN = 1e-3
+"""Added above and below in Richardson-Lucy's update, so that light that no pixel weighs stays as it is."""
 _TABLE_SIZE = 2048
 _TABLE_END = 8.0
 
@@ -27,10 +29,10 @@ def richardson_lucy(
     f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.
     """
     sharp = np.maximum(start, 1e-4)
-    seen = np.maximum(adjoint(weight), 1e-3)
+    seen = adjoint(weight) + _UNSEEN
     for _ in range(iterations):
         ratio = weight * observed / np.maximum(apply(sharp), 1e-4)
-        sharp = np.maximum(sharp * (adjoint(ratio) + np.maximum(1e-3 - seen, 0)) / seen, 1e-5)
+        sharp = np.maximum(sharp * np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen, 1e-5)
     return sharp
 
 

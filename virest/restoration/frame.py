@@ -212,6 +212,8 @@ def _deblurred(
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
     luma, chroma = measure_picture(picture, samples)
     clipped = bool(np.mean(curve.censored_table()[picture]) > MANY_CLIPPED)
+    if not luma.measured:
+        return picture, {"method": "none"}, ("picture too small for its blur to be measured, left alone",)
     if luma.expected_gain_db < MIN_GAIN_DB and not clipped:
         reason = f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
         return picture, {"method": "none"}, (reason,)

@@ -37,7 +37,7 @@ def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int,
     """(x0, y0, x1, y1), x1 and y1 one past the end: a large rectangle whose every pixel was recorded.
 
     Its sides move in from the picture's own, always the one with the largest part of missing pixels.  The map is
-    smooth, so every ``step``-th pixel is looked at; the rectangle begins and ends on such pixels.
+    smooth, so every ``step``-th pixel is looked at; the rectangle begins and ends on such pixels.  All 0 where there is none.
     """
     height, width = source_px.shape[:2]
     columns, rows = _every(width, step), _every(height, step)
@@ -55,6 +55,8 @@ def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int,
         if sides[worst] == 0:
             break
         x0, y0, x1, y1 = x0 + (worst == 0), y0 + (worst == 1), x1 - (worst == 2), y1 - (worst == 3)
+    if missing[y0:y1, x0:x1].any():
+        return 0, 0, 0, 0
     return int(columns[x0]), int(rows[y0]), int(columns[x1 - 1]) + 1, int(rows[y1 - 1]) + 1
 
 

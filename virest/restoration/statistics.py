@@ -53,6 +53,8 @@ class PictureStatistics:
     """(RINGS,) power of the noise."""
     passed: Array
     """(RINGS,) mean |K|² of the kernels."""
+    measured: bool = True
+    """False where the picture told nothing, and the values stand in for it."""
 
     @property
     def noise_to_signal(self) -> Array:
@@ -76,7 +78,9 @@ class PictureStatistics:
 
     @property
     def expected_gain_db(self) -> float:
-        """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more."""
+        """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured."""
+        if not self.measured:
+            return 0.0
         area = self.frequency
         through = self.passed * self.signal
         left = np.sum(area * ((1 - np.sqrt(self.passed)) ** 2 * self.signal + self.noise))
@@ -171,28 +175,33 @@ def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> Pi
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
     spread = np.sqrt(np.maximum((count * k * k).sum(1) / in_ring - mean_k**2, 0))
     determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
-    return _settled(signal, noise, mean_k, determined)
+    return _settled(signal, noise, mean_k, mean_g, determined)
 
 
-def _settled(signal: Array, noise: Array, passed: Array, determined: NDArray[np.bool_]) -> PictureStatistics:
-    """Rings that cannot tell S from N borrow the noise of those that can; S never rises with frequency."""
+def _settled(
+    signal: Array, noise: Array, passed: Array, observed: Array, determined: NDArray[np.bool_]
+) -> PictureStatistics:
+    """Rings that cannot tell S from N borrow the noise of those that can; S never rises with frequency.
+
+    Kernels too short to cancel anything leave the noise open: then it is at most what the highest frequencies hold.
+    """
     frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
-    if not determined.any():
-        return _unknown_picture()
-    through = passed * signal + noise
-    noise = np.interp(frequency, frequency[determined], noise[determined])
-    noise = np.maximum.accumulate(noise[::-1])[::-1]
-    lowest = frequency[determined][0]
-    noise *= np.maximum(lowest / frequency, 1.0) ** _NOISE_SLOPE
-    signal = np.where(determined, signal, np.maximum(through - noise, 0.05 * through) / np.maximum(passed, 0.05))
+    if determined.any():
+        noise = np.interp(frequency, frequency[determined], noise[determined])
+        noise = np.maximum.accumulate(noise[::-1])[::-1]
+        noise *= np.maximum(frequency[determined][0] / frequency, 1.0) ** _NOISE_SLOPE
+    else:
+        noise = np.full(RINGS, max(float(observed[-3:].mean()), _ROUNDING_POWER))
+    through = np.maximum(observed - noise, 0.05 * observed) / np.maximum(passed, 0.05)
+    signal = np.where(determined, signal, through)
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
     return PictureStatistics(frequency, signal, noise, passed)
 
 
 def _unknown_picture() -> PictureStatistics:
-    """Nothing could be measured: all noise, so that nothing is sharpened."""
+    """Nothing could be measured: the picture is smaller than a tile, or the blur larger."""
     frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
-    return PictureStatistics(frequency, np.full(RINGS, 1e-3), np.ones(RINGS), np.ones(RINGS))
+    return PictureStatistics(frequency, np.ones(RINGS), np.ones(RINGS), np.ones(RINGS), False)
 
 
 @lru_cache(maxsize=8)

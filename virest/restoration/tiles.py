@@ -117,11 +117,6 @@ def inverse_filter(power: Image, floor: float = 1e-3) -> Image:
     return 1.0 / np.maximum(power, floor)
 
 
-def wiener_filter(power: Image, noise_to_signal: float) -> Image:
-    """1 / (|K|² + N/S) with a flat noise-to-signal ratio."""
+def wiener_filter(power: Image, noise_to_signal: Image) -> Image:
+    """1 / (|K|² + N/S), with the noise-to-signal ratio at each place of the packed spectrum."""
     return 1.0 / (power + noise_to_signal)
-
-
-def gradient_wiener_filter(power: Image, noise_to_gradient: float, gradients: Image) -> Image:
-    """1 / (|K|² + (σ²/σ_∇²) |D|²): noise against natural pictures, whose gradients are about equally strong."""
-    return 1.0 / (power + noise_to_gradient * gradients)
