@@ -36,6 +36,9 @@ log = logging.getLogger(__name__)
 
 MIN_SEGMENT_FRAMES, USUAL_SEGMENT_FRAMES, MAX_SEGMENT_FRAMES = 5, 10, 30
 IMU_MARGIN_S = 1.0
+KEEP_MEMORY_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
+KEPT_BYTES = str(256 * 2**20)
+"""glibc hands pictures back to the system and fetches them anew, page by page, unless told to keep them."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 Picture = NDArray[np.uint8]
@@ -318,6 +321,8 @@ class Workers:
             return SerialExecutor()
         for variable in THREAD_VARIABLES:
             os.environ[variable] = "1"
+        for variable in KEEP_MEMORY_VARIABLES:
+            os.environ.setdefault(variable, KEPT_BYTES)
         context = multiprocessing.get_context("spawn")
         return ProcessPoolExecutor(self.jobs, context, initializer=_start_worker, initargs=(self.verbose,))
 

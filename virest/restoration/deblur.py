@@ -14,11 +14,10 @@ from virest.degradation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
 from virest.degradation.kernels import KernelField
 from virest.restoration import tiles
 from virest.restoration.deconvolution import (
-    difference,
-    difference_adjoint,
+    LEVELS_PER_UNIT,
     hyper_laplacian,
     richardson_lucy,
-    shrinkage_table,
+    shrinkage_levels,
 )
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics import PictureStatistics, on_spectrum
@@ -238,7 +237,7 @@ def _tile_hyper_laplacian(blurred: BlurredPicture, plane: Image, settings: Resto
             lambda power, w=trust * inverse: 1.0 / (power * w + gradients),
             lambda power, w=guarded * inverse: 1.0 / (power * w + gradients),
         )
-        pull = _gradient_targets(sharp, scale, shrinkage_table(beta))
+        pull = _gradient_targets(sharp, scale, shrinkage_levels(beta))
         weights = [(guarded if border else trust) * inverse for border in deconvolution.at_border]
         sharp = _tile_solve(deconvolution, projected, pull, factors, weights)
     if settings.iterations > 2:
@@ -273,13 +272,15 @@ def _returned_residual(
     return deconvolution.blend(spectra)
 
 
-def _gradient_targets(sharp: Image, scale: Image, table: Image) -> Image:
-    """Dᵀ w, with w the shrunk gradients."""
+def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:
+    """Dᵀ w, with w the shrunk gradients; factors: w / v over |v| · 32, as :func:`shrinkage_levels` tabulates it."""
     pull = np.zeros_like(sharp)
-    for axis in (0, 1):
-        gradient = difference(sharp, axis)
-        index = np.minimum(np.abs(gradient) * scale * np.float32(len(table) / 8.0), len(table) - 1).astype(np.int32)
-        pull += difference_adjoint(gradient * np.take(table, index), axis)
+    for ahead, behind in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        gradient = cv2.subtract(sharp[ahead], sharp[behind])
+        level = cv2.convertScaleAbs(cv2.multiply(gradient, scale[behind]), alpha=LEVELS_PER_UNIT)
+        gradient = cv2.multiply(gradient, cv2.LUT(level, factors))
+        pull[ahead] += gradient
+        pull[behind] -= gradient
     return pull
 
 
@@ -287,12 +288,12 @@ def _tile_solve(
     deconvolution: tiles.TileDeconvolution, projected: list[Image], pull: Image, factors: list[Image], weights: list[np.float32]
 ) -> Image:
     padded = deconvolution.padded(pull, cv2.BORDER_CONSTANT)
-    spectra = [
-        (weight * back + cv2.dft(deconvolution.periodic(padded, top, left))) * factor
-        for (top, left), back, factor, weight in zip(
-            deconvolution.grid.corners(), projected, factors, weights, strict=True
-        )
-    ]
+    spectra = []
+    for (top, left), back, factor, weight in zip(
+        deconvolution.grid.corners(), projected, factors, weights, strict=True
+    ):
+        spectrum = cv2.dft(deconvolution.periodic(padded, top, left))
+        spectra.append(cv2.multiply(cv2.scaleAdd(back, float(weight), spectrum), factor))
     return deconvolution.blend(spectra)
 
 

@@ -6,6 +6,7 @@ Data model: ``observed = apply(sharp) + noise``, with a weight per observed pixe
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ _UNSEEN = 1e-3
 """Added above and below in Richardson-Lucy's update, so that light that no pixel weighs stays as it is."""
 _TABLE_SIZE = 2048
 _TABLE_END = 8.0
+LEVELS_PER_UNIT = 32.0
+"""Steps in which :func:`shrinkage_levels` tabulates."""
 
 
 def richardson_lucy(
@@ -34,6 +37,13 @@ def richardson_lucy(
         ratio = weight * observed / np.maximum(apply(sharp), 1e-4)
         sharp = np.maximum(sharp * np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen, 1e-5)
     return sharp
+
+
+@lru_cache(maxsize=64)
+def shrinkage_levels(beta: float) -> Image:
+    """The factor w / v at |v| = level / LEVELS_PER_UNIT, (256,): for tables over 8-bit levels."""
+    level = np.minimum((np.arange(256) + 0.0) * (_TABLE_SIZE / _TABLE_END / LEVELS_PER_UNIT), _TABLE_SIZE - 1)
+    return shrinkage_table(beta)[level.astype(int)]
 
 
 def shrinkage_table(beta: float, exponent: float = ALPHA) -> Image:

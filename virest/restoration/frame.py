@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +36,6 @@ FULL_TRUST_DB = 0.5
 """From this expected gain on, a restored picture is taken whole."""
 MANY_CLIPPED = 0.003
 """With a larger part of clipped pixels the expected gain says nothing: they are no linear blur."""
-_ENCODE_STEPS = 8192
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,14 +169,19 @@ def unknown_parameters(profile: CameraProfile) -> dict[str, Any]:
 def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> NDArray[np.uint8]:
     """Linear light of the channels to a stored picture (height, width, 3), through a table over the root of light."""
     low, high = curve.light_range
-    roots = np.linspace(0.0, 1.0, _ENCODE_STEPS)
-    table = np.clip(np.rint(curve.encode(low + (high - low) * roots**2) * 255.0), 0, 255).astype(np.uint8)
-    picture = np.empty((*light[0].shape, len(light)), np.uint8)
-    for channel, plane in enumerate(light):
-        part = np.clip((plane - np.float32(low)) * np.float32(1.0 / (high - low)), 0.0, 1.0)
-        index = (np.sqrt(part) * np.float32(_ENCODE_STEPS - 1) + np.float32(0.5)).astype(np.uint16)
-        picture[..., channel] = table[index]
-    return picture
+    part = cv2.merge(light)
+    if (low, high) != (0.0, 1.0):
+        part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
+    root = cv2.sqrt(cv2.max(part, 0.0))
+    return cv2.LUT(cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U), _encoding_table(curve))
+
+
+@lru_cache(maxsize=8)
+def _encoding_table(curve: ResponseCurve) -> NDArray[np.uint8]:
+    """Grey level over 65,536 steps of the root of light; (65536,)."""
+    low, high = curve.light_range
+    grey = curve.encode(low + (high - low) * np.linspace(0.0, 1.0, 65536) ** 2)
+    return np.clip(np.rint(grey * 255.0), 0, 255).astype(np.uint8)
 
 
 def _source_map(

@@ -29,7 +29,7 @@ _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 _ROUNDING_POWER = 1 / 12
 _FIT_STEPS = 6
 _CELLS = 64
-_MAX_TILES = 24
+_MAX_TILES = 16
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _NOISE_SLOPE = 0.7

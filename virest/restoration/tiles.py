@@ -56,8 +56,8 @@ class TileDeconvolution:
         grid, side, margin = self.grid, self.grid.side, self.margin
         result = np.zeros((grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, spectra, strict=True):
-            tile = cv2.idft(spectrum, flags=cv2.DFT_SCALE)
-            result[top : top + side, left : left + side] += window * tile[margin : margin + side, margin : margin + side]
+            tile = cv2.idft(spectrum, flags=cv2.DFT_SCALE)[margin : margin + side, margin : margin + side]
+            cv2.accumulateProduct(window, tile, result[top : top + side, left : left + side])
         return result[: grid.height, : grid.width]
 
     def padded(self, channel: Image, border: int = cv2.BORDER_REPLICATE) -> Image:

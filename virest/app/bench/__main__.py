@@ -62,7 +62,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _versions() -> dict[str, Any]:
     libraries = {name: version(name) for name in LIBRARIES}
-    machine = {"machine": platform.machine(), "cores": len(os.sched_getaffinity(0))}
+    machine = {"machine": platform.machine(), "cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
     return {"virest": __version__, "python": platform.python_version(), **libraries, **machine}
 
 

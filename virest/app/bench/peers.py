@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 from skimage import restoration
 
 from virest.camera.response import ResponseCurve
@@ -21,7 +22,7 @@ from virest.restoration.frame import encode_picture
 from virest.restoration.shutter import rowwise_map, warp
 
 Picture = NDArray[np.uint8]
-Plane = NDArray[np.float64]
+Plane = NDArray[np.float32]
 Deconvolve = Callable[[Plane, Plane, float], Plane]
 ANCHOR = 0.5
 BORDER_RADII = 2
@@ -37,7 +38,7 @@ def _unsupervised_wiener(plane: Plane, psf: Plane, _unused: float) -> Plane:
 
 
 def _richardson_lucy(plane: Plane, psf: Plane, iterations: float) -> Plane:
-    result = restoration.richardson_lucy(np.maximum(plane, 1e-6), psf, num_iter=int(iterations), clip=False)
+    result = restoration.richardson_lucy(np.maximum(plane, np.float32(1e-6)), psf, num_iter=int(iterations), clip=False)
     return np.asarray(result)
 
 
@@ -73,17 +74,14 @@ def peer_deblurred(
     """One picture, each channel's linear light deconvolved with the centre's kernel."""
     psf = centre_psf(motion)
     table = curve.linear_table()
-    light = [
-        deconvolved_inside(lambda p: method(p, psf, setting), table[picture[..., k]].astype(float), psf)
-        for k in range(3)
-    ]
-    return encode_picture([plane.astype(np.float32) for plane in light], curve)
+    light = [deconvolved_inside(lambda p: method(p, psf, setting), table[picture[..., k]], psf) for k in range(3)]
+    return encode_picture([plane.astype(np.float32, copy=False) for plane in light], curve)
 
 
 def centre_psf(motion: RowMotion) -> Plane:
     """Give the true kernel at the picture's centre, zero at mid-exposure, as a convolution takes it."""
     centre = np.array([[(motion.profile.width - 1) / 2, (motion.profile.height - 1) / 2]])
-    kernel = kernel_field(motion, centre, ANCHOR).arrays(positive=True)[0].astype(float)
+    kernel = kernel_field(motion, centre, ANCHOR).arrays(positive=True)[0]
     return kernel[::-1, ::-1] / kernel.sum()
 
 
@@ -95,16 +93,16 @@ def deconvolved_inside(deconvolve: Callable[[Plane], Plane], plane: Plane, psf: 
 
 
 def blended(plane: Plane, border: int) -> Plane:
-    """Widen by ``border`` on all sides: mirror pictures of both edges, blended into each other by a cosine."""
+    """Widen on all sides by at least ``border``: mirror pictures of both edges, blended into each other by a cosine."""
     for axis in (0, 1):
         plane = _blended_rows(plane.swapaxes(0, axis), border).swapaxes(0, axis)
-    return plane
+    return np.ascontiguousarray(plane)
 
 
 def _blended_rows(plane: Plane, border: int) -> Plane:
     """After the last row comes its mirror picture, which fades into the one that leads to the first row."""
-    between = 2 * border
-    part = 0.5 - 0.5 * np.cos(np.pi * (np.arange(between) + 0.5) / between)
+    between = next_fast_len(len(plane) + 2 * border, real=True) - len(plane)
+    part = (0.5 - 0.5 * np.cos(np.pi * (np.arange(between) + 0.5) / between)).astype(plane.dtype)
     after, before = plane[::-1][:between], plane[:between][::-1]
     bridge = (1 - part)[:, None] * after + part[:, None] * before
     return np.roll(np.concatenate([plane, bridge]), border, axis=0)

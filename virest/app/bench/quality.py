@@ -34,8 +34,10 @@ def quality_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     """Measure every frame of every capture. Gains in dB, above ``--deblur none`` and the same warp."""
     rows = []
     for workload in quality_workloads(scale):
-        rows += measure_workload(work, workload)
-        emit(f"measured {workload.name}: {len(rows)} frames so far")
+        found = measure_workload(work, workload)
+        rows += found
+        means = {m: np.mean([row["gain_db"][m] for row in found]) for m in METHODS}
+        emit(f"{workload.name}: " + ", ".join(f"{method} {mean:+.2f}" for method, mean in means.items()))
     summary = summarise(rows)
     return {"frames": rows, "summary": summary}, _text(summary)
 

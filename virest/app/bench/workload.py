@@ -52,33 +52,28 @@ class Workload:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-def _workload(name: str, kind: str, blur_range_px: tuple[float, float], **options: Any) -> Workload:
-    portrait = {"width": 720, "height": 1280} if name.endswith("p") else {"width": 640, "height": 480}
-    return Workload(name, kind, blur_range_px, {"frames": 8, **portrait, **options})
+def _workload(
+    name: str, kind: str, blur_range_px: tuple[float, float], scene: str, exposure_ms: float, rate: float, noise: float
+) -> Workload:
+    portrait = name.endswith("-p")
+    size = {"width": 720, "height": 1280, "frames": 4} if portrait else {"width": 640, "height": 480, "frames": 8}
+    seed = sum(name.encode())
+    motion = {"exposure_ms": exposure_ms, "rate_rad_s": rate, "noise_levels": noise, "seed": seed}
+    return Workload(name, kind, blur_range_px, {"scene": scene, **size, **motion})
 
 
 ORDINARY_PX, LONG_PX = (5.0, 20.0), (15.0, 45.0)
 WORKLOADS = (
-    _workload("leaves", "ordinary", ORDINARY_PX, exposure_ms=14.0, rate_rad_s=2.0, noise_levels=1.5, seed=11),
-    _workload("text", "ordinary", ORDINARY_PX, scene="text", exposure_ms=12, rate_rad_s=2.0, noise_levels=2.0, seed=12),
-    _workload(
-        "board", "ordinary", ORDINARY_PX, scene="board", exposure_ms=14, rate_rad_s=2.0, noise_levels=2.5, seed=13
-    ),
-    _workload("leaves-p", "ordinary", ORDINARY_PX, exposure_ms=10.0, rate_rad_s=1.3, noise_levels=2.5, seed=14),
-    _workload(
-        "text-p", "ordinary", ORDINARY_PX, scene="text", exposure_ms=10, rate_rad_s=1.3, noise_levels=1.5, seed=15
-    ),
-    _workload(
-        "board-p", "ordinary", ORDINARY_PX, scene="board", exposure_ms=10, rate_rad_s=1.3, noise_levels=2.0, seed=16
-    ),
-    _workload("long", "long", LONG_PX, exposure_ms=20.0, rate_rad_s=3.5, noise_levels=4.0, seed=17),
-    _workload("long-p", "long", LONG_PX, scene="text", exposure_ms=20, rate_rad_s=1.8, noise_levels=4.0, seed=18),
-    _workload(
-        "bright", "bright", ORDINARY_PX, scene="bright", exposure_ms=14, rate_rad_s=2.0, noise_levels=2.0, seed=19
-    ),
-    _workload(
-        "bright-p", "bright", ORDINARY_PX, scene="bright", exposure_ms=10, rate_rad_s=1.3, noise_levels=2.0, seed=20
-    ),
+    _workload("leaves", "ordinary", ORDINARY_PX, "leaves", 16.0, 1.4, 1.5),
+    _workload("text", "ordinary", ORDINARY_PX, "text", 16.0, 1.4, 2.0),
+    _workload("board", "ordinary", ORDINARY_PX, "board", 16.0, 1.4, 2.5),
+    _workload("leaves-p", "ordinary", ORDINARY_PX, "leaves", 10.0, 1.2, 2.5),
+    _workload("text-p", "ordinary", ORDINARY_PX, "text", 10.0, 1.2, 1.5),
+    _workload("board-p", "ordinary", ORDINARY_PX, "board", 10.0, 1.2, 2.0),
+    _workload("long", "long", LONG_PX, "leaves", 25.0, 2.2, 4.0),
+    _workload("long-p", "long", LONG_PX, "text", 20.0, 1.6, 4.0),
+    _workload("bright", "bright", ORDINARY_PX, "bright", 16.0, 1.4, 2.0),
+    _workload("bright-p", "bright", ORDINARY_PX, "bright", 10.0, 1.2, 2.0),
 )
 QUICK = ("leaves", "long", "bright")
 
