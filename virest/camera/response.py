@@ -97,11 +97,15 @@ class ResponseCurve:
 
     def censored_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
         """Which of the 256 grey levels carry no measured light: at or beyond A and D, (256,)."""
-        low, high = (self.encode(np.array(self.light_range)) * 255.0).tolist()
-        levels = np.arange(256)
-        above = levels >= min(high, 255.0) - margin_levels
+        low = float(self.encode(np.array(self.light_range[0]))) * 255.0
         dead_zone = self.light_range[0] > 1e-3
-        return (levels <= low + margin_levels) | above if dead_zone else above
+        clipped = self.clipped_table(margin_levels)
+        return (np.arange(256) <= low + margin_levels) | clipped if dead_zone else clipped
+
+    def clipped_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
+        """Which of the 256 grey levels are at or beyond D: light of any strength, (256,)."""
+        high = float(self.encode(np.array(self.light_range[1]))) * 255.0
+        return np.arange(256) >= min(high, 255.0) - margin_levels
 
     def describe(self) -> str:
         """A short name for tables and logs."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,26 +73,16 @@ def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_de
     Computed on a grid and filled in by straight lines; the map is smooth, so this is off by less than 0.01 px.
     """
     width, height = motion.profile.width, motion.profile.height
-    x, y = _grid(width, spacing_px), _grid(height, spacing_px)
-    nodes = np.stack(np.meshgrid(x, y), -1)
+    nodes = np.stack(np.meshgrid(_nodes(width, spacing_px), _nodes(height, spacing_px)), -1)
     source = recorded_points(motion, nodes, anchor, inverse_depth).astype(np.float32)
-    rows, columns = _line_weights(y, height), _line_weights(x, width)
-    return np.stack([rows @ source[..., k] @ columns.T for k in (0, 1)], -1)
+    size = (source.shape[1] * spacing_px, source.shape[0] * spacing_px)
+    filled = cv2.resize(source, size, interpolation=cv2.INTER_LINEAR)
+    return filled[spacing_px : spacing_px + height, spacing_px : spacing_px + width]
 
 
-def _grid(length: int, spacing: int) -> Array:
-    return np.linspace(0, length - 1, max(2, round((length - 1) / spacing) + 1))
-
-
-def _line_weights(nodes: Array, length: int) -> NDArray[np.float32]:
-    """(length, n) weights of straight-line interpolation from nodes to 0, 1, ..., length − 1."""
-    position = np.arange(length) / (nodes[1] - nodes[0])
-    index = np.minimum(position.astype(int), len(nodes) - 2)
-    part = position - index
-    weights = np.zeros((length, len(nodes)), np.float32)
-    weights[np.arange(length), index] = 1 - part
-    weights[np.arange(length), index + 1] = part
-    return weights
+def _nodes(length: int, spacing: int) -> Array:
+    """Middles of cells of ``spacing`` pixels over 0 ... length − 1, and of one more cell on both sides."""
+    return (np.arange(-1, int(np.ceil(length / spacing)) + 1) + 0.5) * spacing - 0.5
 
 
 def _lens(motion: RowMotion) -> Intrinsics:

@@ -42,8 +42,10 @@ class BlurredPicture:
     """Linear light of each channel, (height, width)."""
     slope: Image
     """Grey levels per unit of light, smoothed over the neighbourhood, (height, width, 3)."""
-    censored: list[Image | None]
-    """1.0 where a channel's light could not be measured; None: nowhere."""
+    dark: list[Image | None]
+    """1.0 where a channel's light was too little to be measured; None: nowhere."""
+    clipped: list[Image | None]
+    """1.0 where a channel's light was too much to be measured; None: nowhere."""
     statistics: PictureStatistics
     """Of the luma."""
     chroma: PictureStatistics
@@ -65,17 +67,25 @@ def blurred_picture(
     reach = 2 * int(np.ceil(longest_px / 2)) + 3
     smooth = cv2.blur(picture, (reach, reach))
     slope = cv2.LUT(smooth, curve.slope_table())
-    censored = [_censored(channel, curve) for channel in cv2.split(picture)]
-    return BlurredPicture(light, slope, censored, *statistics, field, longest_px)
+    channels = cv2.split(picture)
+    dark = [_dark(channel, curve) for channel in channels]
+    clipped = [_clipped(channel, curve) for channel in channels]
+    return BlurredPicture(light, slope, dark, clipped, *statistics, field, longest_px)
 
 
-def _censored(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
+def _dark(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
+    """1.0 where the channel is below the curve's A."""
+    dark = cv2.LUT(channel, (curve.censored_table() & ~curve.clipped_table()).astype(np.uint8))
+    return dark.astype(np.float32) if dark.any() else None
+
+
+def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
     """1.0 where the channel is clipped, and where its neighbours are and the codec has pulled it down a little."""
-    clipped = cv2.LUT(channel, curve.censored_table(CLIPPED_LEVELS).astype(np.uint8))
+    clipped = cv2.LUT(channel, curve.clipped_table(CLIPPED_LEVELS).astype(np.uint8))
     if not clipped.any():
         return None
     near = cv2.dilate(clipped, np.ones((5, 5), np.uint8))
-    return (near & cv2.LUT(channel, curve.censored_table(PULLED_DOWN_LEVELS).astype(np.uint8))).astype(np.float32)
+    return (near & cv2.LUT(channel, curve.clipped_table(PULLED_DOWN_LEVELS).astype(np.uint8))).astype(np.float32)
 
 
 def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
@@ -172,8 +182,8 @@ def _from_opponents(planes: list[Image]) -> list[Image]:
 
 
 def _streaks(blurred: BlurredPicture) -> Image | None:
-    """1 where a censored pixel's light may have gone or come from along the blur path, falling to 0 around it."""
-    masks = [c for c in blurred.censored if c is not None]
+    """1 where a clipped pixel's light may have gone or come from along the blur path, falling to 0 around it."""
+    masks = [c for c in blurred.clipped if c is not None]
     if not masks:
         return None
     return cv2.GaussianBlur(cv2.dilate(np.maximum.reduce(masks), _path_reach(blurred)), (0, 0), 1.5)
@@ -195,15 +205,19 @@ def _without_streaks(light: list[Image], streaks: Image | None) -> list[Image]:
 
 
 def _filled_in(plane: Image, known: Image) -> Image:
-    """Weighted means of what is known, over wider and wider neighbourhoods."""
-    filled, weight = plane * known, known
-    for side in (5, 15, 45, 135):
+    """Weighted means of what is known, over wider and wider neighbourhoods, at half the size."""
+    height, width = plane.shape
+    size = ((width + 1) // 2, (height + 1) // 2)
+    weight = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
+    filled = cv2.resize(plane * known, size, interpolation=cv2.INTER_AREA)
+    for side in (3, 9, 27, 81):
         near = cv2.blur(weight, (side, side))
         reached = near > 1e-2
         mean = np.where(reached, cv2.blur(filled, (side, side)) / np.maximum(near, 1e-2), 0)
         filled = filled + (1 - weight) * mean
         weight = np.where(reached, np.float32(1), weight)
-    return filled
+    smooth = cv2.resize(filled.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return plane * known + (1 - known) * smooth
 
 
 def _with_streaks(sharp: list[Image], light: list[Image], streaks: Image | None) -> list[Image]:
@@ -320,8 +334,8 @@ def _extended(channel: Image, border: int) -> Image:
 def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
     operator = _whole_operator(blurred, positive=True)
     sharp = []
-    for light, censored in zip(blurred.light, blurred.censored, strict=True):
-        weight = np.ones_like(light) if censored is None else 1 - censored
+    for light, dark, clipped in zip(blurred.light, blurred.dark, blurred.clipped, strict=True):
+        weight = np.ones_like(light) - sum(mask for mask in (dark, clipped) if mask is not None)
         start = _extended(light, operator.border)
         result = richardson_lucy(light, operator.apply, operator.adjoint, start, weight, settings.iterations)
         sharp.append(_inner(result, operator.border))
@@ -333,16 +347,10 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
     operator = _whole_operator(blurred)
     statistics = blurred.statistics
     first = _by_tile_hyper_laplacian(blurred, replace(settings, iterations=4))
-    reach = _path_reach(blurred) if any(c is not None for c in blurred.censored) else None
+    reach = _path_reach(blurred) if any(c is not None for c in blurred.clipped) else None
     sharp = []
-    for light, slope, censored, start in zip(
-        blurred.light, cv2.split(blurred.slope), blurred.censored, first, strict=True
-    ):
-        weight, bound = slope, None
-        if censored is not None and reach is not None:
-            bound = cv2.erode(censored, reach)
-            unseen = cv2.dilate(censored, np.ones((3, 3), np.uint8)) - bound
-            weight = slope * (1 - unseen)
+    for channel, (light, slope, start) in enumerate(zip(blurred.light, cv2.split(blurred.slope), first, strict=True)):
+        weight, bound = _data_weight(slope, blurred.dark[channel], blurred.clipped[channel], reach)
         result = hyper_laplacian(
             light,
             operator.apply,
@@ -359,6 +367,18 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
         inner = _inner(result, operator.border)
         sharp.append(inner if bound is None else np.where(bound > 0, np.maximum(inner, light), inner))
     return sharp
+
+
+def _data_weight(
+    slope: Image, dark: Image | None, clipped: Image | None, reach: NDArray[np.uint8] | None
+) -> tuple[Image, Image | None]:
+    """Weight of each pixel's light, and where it is only a lower bound: all along the blur path is clipped there."""
+    weight = slope if dark is None else slope * (1 - dark)
+    if clipped is None or reach is None:
+        return weight, None
+    bound = cv2.erode(clipped, reach)
+    unseen = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) - bound
+    return weight * (1 - unseen), bound
 
 
 def _inner(picture: Image, border: int) -> Image:

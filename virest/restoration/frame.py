@@ -217,7 +217,7 @@ def _deblurred(
     height, width = picture.shape[:2]
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
     luma, chroma = measure_picture(picture, samples)
-    clipped = bool(np.mean(curve.censored_table()[picture]) > MANY_CLIPPED)
+    clipped = bool(np.mean(cv2.LUT(picture, curve.clipped_table().astype(np.uint8))) > MANY_CLIPPED)
     if not luma.measured:
         return picture, {"method": "none"}, ("picture too small for its blur to be measured, left alone",)
     if luma.expected_gain_db < MIN_GAIN_DB and not clipped:

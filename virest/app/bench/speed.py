@@ -20,6 +20,8 @@ from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recor
 FRAMES = {"fast": 60, "balanced": 40, "best": 10}
 QUICK_FRAMES = {"fast": 20, "balanced": 10, "best": 5}
 JOBS = 2
+PEER_TRIES = 2
+"""The quicker one counts."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 PEER_SETTINGS = {"wiener": 0.1, "unsupervised_wiener": 0.0, "richardson_lucy": 30}
 
@@ -62,9 +64,12 @@ def _time_peers(work: Path) -> dict[str, float]:
     number, picture = next(recorded_frames(capture))
     seconds = {}
     for name, (method, _) in PEERS.items():
-        began = time.perf_counter()
-        peer_deblurred(method, PEER_SETTINGS[name], picture, motions[number], curve)
-        seconds[name] = time.perf_counter() - began
+        tries = []
+        for _ in range(PEER_TRIES):
+            began = time.perf_counter()
+            peer_deblurred(method, PEER_SETTINGS[name], picture, motions[number], curve)
+            tries.append(time.perf_counter() - began)
+        seconds[name] = min(tries)
     return seconds
 
 

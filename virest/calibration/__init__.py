@@ -1,0 +1,1 @@
+"""Fit the phone: what its pictures say about its response curve and its geometry."""
