@@ -102,7 +102,6 @@ class CameraProfile:
         """The profile with fields changed and the change's origin noted."""
         return replace(self, estimates={**self.estimates, name: Estimate(value, std, source)}, **changes)
 
-
     def with_focal(self, focal_px: float, std_px: float, source: str) -> CameraProfile:
         """The profile with an estimated focal length, square pixels and the principal point in the middle."""
         lens = Intrinsics(self.width, self.height, focal_px, focal_px, (self.width - 1) / 2, (self.height - 1) / 2)
@@ -302,7 +301,9 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "cannot be read"
-        raise SettingsError(f"{path.name}:{where} is not plain YAML: {problem}", hint="see the profile in README") from None
+        raise SettingsError(
+            f"{path.name}:{where} is not plain YAML: {problem}", hint="see the profile in README"
+        ) from None
     except (UnicodeDecodeError, RecursionError, ValueError):
         raise SettingsError(f"{path.name}: is not YAML text", hint="is it a profile?") from None
     except OSError as error:
@@ -338,7 +339,9 @@ def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfi
 def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
     """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
     first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
-    path = [str(part) for part in first["loc"] if not str(part).startswith(("_", "literal", "function-", "constrained"))]
+    path = [
+        str(part) for part in first["loc"] if not str(part).startswith(("_", "literal", "function-", "constrained"))
+    ]
     where = _printable(".".join(path))
     if first["type"] == "extra_forbidden":
         known = _keys_at(model, path[:-1])
@@ -395,8 +398,8 @@ def _from_model(model: _Profile) -> CameraProfile:
         p_cam_imu_m=tuple(pose[:3, 3].tolist()),
         time_offset_s=model.imu.time_offset_s,
         clock_skew=model.imu.clock_skew,
-        gyro_bias_rad_s=tuple(model.imu.gyro_bias_rad_s),
-        gyro_scale=tuple(model.imu.gyro_scale),
+        gyro_bias_rad_s=_triple(model.imu.gyro_bias_rad_s),
+        gyro_scale=_triple(model.imu.gyro_scale),
         response=response,
         sensor_width_mm=model.sensor.width_mm,
         sensor_height_mm=model.sensor.height_mm,
@@ -417,6 +420,14 @@ def _from_model(model: _Profile) -> CameraProfile:
             defocus_sigma_px=extensions.defocus.sigma_px,
         ),
     )
+
+
+def _triple(values: list[float]) -> tuple[float, float, float]:
+    return values[0], values[1], values[2]
+
+
+def _pair(values: list[float]) -> tuple[float, float]:
+    return values[0], values[1]
 
 
 def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -459,8 +470,8 @@ def _response(block: _Response | None, extensions: _Extensions) -> ResponseCurve
     return ResponseCurve(
         block.kind,
         block.gamma,
-        tuple(block.b or (0.0, 0.0)),
-        tuple(block.c or (1.0, 1.0)),
+        _pair(block.b or [0.0, 0.0]),
+        _pair(block.c or [1.0, 1.0]),
         block.y_max,
         tuple(block.x or ()),
         tuple(block.y or ()),
@@ -555,7 +566,9 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
 
 def format_profile(profile: CameraProfile) -> str:
     """The profile as YAML text; reading it back gives the same profile."""
-    return yaml.safe_dump(profile_mapping(profile), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+    return yaml.safe_dump(
+        profile_mapping(profile), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
+    )
 
 
 def write_profile(profile: CameraProfile, path: Path) -> None:

@@ -51,9 +51,7 @@ class KernelField:
         return splat_paths(self.paths_px, radius_px or self.radius_px, _linear_taps if positive else _cubic_taps)
 
 
-def kernel_field(
-    motion: RowMotion, centres_px: Array, anchor: float = 0.5, inverse_depth: Any = 0.0
-) -> KernelField:
+def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inverse_depth: Any = 0.0) -> KernelField:
     """Blur paths of the tiles centred at pixels (n, 2), exact to the rows' own times on both sides."""
     chord = np.linalg.norm(blur_chords(motion, centres_px, inverse_depth), axis=-1).max(initial=0.0)
     samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_PX * 1.3 * chord)))

@@ -90,7 +90,8 @@ def row_motion(
     reference_s = start_s + (0.5 * (readout_s + exposure_s) if reference == "frame-middle" else 0.0)
     first_s = start_s - OUTSIDE_FRACTION * readout_s - STEP_S
     last_s = start_s + (1 + OUTSIDE_FRACTION) * readout_s + exposure_s + STEP_S
-    time_s = first_s + STEP_S * np.arange(int(np.ceil((last_s - first_s) / STEP_S)) + 2)
+    steps = np.arange(int(np.ceil((last_s - first_s) / STEP_S)) + 2, dtype=np.float64)
+    time_s = first_s + STEP_S * steps
     r_world_ref = trajectory.orientation(reference_s)
     r_world_t = trajectory.orientation(time_s)
     r_t_ref = np.swapaxes(r_world_t, -1, -2) @ r_world_ref

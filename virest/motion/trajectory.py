@@ -24,7 +24,7 @@ class Trajectory:
     rotation_world_cam: Array
     """(n, 3, 3) at the knots."""
     rate_polynomials: Array
-    """(4, n - 1, 3) camera-frame rate in rad/s, highest power first, in the time since the knot (scipy's PPoly order)."""
+    """(4, n - 1, 3) camera-frame rate in rad/s, highest power first, in the time since the knot."""
 
     @property
     def span_s(self) -> tuple[float, float]:

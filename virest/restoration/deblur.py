@@ -128,9 +128,7 @@ def _filtered(deconvolution: tiles.TileDeconvolution, plane: Image, factors: lis
     return deconvolution.blend([np.multiply(s, f, out=s) for s, f in zip(spectra, factors, strict=True)])
 
 
-def _filtered_colour(
-    blurred: BlurredPicture, differences: list[Image], settings: RestorationSettings
-) -> list[Image]:
+def _filtered_colour(blurred: BlurredPicture, differences: list[Image], settings: RestorationSettings) -> list[Image]:
     """The colour differences, filtered at half size: a movie stores no more of them."""
     height, width = differences[0].shape
     deconvolution = _tile_deconvolution(blurred, settings.tile_px, COLOUR_SCALE)
@@ -246,13 +244,9 @@ def _tile_hyper_laplacian(blurred: BlurredPicture, plane: Image, settings: Resto
     sharp = deconvolution.blend([s * f for s, f in zip(projected, first, strict=True)])
     scale = blurred.slope[..., 1] * np.float32(1.0 / unit)
     for beta in _beta_schedule(settings.iterations):
-        inverse = np.float32(1.0 / beta)
-        factors = deconvolution.filters(
-            lambda power, w=trust * inverse: 1.0 / (power * w + gradients),
-            lambda power, w=guarded * inverse: 1.0 / (power * w + gradients),
-        )
+        weights = [(guarded if border else trust) / np.float32(beta) for border in deconvolution.at_border]
+        factors = [1.0 / (p * w + gradients) for p, w in zip(deconvolution.powers, weights, strict=True)]
         pull = _gradient_targets(sharp, scale, shrinkage_levels(beta))
-        weights = [(guarded if border else trust) * inverse for border in deconvolution.at_border]
         sharp = _tile_solve(deconvolution, projected, pull, factors, weights)
     if settings.iterations > 2:
         sharp += _returned_residual(deconvolution, projected, sharp, statistics)
@@ -299,7 +293,11 @@ def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:
 
 
 def _tile_solve(
-    deconvolution: tiles.TileDeconvolution, projected: list[Image], pull: Image, factors: list[Image], weights: list[np.float32]
+    deconvolution: tiles.TileDeconvolution,
+    projected: list[Image],
+    pull: Image,
+    factors: list[Image],
+    weights: list[np.float32],
 ) -> Image:
     padded = deconvolution.padded(pull, cv2.BORDER_CONSTANT)
     spectra = []

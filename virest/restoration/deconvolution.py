@@ -11,7 +11,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-
 Image = NDArray[np.float32]
 Operator = Callable[[Image], Image]
 ALPHA = 2.0 / 3.0
@@ -31,11 +30,11 @@ def richardson_lucy(
 
     f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.
     """
-    sharp = np.maximum(start, 1e-4)
+    sharp: Image = np.maximum(start, np.float32(1e-4))
     seen = adjoint(weight) + _UNSEEN
     for _ in range(iterations):
-        ratio = weight * observed / np.maximum(apply(sharp), 1e-4)
-        sharp = np.maximum(sharp * np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen, 1e-5)
+        ratio = weight * observed / np.maximum(apply(sharp), np.float32(1e-4))
+        sharp = np.maximum(sharp * np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen, np.float32(1e-5))
     return sharp
 
 
@@ -90,7 +89,7 @@ def difference_adjoint(gradient: Image, axis: int) -> Image:
 
 
 def conjugate_gradients(normal: Operator, right: Image, start: Image, precondition: Image, iterations: int) -> Image:
-    """Solve normal(x) = right for a symmetric positive operator; ``precondition`` is an approximate inverse diagonal."""
+    """Solve normal(x) = right for a symmetric positive operator; precondition: about its inverse diagonal."""
     x = start.copy()
     residual = right - normal(x)
     direction = precondition * residual

@@ -138,7 +138,11 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: 
 
 
 def copied_frame(
-    frame: Frame, picture: NDArray[np.uint8], profile: CameraProfile, reason: str, parameters: dict[str, Any] | None = None
+    frame: Frame,
+    picture: NDArray[np.uint8],
+    profile: CameraProfile,
+    reason: str,
+    parameters: dict[str, Any] | None = None,
 ) -> RestoredFrame:
     """The decoded pixels unchanged, and why."""
     height, width = picture.shape[:2]

@@ -37,7 +37,8 @@ def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int,
     """(x0, y0, x1, y1), x1 and y1 one past the end: a large rectangle whose every pixel was recorded.
 
     Its sides move in from the picture's own, always the one with the largest part of missing pixels.  The map is
-    smooth, so every ``step``-th pixel is looked at; the rectangle begins and ends on such pixels.  All 0 where there is none.
+    smooth, so every ``step``-th pixel is looked at; the rectangle begins and ends on such pixels.
+    All 0 where there is none.
     """
     height, width = source_px.shape[:2]
     columns, rows = _every(width, step), _every(height, step)

@@ -150,7 +150,9 @@ def _ring_index(side: int) -> NDArray[np.intp]:
     fy, fx = np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :]
     radius = np.hypot(fx, fy)
     ring = (radius / 0.5 * RINGS).astype(np.intp)
-    return np.where((radius < 0.5) & (radius > 2.5 / side) & (np.abs(fx) > 1.5 / side) & (np.abs(fy) > 1.5 / side), ring, RINGS)
+    return np.where(
+        (radius < 0.5) & (radius > 2.5 / side) & (np.abs(fx) > 1.5 / side) & (np.abs(fy) > 1.5 / side), ring, RINGS
+    )
 
 
 def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> PictureStatistics:
@@ -160,9 +162,10 @@ def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> Pi
 
     def per_cell(values: NDArray[np.float32] | None) -> Array:
         weights = None if values is None else values.ravel()
-        return np.bincount(cell, weights, (RINGS + 1) * _CELLS)[: RINGS * _CELLS].reshape(RINGS, _CELLS)
+        sums = np.bincount(cell, weights, (RINGS + 1) * _CELLS).astype(np.float64)
+        return sums[: RINGS * _CELLS].reshape(RINGS, _CELLS)
 
-    count = per_cell(None).astype(float)
+    count = per_cell(None)
     g, k = (per_cell(v) / np.maximum(count, 1) for v in (observed, passed))
     in_ring = np.maximum(count.sum(1), 1)
     mean_k, mean_g = (count * k).sum(1) / in_ring, (count * g).sum(1) / in_ring
@@ -231,5 +234,3 @@ def on_spectrum(
 def _bessel_j0(x: Array) -> Array:
     angle = (np.arange(64) + 0.5) * np.pi / 64
     return np.cos(x[:, None] * np.sin(angle)).mean(axis=1)
-
-

@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.degradation.blur import Image, TileGrid, fast_size
 
@@ -28,7 +27,10 @@ class TileDeconvolution:
         self.patch = grid.side + 2 * margin
         self.size = fast_size(self.patch + max(8, self.patch // 16))
         self.at_border = [
-            top < margin or left < margin or top + grid.side > grid.height - margin or left + grid.side > grid.width - margin
+            top < margin
+            or left < margin
+            or top + grid.side > grid.height - margin
+            or left + grid.side > grid.width - margin
             for top, left in grid.corners()
         ]
         self._windows = grid.windows()
@@ -87,7 +89,7 @@ class TileDeconvolution:
 
 def _bridge(length: int) -> Image:
     rise = (np.arange(length, dtype=np.float32) + 1) / (length + 1)
-    return rise * rise * (3 - 2 * rise)
+    return (rise * rise * (3 - 2 * rise)).astype(np.float32)
 
 
 def doubled(packed: Image) -> Image:
@@ -114,7 +116,7 @@ def gradient_power(size: int) -> Image:
 
 def inverse_filter(power: Image, floor: float = 1e-3) -> Image:
     """1 / |K|², held where |K| falls below the square root of ``floor``: the naive inverse, for comparison."""
-    return 1.0 / np.maximum(power, floor)
+    return np.float32(1) / np.maximum(power, np.float32(floor))
 
 
 def wiener_filter(power: Image, noise_to_signal: Image) -> Image:

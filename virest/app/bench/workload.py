@@ -46,7 +46,7 @@ class Workload:
 
     name: str
     kind: str
-    """``ordinary``, ``long`` or ``bright``."""
+    """``ordinary``, ``fine``, ``long`` or ``bright``."""
     blur_range_px: tuple[float, float]
     """Frames whose blur at the centre lies in here count in the means; all count in the minimum."""
     options: dict[str, Any] = field(default_factory=dict)
@@ -59,9 +59,12 @@ def _workload(
     size = {"width": 720, "height": 1280, "frames": 4} if portrait else {"width": 640, "height": 480, "frames": 8}
     seed = sum(name.encode())
     motion = {"exposure_ms": exposure_ms, "rate_rad_s": rate, "noise_levels": noise, "seed": seed}
-    return Workload(name, kind, blur_range_px, {"scene": scene, **size, **motion})
+    coder = {"bitrate_bits_per_px": FINE_BITS} if kind == "fine" else {}
+    return Workload(name, kind, blur_range_px, {"scene": scene, **size, **motion, **coder})
 
 
+FINE_BITS = 1.0
+"""Bits per pixel of the captures whose coder is to take little away; the recorder's own rate is 0.25."""
 ORDINARY_PX, LONG_PX = (5.0, 20.0), (15.0, 45.0)
 WORKLOADS = (
     _workload("leaves", "ordinary", ORDINARY_PX, "leaves", 16.0, 1.4, 1.5),
@@ -70,6 +73,8 @@ WORKLOADS = (
     _workload("leaves-p", "ordinary", ORDINARY_PX, "leaves", 10.0, 1.2, 2.5),
     _workload("text-p", "ordinary", ORDINARY_PX, "text", 10.0, 1.2, 1.5),
     _workload("board-p", "ordinary", ORDINARY_PX, "board", 10.0, 1.2, 2.0),
+    _workload("leaves-fine", "fine", ORDINARY_PX, "leaves", 16.0, 1.4, 1.5),
+    _workload("text-fine-p", "fine", ORDINARY_PX, "text", 10.0, 1.2, 2.0),
     _workload("long", "long", LONG_PX, "leaves", 25.0, 2.2, 4.0),
     _workload("long-p", "long", LONG_PX, "text", 20.0, 1.6, 4.0),
     _workload("bright", "bright", ORDINARY_PX, "bright", 16.0, 1.4, 2.0),

@@ -1,0 +1,281 @@
+"""From a bracket of pictures to samples: the same places of the scene, seen at every exposure.
+
+Pictures are aligned by what exposure does not change, the rank of each pixel among its picture's greys (in the manner
+of Ward 2003, "Fast, robust image registration for compositing high dynamic range photographs from hand-held exposures",
+doi:10.1080/10867651.2003.10487583, whose median threshold bitmaps are ranks of one bit).  Samples are means over small
+flat squares, spread over the picture and over its brightnesses; squares on edges are left out, since there the smallest
+misalignment counts as light.  The three channels are pooled: one curve stands for all, as in the camera profile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.errors import CalibrationError
+
+Array = NDArray[np.float64]
+MAX_SHIFT_PX = 8.0
+MIN_GAIN = 0.1
+"""A shift counts if it takes this share of the difference between two pictures away."""
+RIGID_PX = 1.5
+CANDIDATES = 9000
+SITES = 900
+MIN_SITES = 40
+MIN_SHARED = 25
+"""Samples that two pictures must both see unclipped, so that their exposures can be compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class BracketPicture:
+    """One picture, as listed."""
+
+    file: str
+    levels: NDArray[Any]
+    """(h, w, 3), 0 to 255."""
+    exposure: float
+    """Listed light, in any unit that the bracket shares."""
+
+
+@dataclass(frozen=True, slots=True)
+class BracketSamples:
+    """Greys of the same places in every picture."""
+
+    grey: Array
+    """(samples, pictures), mean levels of small squares, 0 to 255."""
+    site: NDArray[np.int64]
+    """(samples,) which place of the picture; the channels of one place share it."""
+    exposure: Array
+    """(pictures,) listed light."""
+    low: float
+    """Greys at or below are censored: black, or noise cut off there."""
+    high: float
+    """Greys at or above are censored: clipped, or on the curve's plateau."""
+    top: float
+    """The brightest grey seen, robustly."""
+    noise: tuple[float, float]
+    """(a, b): variance of a sample a + b grey, levels squared."""
+    shifts_px: Array
+    """(pictures, 2) how far the scene lies to the right and below of where the first picture has it."""
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(samples, pictures): not censored."""
+        return (self.grey > self.low) & (self.grey < self.high)
+
+    @property
+    def sigma(self) -> Array:
+        """(samples, pictures) standard deviation of each grey."""
+        return np.sqrt(self.noise[0] + self.noise[1] * self.grey)
+
+    def take(self, rows: NDArray[Any]) -> BracketSamples:
+        """Some of the samples."""
+        return BracketSamples(self.grey[rows], self.site[rows], self.exposure, self.low, self.high, self.top,
+                              self.noise, self.shifts_px)  # fmt: skip
+
+    def keep_pictures(self, keep: NDArray[Any]) -> BracketSamples:
+        """Some of the pictures."""
+        return BracketSamples(self.grey[:, keep], self.site, self.exposure[keep], self.low, self.high, self.top,
+                              self.noise, self.shifts_px[keep])  # fmt: skip
+
+
+def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator) -> BracketSamples:
+    """Align the pictures and sample them.
+
+    Raises CalibrationError where they are shifted by more than MAX_SHIFT_PX or not rigidly, have no flat places, or
+    are clipped throughout.
+    """
+    shifts_px = align_pictures(pictures)
+    height, width = pictures[0].levels.shape[:2]
+    half = 2 if height * width > 300_000 else 1
+    centres = _candidates(height, width, half + int(np.ceil(np.abs(shifts_px).max())) + 1, rng)
+    channels = 1 if _is_grey(pictures) else 3
+    means, variances = _squares(pictures, centres, shifts_px, half, channels)
+    low, high, top, noise = _limits(means, variances, (2 * half + 1) ** 2)
+    measured = (means > low) & (means < high)
+    if not measured.any(axis=1).any():
+        text = f"all {len(pictures)} pictures are clipped throughout"
+        raise CalibrationError(text, hint="take exposures at which the scene is neither black nor white")
+    keep = _flat_sites(means, variances, measured, noise, (2 * half + 1) ** 2)
+    chosen = _spread_sites(means[:, :, keep], measured[:, :, keep], keep, rng)
+    grey = means[:, :, chosen].transpose(2, 0, 1).reshape(-1, len(pictures))
+    site = np.repeat(np.arange(len(chosen)), channels)
+    exposure = np.array([p.exposure for p in pictures], np.float64)
+    samples = BracketSamples(grey, site, exposure, low, high, top, noise, shifts_px)
+    seen = samples.measured.sum(axis=1) >= 2
+    if len(np.unique(site[seen])) < MIN_SITES:
+        text = f"only {len(np.unique(site[seen]))} flat places are unclipped in two pictures, {MIN_SITES} are needed"
+        raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, of a scene with flat areas")
+    return samples.take(seen)
+
+
+def _is_grey(pictures: Sequence[BracketPicture]) -> bool:
+    part = pictures[len(pictures) // 2].levels[::7, ::7]
+    return bool((part[..., 0] == part[..., 1]).all() and (part[..., 0] == part[..., 2]).all())
+
+
+def _candidates(height: int, width: int, margin: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Places on a jittered grid, (n, 2) x y."""
+    if min(height, width) < 2 * margin + 8:
+        raise CalibrationError(f"pictures of {width}x{height} px are too small", hint="take larger ones")
+    step = max(2.0 * (margin > 3) + 1.0, np.sqrt(height * width / CANDIDATES))
+    grid = np.stack(np.meshgrid(np.arange(margin, width - margin, step), np.arange(margin, height - margin, step)), -1)
+    places = grid.reshape(-1, 2) + rng.uniform(0, step, (grid.shape[0] * grid.shape[1], 2))
+    return np.clip(places, margin, [width - margin - 1, height - margin - 1]).astype(np.int64)
+
+
+def _squares(
+    pictures: Sequence[BracketPicture], centres: NDArray[np.int64], shifts_px: Array, half: int, channels: int
+) -> tuple[Array, Array]:
+    """Mean and variance of the square round each place, (channels, pictures, places)."""
+    span = np.arange(-half, half + 1)
+    means = np.empty((channels, len(pictures), len(centres)))
+    variances = np.empty_like(means)
+    for n, picture in enumerate(pictures):
+        x, y = (centres + np.rint(shifts_px[n]).astype(int)).T
+        rows, columns = y[:, None, None] + span[:, None], x[:, None, None] + span[None, :]
+        patch = picture.levels[rows, columns, :channels].astype(np.float32).reshape(len(centres), -1, channels)
+        means[:, n] = patch.mean(axis=1).T
+        variances[:, n] = patch.var(axis=1, ddof=1).T
+    return means, variances
+
+
+def _limits(means: Array, variances: Array, pixels: int) -> tuple[float, float, float, tuple[float, float]]:
+    """Censoring limits, the brightest grey, and the noise of a square's mean, from the flattest squares by grey."""
+    inside = (means > 8) & (means < 247)
+    a, b = 1.0, 0.0
+    if inside.sum() > 200:
+        greys, spread = means[inside], variances[inside]
+        bins = np.digitize(greys, np.linspace(8, 247, 13))
+        points = [(greys[bins == i].mean(), np.quantile(spread[bins == i], 0.2)) for i in np.unique(bins)
+                  if (bins == i).sum() >= 15]  # fmt: skip
+        x, y = np.array(points).T if len(points) > 1 else (np.array([0.0, 255.0]), np.array([1.0, 1.0]))
+        b = float(np.clip(np.polyfit(x, y, 1)[0], 0.0, 1.0)) if len(x) > 2 else 0.0
+        a = float(np.clip(np.median(y - b * x), 0.05, 400.0))
+    margin = float(np.clip(3.0 * np.sqrt(a + 128 * b), 2.0, 12.0))
+    bottom, top = np.quantile(means, [0.001, 0.999])
+    # the floor keeps rounding of the levels, which neighbours share, from counting as precision
+    noise = (a / pixels + 0.15**2, b / pixels)
+    return float(bottom) + margin, float(top) - margin, float(top), noise
+
+
+def _flat_sites(
+    means: Array, variances: Array, measured: NDArray[np.bool_], noise: tuple[float, float], pixels: int
+) -> NDArray[np.int64]:
+    """Indices of the flatter half of the places, judged where they are not clipped, against the noise there."""
+    expected = pixels * (noise[0] + noise[1] * means)
+    excess = np.where(measured, variances / expected, 0.0).max(axis=(0, 1))
+    seen = np.flatnonzero((measured.sum(axis=1) >= 2).any(axis=0))
+    if not len(seen):
+        text = "no place is unclipped in two pictures"
+        raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, at most 3 EV apart")
+    return seen[excess[seen] <= max(np.quantile(excess[seen], 0.5), 2.0)]
+
+
+def _spread_sites(
+    means: Array, measured: NDArray[np.bool_], keep: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """SITES of the places, as many from each of 24 classes of brightness as there are."""
+    brightness = means.mean(axis=(0, 1)) + 0.0 * measured.any()
+    edges = np.linspace(brightness.min(), brightness.max() + 1e-6, 25)
+    classes = np.digitize(brightness, edges)
+    order = rng.permutation(len(keep))
+    rank = np.empty(len(keep), np.int64)
+    for number in np.unique(classes):
+        members = order[classes[order] == number]
+        rank[members] = np.arange(len(members))
+    return np.sort(keep[np.argsort(rank, kind="stable")[:SITES]])
+
+
+# ── alignment ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def align_pictures(pictures: Sequence[BracketPicture]) -> Array:
+    """(pictures, 2): how far each picture's scene is shifted right and down against the first picture's, in pixels.
+
+    Neighbours in exposure are compared by rank within the greys that neither clips; a shift counts where it explains
+    the difference.  Raises CalibrationError beyond MAX_SHIFT_PX, and where parts of the picture move differently.
+    """
+    order = np.argsort([p.exposure for p in pictures], kind="stable")
+    shifts = np.zeros((len(pictures), 2))
+    step = 2 if pictures[0].levels.shape[0] * pictures[0].levels.shape[1] > 500_000 else 1
+    green = [_small_green(pictures[i].levels, step) for i in order]
+    for n in range(1, len(order)):
+        shift = step * _shift_between(green[n - 1], green[n], pictures[order[n - 1]].file, pictures[order[n]].file)
+        shifts[order[n]] = shifts[order[n - 1]] + shift
+    shifts -= shifts[0]
+    furthest = int(np.argmax(np.hypot(*(shifts - np.median(shifts, axis=0)).T)))
+    _require_small(float(np.hypot(*(shifts[furthest] - np.median(shifts, axis=0)))), pictures[furthest].file)
+    return shifts
+
+
+def _require_small(size_px: float, file: str) -> None:
+    if size_px > MAX_SHIFT_PX:
+        raise CalibrationError(
+            f"{file} is shifted by {size_px:.1f} px against the others, at most {MAX_SHIFT_PX:g} px can be corrected",
+            hint="take the bracket from a tripod",
+        )
+
+
+def _small_green(levels: NDArray[Any], step: int) -> NDArray[Any]:
+    green = np.ascontiguousarray(levels[..., 1])
+    if step > 1:
+        height, width = green.shape[0] // step, green.shape[1] // step
+        green = cv2.resize(green[: height * step, : width * step], (width, height), interpolation=cv2.INTER_AREA)
+    return np.rint(cv2.GaussianBlur(green, (0, 0), 1.0)).astype(np.uint8)
+
+
+def _shift_between(first: NDArray[Any], second: NDArray[Any], first_name: str, second_name: str) -> Array:
+    """Shift (x, y) of the second picture against the first, in their pixels; zero where there is nothing to see."""
+    pair = _common_ranks(first, second)
+    if pair is None:
+        return np.zeros(2)
+    shift, gain = _tested_shift(*pair)
+    if gain < MIN_GAIN:
+        return np.zeros(2)
+    parts = [_tested_shift(*(rank[part] for rank in pair)) for part in _quarters(first.shape)]
+    clear = np.array([part for part, part_gain in parts if part_gain > 3 * MIN_GAIN])
+    if len(clear) > 1 and np.hypot(*np.ptp(clear, axis=0)) > RIGID_PX:
+        raise CalibrationError(
+            f"between {first_name} and {second_name} parts of the picture move by {np.hypot(*np.ptp(clear, axis=0)):.1f}"
+            " px against each other",
+            hint="a turn, a near object or a moving scene; take the bracket of a still scene from a tripod",
+        )
+    return shift
+
+
+def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    y, x = shape[0] // 2, shape[1] // 2
+    return [(rows, columns) for rows in (slice(0, y), slice(y, 2 * y)) for columns in (slice(0, x), slice(x, 2 * x))]
+
+
+def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] | None:
+    """Both pictures as ranks in [0, 1], held within what neither clips; None where that is next to nothing."""
+    shares = [np.cumsum(np.bincount(p.ravel(), minlength=256)) / p.size for p in (first, second)]
+    low = max(share[4] for share in shares)
+    high = min(share[250] for share in shares)
+    if high - low < 0.05:
+        return None
+    ranks = []
+    for picture, share in zip((first, second), shares, strict=True):
+        middle = share - 0.5 * np.diff(share, prepend=0.0)
+        ranks.append(((np.clip(middle, low, high) - low) / (high - low)).astype(np.float32)[picture])
+    return ranks[0], ranks[1]
+
+
+def _tested_shift(first: Any, second: Any) -> tuple[Array, float]:
+    """Shift (x, y) by phase correlation and the share of the squared difference that it takes away."""
+    size = (first.shape[1], first.shape[0])
+    (dx, dy), _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow(size, cv2.CV_32F))
+    margin = int(min(np.ceil(max(abs(dx), abs(dy))) + 1, min(first.shape) // 3))
+    inner = (slice(margin, -margin), slice(margin, -margin))
+    moved = cv2.warpAffine(second, np.array([[1, 0, dx], [0, 1, dy]], np.float32), size,
+                           flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)  # fmt: skip
+    before = float(np.mean((first - second)[inner] ** 2))
+    after = float(np.mean((first - moved)[inner] ** 2))
+    return np.array([dx, dy]), 1.0 - after / before if before > 0 else 0.0

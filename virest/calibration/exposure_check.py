@@ -1,0 +1,154 @@
+"""A first curve and the exposures that contradict the others, by one linear least-squares problem.
+
+Debevec & Malik 1997, "Recovering high dynamic range radiance maps from photographs", doi:10.1145/258734.258884:
+``g(z) = ln light + ln exposure`` with g, the logarithm of the inverse curve, and the light of every pixel unknown.
+Here g is piecewise linear over some twenty greys, and every picture has a correction c of its log exposure too:
+
+    g(z_pn) = l_p + ln t_n + c_n
+
+Corrections that follow a + β ln t cannot be told from a curve raised to a power: (g, l, t) and their multiples fit
+alike.  So the problem is solved with such a trend forbidden, and the trend is then chosen so that most pictures need
+no correction: a line through the corrections that a few wrong exposures cannot bend (all lines through two pictures
+are tried).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.calibration.bracket_samples import BracketSamples
+
+Array = NDArray[np.float64]
+KNOTS = 18
+SMOOTHNESS = 0.3
+PASSES = 4
+CONTRADICTS_EV = 0.1
+MIN_PICTURES = 4
+"""With fewer, any exposures are consistent with some curve."""
+ROBUST_Z = 4.0
+LN2 = float(np.log(2.0))
+
+
+@dataclass(frozen=True, slots=True)
+class FirstCurve:
+    """The inverse curve at some greys, and which exposures fit it."""
+
+    grey: Array
+    """(k,) levels."""
+    log_light: Array
+    """(k,) natural logarithm of the exposure at them, 0 at the brightest."""
+    correction_ev: Array
+    """(pictures,) what must be added to log2 of each listed exposure."""
+    suspect: NDArray[np.bool_]
+    """(pictures,) whether the listed exposure contradicts the others."""
+
+
+def fit_first_curve(samples: BracketSamples) -> FirstCurve:
+    """Solve for the curve and the corrections, and tell the corrections that stand out."""
+    measured = samples.measured & (samples.measured.sum(axis=1, keepdims=True) >= 2)
+    greys = samples.low + (samples.high - samples.low) * np.linspace(0, 1, KNOTS) ** 1.5
+    basis = _hats(samples.grey, greys)
+    g = 2.2 * np.log(greys)
+    log_t = np.log(samples.exposure)
+    robust = np.ones(samples.grey.shape)
+    correction = np.zeros(len(log_t))
+    for _ in range(PASSES):
+        slope = np.interp(samples.grey, 0.5 * (greys[1:] + greys[:-1]), np.maximum(np.diff(g) / np.diff(greys), 1e-4))
+        weight = np.where(measured, 1.0 / (slope * samples.sigma) ** 2, 0.0) * robust
+        g, correction, residual = _solve(basis, weight, log_t, greys)
+        g = np.maximum.accumulate(g + 1e-6 * np.arange(KNOTS))
+        normal = np.abs(residual) / (slope * samples.sigma)
+        scale = max(1.4826 * float(np.median(normal[measured])), 0.5)
+        robust = 1.0 / np.maximum(1.0, normal / (2.0 * scale))
+    return _untrended(greys, g, correction, log_t)
+
+
+def _hats(values: Array, knots: Array) -> Array:
+    """Piecewise linear basis, values.shape + (k,)."""
+    place = np.clip(np.searchsorted(knots, values) - 1, 0, len(knots) - 2)
+    part = np.clip((values - knots[place]) / (knots[place + 1] - knots[place]), 0.0, 1.0)
+    out = np.zeros((*values.shape, len(knots)))
+    np.put_along_axis(out, place[..., None], (1.0 - part)[..., None], -1)
+    np.put_along_axis(out, place[..., None] + 1, part[..., None], -1)
+    return out
+
+
+def _solve(basis: Array, weight: Array, log_t: Array, greys: Array) -> tuple[Array, Array, Array]:
+    """(g, c, residual) with every pixel's light eliminated: its mean of g − ln t − c under the weights."""
+    count = len(log_t)
+    design = np.concatenate([basis, np.broadcast_to(-np.eye(count), (*basis.shape[:2], count))], axis=-1)
+    share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+    design = design - np.einsum("pn,pnk->pk", share, design)[:, None, :]
+    target = np.broadcast_to(log_t, weight.shape)
+    target = target - (share * target).sum(axis=1, keepdims=True)
+    flat, wide = design.reshape(-1, design.shape[-1]), weight.ravel()
+    normal = flat.T @ (flat * wide[:, None])
+    right = flat.T @ (wide * target.ravel())
+    strength = float(np.trace(normal)) / len(normal)
+    for row, factor in _side_conditions(greys, log_t):
+        normal += factor * strength * np.outer(row, row)
+    solution = np.linalg.solve(normal + 1e-12 * strength * np.eye(len(normal)), right)
+    return solution[: len(greys)], solution[len(greys) :], design @ solution - target
+
+
+def _side_conditions(greys: Array, log_t: Array) -> list[tuple[Array, float]]:
+    """(row, strength): no sum and no trend of the corrections, g zero at the top, g smooth over ln grey."""
+    count, knots = len(log_t), len(greys)
+    conditions: list[tuple[Array, float]] = []
+    for pattern in (np.ones(count), log_t - log_t.mean()):
+        row = np.concatenate([np.zeros(knots), pattern / max(float(np.linalg.norm(pattern)), 1e-12)])
+        conditions.append((row, 1e3))
+    conditions.append((np.eye(knots + count)[knots - 1], 1.0))
+    along = np.log(greys + 8.0)
+    for i in range(1, knots - 1):
+        row = np.zeros(knots + count)
+        left, right = along[i] - along[i - 1], along[i + 1] - along[i]
+        row[i - 1 : i + 2] = np.array([1 / left, -1 / left - 1 / right, 1 / right]) * 0.1
+        conditions.append((row, SMOOTHNESS * 1e-4))
+    return conditions
+
+
+def _untrended(greys: Array, g: Array, correction: Array, log_t: Array) -> FirstCurve:
+    level, trend = robust_line(log_t, correction)
+    left = correction - level - trend * log_t
+    power = max(1.0 + trend, 0.2)
+    ev = left / power / LN2
+    log_light = (g - g[-1]) / power
+    return FirstCurve(greys, log_light, ev, outlying(ev))
+
+
+def robust_line(x: Array, y: Array) -> tuple[float, float]:
+    """(level, trend) of the line through two of the points that leaves the least sum of capped deviations.
+
+    With fewer than MIN_PICTURES points: no trend, the median as level.
+    """
+    if len(x) < MIN_PICTURES:
+        return float(np.median(y)), 0.0
+    best, found = np.inf, (0.0, 0.0)
+    for i in range(len(x)):
+        for j in range(i):
+            if abs(x[i] - x[j]) < 0.25 * float(np.ptp(x)):
+                continue
+            trend = (y[i] - y[j]) / (x[i] - x[j])
+            level = y[i] - trend * x[i]
+            cost = float(np.minimum(np.abs(y - level - trend * x), 0.15).sum())
+            if cost < best:
+                best, found = cost, (float(level), float(trend))
+    inside = np.abs(y - found[0] - found[1] * x) < 0.5 * CONTRADICTS_EV * LN2
+    if inside.sum() >= MIN_PICTURES - 1 and np.ptp(x[inside]) > 0:
+        trend, level = np.polyfit(x[inside], y[inside], 1)
+        return float(level), float(trend)
+    return found
+
+
+def outlying(ev: Array) -> NDArray[np.bool_]:
+    """Which corrections are more than CONTRADICTS_EV and ROBUST_Z deviations (median absolute) from the others'."""
+    if len(ev) < MIN_PICTURES:
+        return np.zeros(len(ev), bool)
+    away = np.abs(ev - np.median(ev))
+    spread = 1.4826 * float(np.median(away))
+    suspect = (away > CONTRADICTS_EV) & (away > ROBUST_Z * spread)
+    return suspect if suspect.sum() < 0.5 * len(ev) else np.zeros(len(ev), bool)
