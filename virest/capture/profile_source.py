@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, read_profile
+from virest.camera.kalibr import is_kalibr, parse_camchain
+from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, load_yaml_mapping, parse_profile
 from virest.camera.shutter import Shutter
 from virest.capture.files import is_present
 from virest.capture.records import Capture
@@ -55,8 +56,9 @@ def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfil
 
 
 def read_any_profile(path: Path) -> CameraProfile:
-    """Read a profile file by its kind; formats other than our own are told apart here."""
-    return read_profile(path)
+    """Read a profile file by its kind: our own, or a Kalibr camera chain."""
+    content = load_yaml_mapping(path)
+    return parse_camchain(content, path.name) if is_kalibr(content) else parse_profile(content, path.name)
 
 
 def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[CameraProfile, str]:

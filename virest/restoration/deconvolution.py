@@ -30,11 +30,11 @@ def richardson_lucy(
 
     f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.
     """
-    sharp: Image = np.maximum(start, np.float32(1e-4))
+    sharp: Image = np.maximum(start, 1e-4).astype(np.float32)
     seen = adjoint(weight) + _UNSEEN
     for _ in range(iterations):
-        ratio = weight * observed / np.maximum(apply(sharp), np.float32(1e-4))
-        sharp = np.maximum(sharp * np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen, np.float32(1e-5))
+        ratio: Image = (weight * observed / np.maximum(apply(sharp), 1e-4)).astype(np.float32)
+        sharp = np.maximum(sharp * np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen, 1e-5).astype(np.float32)
     return sharp
 
 

@@ -116,7 +116,7 @@ def gradient_power(size: int) -> Image:
 
 def inverse_filter(power: Image, floor: float = 1e-3) -> Image:
     """1 / |K|², held where |K| falls below the square root of ``floor``: the naive inverse, for comparison."""
-    return np.float32(1) / np.maximum(power, np.float32(floor))
+    return (1.0 / np.maximum(power, floor)).astype(np.float32)
 
 
 def wiener_filter(power: Image, noise_to_signal: Image) -> Image:
