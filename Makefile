@@ -36,7 +36,7 @@ lint: $(READY)
 	$(BIN)/mypy virest
 
 sample: $(READY)
-	$(BIN)/python -m virest.app.sample sample_data
+	$(BIN)/python -m virest.app.sample sample_data --picture docs/before_after.png
 
 clean:
 	rm -rf demo-out bench-out virest-out build dist .pytest_cache .mypy_cache .ruff_cache
