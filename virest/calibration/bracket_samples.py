@@ -27,6 +27,8 @@ RIGID_PX = 1.5
 CANDIDATES = 9000
 SITES = 900
 MIN_SITES = 40
+PILE = 0.02
+"""Share of the samples within the noise of the darkest or brightest that makes it a place where greys pile up."""
 MIN_SHARED = 25
 """Samples that two pictures must both see unclipped, so that their exposures can be compared."""
 
@@ -132,7 +134,10 @@ def _candidates(height: int, width: int, margin: int, rng: np.random.Generator) 
 def _squares(
     pictures: Sequence[BracketPicture], centres: NDArray[np.int64], shifts_px: Array, half: int, channels: int
 ) -> tuple[Array, Array]:
-    """Mean and variance of the square round each place, (channels, pictures, places)."""
+    """Mean and variance of the square round each place, (channels, pictures, places).
+
+    A square with a pixel at 0 or 255 counts as 0 or 255 whole, so that it is censored.
+    """
     span = np.arange(-half, half + 1)
     means = np.empty((channels, len(pictures), len(centres)))
     variances = np.empty_like(means)
@@ -140,7 +145,8 @@ def _squares(
         x, y = (centres + np.rint(shifts_px[n]).astype(int)).T
         rows, columns = y[:, None, None] + span[:, None], x[:, None, None] + span[None, :]
         patch = picture.levels[rows, columns, :channels].astype(np.float32).reshape(len(centres), -1, channels)
-        means[:, n] = patch.mean(axis=1).T
+        mean = np.where(patch.max(axis=1) >= 255, 255.0, patch.mean(axis=1))
+        means[:, n] = np.where(patch.min(axis=1) <= 0, 0.0, mean).T
         variances[:, n] = patch.var(axis=1, ddof=1).T
     return means, variances
 
@@ -158,10 +164,12 @@ def _limits(means: Array, variances: Array, pixels: int) -> tuple[float, float, 
         b = float(np.clip(np.polyfit(x, y, 1)[0], 0.0, 1.0)) if len(x) > 2 else 0.0
         a = float(np.clip(np.median(y - b * x), 0.05, 400.0))
     margin = float(np.clip(3.0 * np.sqrt(a + 128 * b), 2.0, 12.0))
-    bottom, top = np.quantile(means, [0.001, 0.999])
+    bottom, top = (float(v) for v in np.quantile(means, [0.001, 0.999]))
+    low = bottom + margin if np.mean(means < bottom + margin) > PILE else bottom
+    high = top - margin if np.mean(means > top - margin) > PILE else top
     # the floor keeps rounding of the levels, which neighbours share, from counting as precision
     noise = (a / pixels + 0.15**2, b / pixels)
-    return float(bottom) + margin, float(top) - margin, float(top), noise
+    return max(low, margin), min(high, 255.0 - margin), top, noise
 
 
 def _flat_sites(

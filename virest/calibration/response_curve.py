@@ -29,6 +29,8 @@ from virest.errors import CalibrationError, SettingsError
 Array = NDArray[np.float64]
 TRUSTED_EV = 0.02
 """Standard deviation of a listed exposure that is believed."""
+TREND_EV = 1e-4
+"""The same for what believed corrections have in common: a trend would be a power of the curve in disguise."""
 FREE_EV = 4.0
 MIN_RATIO = 2**0.25
 FEW_RATIO = 2**1.5
@@ -222,10 +224,11 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
     """(curve parameters, corrections in EV) of least cost, the sizes of the residuals held down (soft L1)."""
     shape = len(family.start)
     belief = np.where(suspect, FREE_EV, TRUSTED_EV)
+    no_trend = _trend_rows(samples.exposure, suspect) / TREND_EV
 
     def miss(q: Array) -> Array:
         lookup = log_lookup(family.build(q[:shape]))
-        parts = [(_residual(lookup, samples, q[shape:]) / samples.sigma).ravel() / 2.0, q[shape:] / belief]
+        parts = [(_residual(lookup, samples, q[shape:]) / samples.sigma).ravel() / 2.0, q[shape:] / belief, no_trend @ q[shape:]]
         if family.smoothness:
             parts.append(family.smoothness(q[:shape]))
         return np.concatenate(parts)
@@ -243,6 +246,15 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
     found = least_squares(miss, start, jac=jacobian, bounds=bounds, loss="soft_l1", max_nfev=evaluations,
                           ftol=1e-5, xtol=1e-6, gtol=1e-8)  # fmt: skip
     return found.x[:shape], found.x[shape:]
+
+
+def _trend_rows(exposure: Array, suspect: NDArray[np.bool_]) -> Array:
+    """(2, pictures): level and trend over log exposure of the corrections of the pictures that are believed."""
+    believed = (~suspect).astype(float)
+    level = believed / np.sqrt(believed.sum())
+    log_t = np.log(exposure)
+    trend = believed * (log_t - (believed @ log_t) / believed.sum())
+    return np.stack([level, trend / max(float(np.linalg.norm(trend)), 1e-12)])
 
 
 def _try_kinds(kind: str, fit: BracketSamples, held: BracketSamples, first: FirstCurve) -> dict[str, _Trial]:

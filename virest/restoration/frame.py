@@ -32,7 +32,7 @@ SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
 MIN_GAIN_DB = 0.03
 """A picture of which the measured noise promises less is left alone."""
-FULL_TRUST_DB = 0.5
+FULL_TRUST_DB = 0.8
 """From this expected gain on, a restored picture is taken whole."""
 MANY_CLIPPED = 0.003
 """With a larger part of clipped pixels the expected gain says nothing: they are no linear blur."""
@@ -231,9 +231,11 @@ def _deblurred(
         picture, curve, (luma, chroma), lambda centres: kernel_field(motion, centres, anchor), longest_px
     )
     sharp = deblur(blurred, settings)
-    share = 1.0 if clipped or anchor != 0.5 else _trusted_share(luma.expected_gain_db, settings.deblur)
-    if share < 1.0:
-        sharp = [light + np.float32(share) * (s - light) for s, light in zip(sharp, blurred.light, strict=True)]
+    share = 1.0
+    if anchor == 0.5:
+        share = 1.0 if clipped else _trusted_share(luma.expected_gain_db, settings.deblur)
+        part = np.float32(share) * _blurred_part(motion, settings.min_blur_px)
+        sharp = [light + part * (s - light) for s, light in zip(sharp, blurred.light, strict=True)]
     restored = encode_picture(sharp, curve)
     details = {
         "method": settings.deblur,
@@ -246,6 +248,15 @@ def _deblurred(
         "share": share,
     }
     return restored, details, ()
+
+
+def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32]:
+    """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on."""
+    width, height = motion.profile.width, motion.profile.height
+    x, y = (np.linspace(0, length - 1, max(2, length // 48)) for length in (width, height))
+    length_px = np.linalg.norm(blur_chords(motion, np.stack(np.meshgrid(x, y), -1)), axis=-1)
+    part = np.clip(length_px / min_blur_px - 1.0, 0.0, 1.0).astype(np.float32)
+    return cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _trusted_share(expected_gain_db: float, method: str) -> float:

@@ -27,6 +27,7 @@ _WINDOW = np.outer(np.hanning(_SIDE + 2)[1:-1], np.hanning(_SIDE + 2)[1:-1]).ast
 _WINDOW_SUM = float(_WINDOW.sum())
 _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 _ROUNDING_POWER = 1 / 12
+_SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _FIT_STEPS = 6
 _CELLS = 64
 _MAX_TILES = 16
@@ -106,8 +107,17 @@ def measure_picture(picture: NDArray[np.uint8], field: KernelField) -> tuple[Pic
     def observed(plane: NDArray[np.uint8]) -> NDArray[np.float32]:
         return np.stack([_windowed_power(_cut(plane, corners[i])) for i in chosen])
 
-    chroma = _fit_rings(np.concatenate([observed(red), observed(blue)]), np.concatenate([passed, passed]))
-    return _fit_rings(observed(luma), passed), chroma
+    both = np.concatenate([observed(red), observed(blue)]), np.concatenate([passed, passed])
+    return _fit_rings(observed(luma), passed, white_noise(luma)), _fit_rings(*both, white_noise(red))
+
+
+def white_noise(plane: NDArray[np.uint8]) -> float:
+    """Standard deviation of a plane's white noise, grey levels: the median absolute second difference both ways.
+
+    Immerkær 1996, doi:10.1006/cviu.1996.0060; edges and texture are outliers to the median.
+    """
+    residual = cv2.filter2D(plane, cv2.CV_32F, _SECOND_DIFFERENCE)[2:-2:4, 2:-2:4]
+    return float(np.median(np.abs(residual))) / 0.6745 / 6.0
 
 
 def _corners(field: KernelField, shape: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -155,7 +165,7 @@ def _ring_index(side: int) -> NDArray[np.intp]:
     )
 
 
-def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> PictureStatistics:
+def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32], white_levels: float) -> PictureStatistics:
     """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
     share = np.minimum((passed * _CELLS).astype(np.int32), _CELLS - 1)
     cell = (_ring_index(_SIDE).astype(np.int32) * _CELLS + share).ravel()
@@ -178,15 +188,21 @@ def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32]) -> Pi
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
     spread = np.sqrt(np.maximum((count * k * k).sum(1) / in_ring - mean_k**2, 0))
     determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
-    return _settled(signal, noise, mean_k, mean_g, determined)
+    return _settled(signal, noise, mean_k, mean_g, determined, white_levels)
 
 
 def _settled(
-    signal: Array, noise: Array, passed: Array, observed: Array, determined: NDArray[np.bool_]
+    signal: Array,
+    noise: Array,
+    passed: Array,
+    observed: Array,
+    determined: NDArray[np.bool_],
+    white_levels: float,
 ) -> PictureStatistics:
     """Rings that cannot tell S from N borrow the noise of those that can; S never rises with frequency.
 
-    Kernels too short to cancel anything leave the noise open: then it is at most what the highest frequencies hold.
+    Kernels too short to cancel anything leave the noise open: then it is what a picture's second differences say, and
+    at most what the highest frequencies hold.
     """
     frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
     if determined.any():
@@ -194,7 +210,7 @@ def _settled(
         noise = np.maximum.accumulate(noise[::-1])[::-1]
         noise *= np.maximum(frequency[determined][0] / frequency, 1.0) ** _NOISE_SLOPE
     else:
-        noise = np.full(RINGS, max(float(observed[-3:].mean()), _ROUNDING_POWER))
+        noise = np.full(RINGS, max(min(float(observed[-3:].mean()), 2 * white_levels**2), _ROUNDING_POWER))
     through = np.maximum(observed - noise, 0.05 * observed) / np.maximum(passed, 0.05)
     signal = np.where(determined, signal, through)
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
