@@ -56,9 +56,10 @@ def write_before_after(capture: Path, frame: int, corner_px: tuple[int, int], si
     frames = read_frames(recorded.movie, probe_movie(recorded.movie), frame, frame)
     index, picture = next(frames)
     restored = next(restore_frames([(recorded.frames[index], picture)], recorded.imu, plan)).picture
-    truth = cv2.imread(str(capture / "truth" / "frames" / f"{frame:06d}.png"))[..., ::-1]
+    truth = cv2.imread(str(capture / "truth" / "frames" / f"{frame:06d}.png"))
     x, y = corner_px
-    cuts = [p[y : y + side_px, x : x + side_px] for p in (picture, restored, truth) if p is not None]
+    pictures = (picture, restored, None if truth is None else truth[..., ::-1])
+    cuts = [p[y : y + side_px, x : x + side_px] for p in pictures if p is not None]
     out.parent.mkdir(exist_ok=True)
     cv2.imwrite(str(out), np.hstack(cuts)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
 

@@ -16,17 +16,19 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from virest.errors import CalibrationError
 
 Array = NDArray[np.float64]
 MAX_SHIFT_PX = 8.0
-MIN_GAIN = 0.1
+MIN_GAIN = 0.2
 """A shift counts if it takes this share of the difference between two pictures away."""
 RIGID_PX = 1.5
 CANDIDATES = 9000
 SITES = 900
 MIN_SITES = 40
+FLAT_SHARE = 0.1
 PILE = 0.02
 """Share of the samples within the noise of the darkest or brightest that makes it a place where greys pile up."""
 MIN_SHARED = 25
@@ -104,7 +106,7 @@ def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator)
         text = f"all {len(pictures)} pictures are clipped throughout"
         raise CalibrationError(text, hint="take exposures at which the scene is neither black nor white")
     keep = _flat_sites(means, variances, measured, noise, (2 * half + 1) ** 2)
-    chosen = _spread_sites(means[:, :, keep], measured[:, :, keep], keep, rng)
+    chosen = _spread_sites(means[:, :, keep], keep, rng)
     grey = means[:, :, chosen].transpose(2, 0, 1).reshape(-1, len(pictures))
     site = np.repeat(np.arange(len(chosen)), channels)
     exposure = np.array([p.exposure for p in pictures], np.float64)
@@ -157,8 +159,10 @@ def _limits(means: Array, variances: Array, pixels: int) -> tuple[float, float, 
     a, b = 1.0, 0.0
     if inside.sum() > 200:
         greys, spread = means[inside], variances[inside]
+        # of squares that hold nothing but noise, this share has a smaller variance than chance x the true one
+        chance = float(chi2.ppf(FLAT_SHARE, pixels - 1)) / (pixels - 1)
         bins = np.digitize(greys, np.linspace(8, 247, 13))
-        points = [(greys[bins == i].mean(), np.quantile(spread[bins == i], 0.2)) for i in np.unique(bins)
+        points = [(greys[bins == i].mean(), np.quantile(spread[bins == i], FLAT_SHARE) / chance) for i in np.unique(bins)
                   if (bins == i).sum() >= 15]  # fmt: skip
         x, y = np.array(points).T if len(points) > 1 else (np.array([0.0, 255.0]), np.array([1.0, 1.0]))
         b = float(np.clip(np.polyfit(x, y, 1)[0], 0.0, 1.0)) if len(x) > 2 else 0.0
@@ -185,11 +189,9 @@ def _flat_sites(
     return seen[excess[seen] <= max(np.quantile(excess[seen], 0.5), 2.0)]
 
 
-def _spread_sites(
-    means: Array, measured: NDArray[np.bool_], keep: NDArray[np.int64], rng: np.random.Generator
-) -> NDArray[np.int64]:
+def _spread_sites(means: Array, keep: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
     """SITES of the places, as many from each of 24 classes of brightness as there are."""
-    brightness = means.mean(axis=(0, 1)) + 0.0 * measured.any()
+    brightness = means.mean(axis=(0, 1))
     edges = np.linspace(brightness.min(), brightness.max() + 1e-6, 25)
     classes = np.digitize(brightness, edges)
     order = rng.permutation(len(keep))
@@ -247,7 +249,7 @@ def _shift_between(first: NDArray[Any], second: NDArray[Any], first_name: str, s
     if gain < MIN_GAIN:
         return np.zeros(2)
     parts = [_tested_shift(*(rank[part] for rank in pair)) for part in _quarters(first.shape)]
-    clear = np.array([part for part, part_gain in parts if part_gain > 3 * MIN_GAIN])
+    clear = np.array([part for part, part_gain in parts if part_gain > 2 * MIN_GAIN])
     if len(clear) > 1 and np.hypot(*np.ptp(clear, axis=0)) > RIGID_PX:
         raise CalibrationError(
             f"between {first_name} and {second_name} parts of the picture move by {np.hypot(*np.ptp(clear, axis=0)):.1f}"
@@ -265,8 +267,8 @@ def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
 def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] | None:
     """Both pictures as ranks in [0, 1], held within what neither clips; None where that is next to nothing."""
     shares = [np.cumsum(np.bincount(p.ravel(), minlength=256)) / p.size for p in (first, second)]
-    low = max(share[4] for share in shares)
-    high = min(share[250] for share in shares)
+    low = max(share[min(int(np.searchsorted(share, 0.001)) + 4, 255)] for share in shares)
+    high = min(share[max(int(np.searchsorted(share, 0.999)) - 6, 0)] for share in shares)
     if high - low < 0.05:
         return None
     ranks = []

@@ -38,6 +38,8 @@ class Family:
     build: Callable[[Array], ResponseCurve]
     smoothness: Callable[[Array], Array] | None = None
     """What a fit adds to its residuals, so that parameters without data stay sane."""
+    others: tuple[Array, ...] = ()
+    """Further parameters to begin with; the best after a few steps is followed."""
 
 
 def make_family(kind: str, first: FirstCurve, low: float, high: float, top: float) -> Family:
@@ -73,8 +75,8 @@ def _five_segment(first: FirstCurve, high: float, top: float) -> Family:
     upper = np.array([2.0, 0.6, 1.0, 1.0])
     grey, light = first.grey / 255, np.exp(first.log_light)
     rise = np.polyfit(light[len(light) // 3 :], grey[len(light) // 3 :], 1)[0]
-    best, start = np.inf, np.zeros(4)
-    for yb, share in ((0.05, 0.9), (0.1, 0.6), (0.02, 0.3)):
+    starts = []
+    for yb, share in ((0.05, 0.9), (0.1, 0.6), (0.2, 0.2)):
         guess = np.array([0.12, yb, share, 1.0 - 5e-7 if clipped else top / 255])
 
         def miss(q: Array) -> Array:
@@ -82,10 +84,10 @@ def _five_segment(first: FirstCurve, high: float, top: float) -> Family:
 
         lo, hi = np.append(lower, -6.0), np.append(upper, 6.0)
         begin = np.clip(np.append(guess, np.log(max(rise, 0.01))), lo + 1e-7, hi - 1e-7)
-        found = least_squares(miss, begin, bounds=(lo, hi), max_nfev=60)
-        if found.cost < best:
-            best, start = found.cost, found.x[:4]
-    return Family("five_segment", np.clip(start, lower + 1e-7, upper - 1e-7), lower, upper, five_segment_curve)
+        found = least_squares(miss, begin, bounds=(lo, hi), max_nfev=25).x[:4]
+        # off the bounds, where a trust region would creep
+        starts.append(np.clip(found, lower + [1e-7, 0.01, 0.02, 1e-7], upper - [1e-7, 0.01, 0.02, 1e-7]))
+    return Family("five_segment", starts[0], lower, upper, five_segment_curve, others=tuple(starts[1:]))
 
 
 # ── a table ──────────────────────────────────────────────────────────────────────────────────────────────────────

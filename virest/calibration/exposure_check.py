@@ -59,7 +59,7 @@ def fit_first_curve(samples: BracketSamples) -> FirstCurve:
         slope = np.interp(samples.grey, 0.5 * (greys[1:] + greys[:-1]), np.maximum(np.diff(g) / np.diff(greys), 1e-4))
         weight = np.where(measured, 1.0 / (slope * samples.sigma) ** 2, 0.0) * robust
         g, correction, residual = _solve(basis, weight, log_t, greys)
-        g = np.maximum.accumulate(g + 1e-6 * np.arange(KNOTS))
+        g = np.maximum.accumulate(g) + 1e-5 * np.arange(KNOTS)
         normal = np.abs(residual) / (slope * samples.sigma)
         scale = max(1.4826 * float(np.median(normal[measured])), 0.5)
         robust = 1.0 / np.maximum(1.0, normal / (2.0 * scale))

@@ -37,6 +37,8 @@ FEW_RATIO = 2**1.5
 STEP = 1e-4
 MOVED_LEVELS = 8.0
 MAX_MOVED = 0.2
+SCORE_CAP = 16.0
+"""The most that one grey, in units of its variance, counts against a curve."""
 Z_REJECTED = 3.0
 MIN_RELATIVE_GAIN = 0.01
 STRUCTURE_LEVELS = 0.3
@@ -220,7 +222,7 @@ class _Trial:
 
 
 def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDArray[np.bool_],
-              evaluations: int = 14) -> tuple[Array, Array]:  # fmt: skip
+              evaluations: int = 30) -> tuple[Array, Array]:  # fmt: skip
     """(curve parameters, corrections in EV) of least cost, the sizes of the residuals held down (soft L1)."""
     shape = len(family.start)
     belief = np.where(suspect, FREE_EV, TRUSTED_EV)
@@ -244,7 +246,7 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
     wide = np.full(len(suspect), 20.0)
     bounds = (np.concatenate([family.lower, -wide]), np.concatenate([family.upper, wide]))
     found = least_squares(miss, start, jac=jacobian, bounds=bounds, loss="soft_l1", max_nfev=evaluations,
-                          ftol=1e-5, xtol=1e-6, gtol=1e-8)  # fmt: skip
+                          ftol=1e-6, xtol=1e-7, gtol=1e-8)  # fmt: skip
     return found.x[:shape], found.x[shape:]
 
 
@@ -262,9 +264,20 @@ def _try_kinds(kind: str, fit: BracketSamples, held: BracketSamples, first: Firs
     trials = {}
     for name in dict.fromkeys(names):
         family = make_family(name, first, fit.low, fit.high, fit.top)
-        start = np.concatenate([family.start, np.where(first.suspect, first.correction_ev, 0.0)])
-        trials[name] = _judge(family, *_optimise(family, start, fit, first.suspect), first.suspect, held)
+        trials[name] = _judge(family, *_from_best_start(family, fit, first), first.suspect, held)
     return trials
+
+
+def _from_best_start(family: Family, fit: BracketSamples, first: FirstCurve) -> tuple[Array, Array]:
+    """Follow the best of the family's starts; which is best, a thinned sample decides."""
+    correction = np.where(first.suspect, first.correction_ev, 0.0)
+    starts = [np.concatenate([p, correction]) for p in (family.start, *family.others)]
+    if len(starts) > 1:
+        thin = fit.take(np.arange(len(fit.grey))[:: max(len(fit.grey) // 300, 1)])
+        tried = [_optimise(family, start, thin, first.suspect, 12) for start in starts]
+        costs = [float(np.abs(_residual(log_lookup(family.build(p)), thin, c) / thin.sigma).sum()) for p, c in tried]
+        starts = [np.concatenate(tried[int(np.argmin(costs))])]
+    return _optimise(family, starts[0], fit, first.suspect)
 
 
 def _judge(
@@ -272,7 +285,7 @@ def _judge(
 ) -> _Trial:
     curve = family.build(parameters)
     left = _residual(log_lookup(curve), held, correction_ev)
-    score = np.minimum((left / held.sigma) ** 2, 100.0).sum(axis=1)
+    score = np.minimum((left / held.sigma) ** 2, SCORE_CAP).sum(axis=1)
     return _Trial(family, curve, parameters, correction_ev, suspect, score, held.site, _rms(left[held.measured]))
 
 
@@ -307,7 +320,7 @@ def _refine(trial: _Trial, samples: BracketSamples) -> _Trial:
     start = np.concatenate([trial.parameters, trial.correction_ev])
     suspect = trial.suspect
     for _ in range(2):
-        parameters, correction = _optimise(trial.family, start, samples, suspect, 8)
+        parameters, correction = _optimise(trial.family, start, samples, suspect, 10)
         wide = suspect | (outlying(correction) & (np.abs(correction) > 0.6 * CONTRADICTS_EV))
         start = np.concatenate([parameters, correction])
         if (wide == suspect).all():

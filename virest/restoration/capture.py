@@ -17,7 +17,13 @@ from virest.degradation.row_motion import row_motion
 from virest.motion.alignment import OffsetEstimate, check_agreement, choose_pairs, estimate_time_offset
 from virest.motion.integration import integrate_gyro
 from virest.motion.tracking import TrackPair, track_pairs
-from virest.restoration.frame import RestoredFrame, copied_frame, restore_frame, unknown_parameters
+from virest.restoration.frame import (
+    RestoredFrame,
+    copied_frame,
+    degradation_parameters,
+    restore_frame,
+    unknown_parameters,
+)
 from virest.restoration.settings import RestorationSettings
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
@@ -49,18 +55,22 @@ def restore_frames(
 ) -> Iterator[RestoredFrame]:
     """Restore frames one by one; ``imu`` covers them. Frames without a picture are passed over."""
     profile = plan.profile
-    trajectory = integrate_gyro(imu, profile) if plan.copy_reason is None else None
+    trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
     for frame, picture in frames:
         if picture is None:
             continue
         if trajectory is None:
-            yield copied_frame(frame, picture, profile, plan.copy_reason or "")
+            yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN)
             continue
         motion = row_motion(trajectory, profile, frame.time_s, frame.exposure_s, plan.settings.reference)
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, imu.time_s, plan.imu_gaps_s)
         if outside:
             yield RestoredFrame(frame, "skipped", None, (outside[1],), parameters=unknown_parameters(profile))
+            continue
+        if plan.copy_reason:
+            said = degradation_parameters(motion, trajectory, plan.settings)
+            yield copied_frame(frame, picture, profile, plan.copy_reason, said)
             continue
         yield restore_frame(frame, picture, motion, trajectory, plan.settings)
 

@@ -1,0 +1,145 @@
+"""``virest calibrate-curve SOURCE``: the response curve of a bracket or of a capture of a still scene."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from virest.app.console import table
+from virest.app.outputs import write_whole
+from virest.calibration.bracket_samples import BracketPicture
+from virest.calibration.response_curve import CurveFit, fit_response
+from virest.camera.profile import response_block
+from virest.camera.response import ResponseCurve
+from virest.capture.files import is_present
+from virest.capture.folder import MOVIE, read_capture
+from virest.capture.stills import Still, capture_bracket, read_bracket
+from virest.errors import CaptureError, OutputError
+from virest.report.figures import FORMATS, response_figure
+
+log = logging.getLogger(__name__)
+
+DIGITS = 7
+
+
+def calibrate_curve(
+    source: Path, *, exposures: Path | None = None, kind: str = "auto", out: Path | None = None, plot: Path | None = None
+) -> tuple[dict[str, Any], str]:
+    """Fit the curve and write its files; returns the mapping for ``--json`` and the table for people.
+
+    out: YAML with the ``response:`` block; plot: figure, its format by its suffix.  Raises CaptureError,
+    CalibrationError, OutputError; nothing is written then.
+    """
+    for path in (out, plot):
+        _require_place(path)
+    stills, notes = read_source(source, exposures)
+    fit = fit_response([BracketPicture(s.file, s.levels, s.exposure) for s in stills], kind)
+    facts = as_json(fit, stills, notes)
+    figure = response_figure(fit, source.resolve().name, plot.suffix[1:].lower()) if plot else b""
+    if out:
+        write_whole(out, format_curve(facts).encode())
+    if plot:
+        write_whole(plot, figure)
+    return facts, describe(facts, out, plot)
+
+
+def _require_place(path: Path | None) -> None:
+    if path is None:
+        return
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder", hint="name a file")
+    if not path.absolute().parent.is_dir():
+        raise OutputError(f"{path}: its folder does not exist", hint="create it first")
+
+
+def plot_format_known(path: Path) -> bool:
+    """Whether a figure can be written under this name."""
+    return path.suffix[1:].lower() in FORMATS
+
+
+def read_source(source: Path, exposures: Path | None) -> tuple[list[Still], list[str]]:
+    """The pictures of a folder of stills or of a capture, and what is worth knowing about them."""
+    if not is_present(source / MOVIE):
+        return read_bracket(source, exposures)
+    if exposures is not None:
+        text = f"{source}: is a capture, whose exposures are logged"
+        raise CaptureError(text, hint="leave --exposures out, or pass a folder of stills")
+    return capture_bracket(read_capture(source))
+
+
+def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, Any]:
+    """The result as contract, section 1, has it."""
+    return {
+        "response": _rounded(response_block(fit.curve)),
+        "rms_grey_levels": fit.rms_grey_levels,
+        "covered_exposure": list(fit.covered_exposure),
+        "pictures": [
+            {
+                "file": p.file,
+                "exposure_s": still.exposure_s,
+                "exposure_error_ev": p.exposure_error_ev,
+                "contradicts": p.contradicts,
+                "likely_exposure_s": p.likely_exposure / still.gain,
+            }
+            for p, still in zip(fit.pictures, stills, strict=True)
+        ],
+        "held_out_rms_grey_levels": fit.held_out,
+        "notes": [*notes, *fit.notes],
+    }
+
+
+def _rounded(block: dict[str, Any]) -> dict[str, Any]:
+    def shorten(value: Any) -> Any:
+        if isinstance(value, list):
+            return [shorten(item) for item in value]
+        return round(value, DIGITS) if isinstance(value, float) else value
+
+    short = {key: shorten(value) for key, value in block.items()}
+    try:
+        ResponseCurve(**{key: tuple(v) if isinstance(v, list) else v for key, v in short.items()})
+    except ValueError:
+        return block
+    return short
+
+
+def format_curve(facts: dict[str, Any]) -> str:
+    """The ``response:`` block as YAML, to be put into camera.yaml; fit error and covered range as comments."""
+    low, high = facts["covered_exposure"]
+    lines = [
+        "# Exposure characteristic curve by virest calibrate-curve; put the block into camera.yaml.",
+        f"# fit error: {facts['rms_grey_levels']:.3f} grey levels rms; exposures covered: {low:.6g} to {high:.6g}",
+    ]
+    for p in facts["pictures"]:
+        error = "left out" if p["exposure_error_ev"] is None else f"{p['exposure_error_ev']:+.3f} EV"
+        mark = f", contradicts the others; likely {p['likely_exposure_s']:.6g} s" if p["contradicts"] else ""
+        lines.append(f"# {_one_line(p['file'])}: {p['exposure_s']:.6g} s, error {error}{mark}")
+    block = yaml.safe_dump({"response": facts["response"]}, sort_keys=False, default_flow_style=None, width=110)
+    return "\n".join(lines) + "\n" + block
+
+
+def _one_line(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
+    """The result for people: one line for the curve, a table of the pictures, the notes."""
+    rows = []
+    for p in facts["pictures"]:
+        error = "–" if p["exposure_error_ev"] is None else f"{p['exposure_error_ev']:+.3f}"
+        likely = f"{p['likely_exposure_s']:.6g}" if p["contradicts"] else ""
+        rows.append([_one_line(p["file"]), f"{p['exposure_s']:.6g}", error, "yes" if p["contradicts"] else "no", likely])
+    low, high = facts["covered_exposure"]
+    block = dict(facts["response"])
+    name = block.pop("kind")
+    shape = "" if name == "table" else ", ".join(f"{key} {value}" for key, value in block.items())
+    lines = [
+        f"{name} {shape}".strip(),
+        f"fit error {facts['rms_grey_levels']:.2f} grey levels rms, exposures {low:.4g} to {high:.4g} covered",
+        table(["picture", "exposure_s", "error_ev", "contradicts", "likely_s"], rows),
+    ]
+    lines += [f"note: {_one_line(note)}" for note in facts["notes"]]
+    lines += [f"wrote {path}" for path in (out, plot) if path]
+    return "\n".join(lines)
