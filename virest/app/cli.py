@@ -24,6 +24,7 @@ from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHU
 log = logging.getLogger(__name__)
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
+CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
 USAGE = 2
 INTERRUPTED = 130
 TERMINATED = 143
@@ -319,6 +320,48 @@ def simulate(
         console.emit(json_line(facts))
     else:
         console.emit(_describe_simulation(facts))
+    return 0
+
+
+@app.command("calibrate-curve")
+def calibrate_curve(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture.")],
+    exposures: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Exposure times: columns file,exposure_s. [EXIF]")
+    ] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(metavar="KIND", callback=_one_of(CURVE_KINDS), help=f"{', '.join(CURVE_KINDS)}. [auto]"),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The response block goes here.")] = Path(
+        "curve.yaml"
+    ),
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Curve, data, residuals: png, svg or pdf.")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Fit the exposure characteristic curve to pictures of one still scene at several exposures.
+
+    \b
+    $ virest calibrate-curve bracket --exposures bracket/exposures.csv --plot curve.png
+    gamma gamma 2.1998
+    fit error 0.47 grey levels rms, exposures 0.0009 to 0.92 covered
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    _one_thread_each()
+    from virest.app.calibrate_curve import calibrate_curve as fit_and_write
+    from virest.app.calibrate_curve import plot_format_known
+
+    if plot is not None and not plot_format_known(plot):
+        raise typer.BadParameter(f"--plot {plot.name}: the name must end in .png, .svg or .pdf")
+    facts, text = fit_and_write(source, exposures=exposures, kind=kind or "auto", out=out, plot=plot)
+    if json:
+        from virest.app.outputs import json_line
+
+        text = json_line(facts)
+    console.emit(text)
     return 0
 
 

@@ -29,18 +29,18 @@ from virest.errors import CalibrationError, SettingsError
 Array = NDArray[np.float64]
 TRUSTED_EV = 0.02
 """Standard deviation of a listed exposure that is believed."""
-TREND_EV = 1e-4
-"""The same for what believed corrections have in common: a trend would be a power of the curve in disguise."""
 FREE_EV = 4.0
 MIN_RATIO = 2**0.25
 FEW_RATIO = 2**1.5
 STEP = 1e-4
 MOVED_LEVELS = 8.0
 MAX_MOVED = 0.2
+OUTLIER_LEVELS = 20.0
 SCORE_CAP = 16.0
 """The most that one grey, in units of its variance, counts against a curve."""
 Z_REJECTED = 3.0
-MIN_RELATIVE_GAIN = 0.01
+DISTINCT_LEVELS = 0.25
+"""Smaller systematic differences between two kinds are left to rounding and compression."""
 STRUCTURE_LEVELS = 0.3
 LN2 = float(np.log(2.0))
 
@@ -226,11 +226,13 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
     """(curve parameters, corrections in EV) of least cost, the sizes of the residuals held down (soft L1)."""
     shape = len(family.start)
     belief = np.where(suspect, FREE_EV, TRUSTED_EV)
-    no_trend = _trend_rows(samples.exposure, suspect) / TREND_EV
+    rows = _trend_rows(samples.exposure, suspect)
+    no_trend = np.eye(len(suspect)) - rows.T @ rows
 
     def miss(q: Array) -> Array:
         lookup = log_lookup(family.build(q[:shape]))
-        parts = [(_residual(lookup, samples, q[shape:]) / samples.sigma).ravel() / 2.0, q[shape:] / belief, no_trend @ q[shape:]]
+        correction = no_trend @ q[shape:]
+        parts = [(_residual(lookup, samples, correction) / samples.sigma).ravel() / 2.0, q[shape:] / belief]
         if family.smoothness:
             parts.append(family.smoothness(q[:shape]))
         return np.concatenate(parts)
@@ -247,11 +249,14 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
     bounds = (np.concatenate([family.lower, -wide]), np.concatenate([family.upper, wide]))
     found = least_squares(miss, start, jac=jacobian, bounds=bounds, loss="soft_l1", max_nfev=evaluations,
                           ftol=1e-6, xtol=1e-7, gtol=1e-8)  # fmt: skip
-    return found.x[:shape], found.x[shape:]
+    return found.x[:shape], no_trend @ found.x[shape:]
 
 
 def _trend_rows(exposure: Array, suspect: NDArray[np.bool_]) -> Array:
-    """(2, pictures): level and trend over log exposure of the corrections of the pictures that are believed."""
+    """(2, pictures), orthonormal: level and trend over log exposure of the corrections of believed pictures.
+
+    Both are forbidden: a level is a unit of light, a trend would be a power of the curve in disguise.
+    """
     believed = (~suspect).astype(float)
     level = believed / np.sqrt(believed.sum())
     log_t = np.log(exposure)
@@ -286,7 +291,7 @@ def _judge(
     curve = family.build(parameters)
     left = _residual(log_lookup(curve), held, correction_ev)
     score = np.minimum((left / held.sigma) ** 2, SCORE_CAP).sum(axis=1)
-    return _Trial(family, curve, parameters, correction_ev, suspect, score, held.site, _rms(left[held.measured]))
+    return _Trial(family, curve, parameters, correction_ev, suspect, score, held.site, _capped_rms(left[held.measured]))
 
 
 def _rms(residual: Array) -> float:
@@ -296,6 +301,11 @@ def _rms(residual: Array) -> float:
     limit = 6.0 * 1.4826 * float(np.median(np.abs(residual))) + 1e-9
     inside = residual[np.abs(residual) <= limit]
     return float(np.sqrt(np.mean(inside**2)))
+
+
+def _capped_rms(residual: Array) -> float:
+    """Root mean square, no residual counted beyond OUTLIER_LEVELS: comparable between kinds that miss differently."""
+    return float(np.sqrt(np.mean(np.minimum(np.abs(residual), OUTLIER_LEVELS) ** 2))) if residual.size else 0.0
 
 
 def choose_kind(trials: dict[str, _Trial]) -> str:
@@ -310,7 +320,7 @@ def _beaten(one: _Trial, other: _Trial) -> bool:
     """Whether the other predicts held-out places better: a paired test by place, and by more than a trifle."""
     _, index = np.unique(one.site, return_inverse=True)
     gain = np.bincount(index, one.score - other.score)
-    if gain.sum() < MIN_RELATIVE_GAIN * one.score.sum():
+    if one.held_out_rms**2 - other.held_out_rms**2 < DISTINCT_LEVELS**2:
         return False
     return bool(gain.mean() > Z_REJECTED * gain.std() / np.sqrt(len(gain)))
 
@@ -347,7 +357,7 @@ def residual_structure(grey: Array, residual: Array, bins: int = 16) -> float:
 def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: BracketSamples) -> list[str]:
     notes = []
     left = _residual(log_lookup(final.curve), samples, final.correction_ev)
-    limit = 6.0 * max(final.held_out_rms, 0.3)
+    limit = 6.0 * max(_rms(left[samples.measured]), 0.3)
     use = samples.measured & (np.abs(left) < limit)
     structure = residual_structure(samples.grey[use], left[use])
     tabulated = trials["table"]

@@ -22,7 +22,7 @@ from virest.motion.trajectory import Trajectory, quaternion_wxyz
 from virest.restoration.deblur import blurred_picture, deblur
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
-from virest.restoration.statistics import measure_picture
+from virest.restoration.statistics import PictureStatistics, measure_picture
 
 LOG_TILE_PX = 128
 """Spacing of the tiles in the log."""
@@ -34,6 +34,10 @@ MIN_GAIN_DB = 0.03
 """A picture of which the measured noise promises less is left alone."""
 FULL_TRUST_DB = 0.8
 """From this expected gain on, a restored picture is taken whole."""
+MIN_SHARE = 0.25
+"""A picture of which no more would be taken is left alone."""
+FULL_TRUST_NOISE = 1.8
+"""Up to this multiple of the gradients' scale, noise does not lessen the trust."""
 MANY_CLIPPED = 0.003
 """With a larger part of clipped pixels the expected gain says nothing: they are no linear blur."""
 
@@ -222,18 +226,15 @@ def _deblurred(
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
     luma, chroma = measure_picture(picture, samples)
     clipped = bool(np.mean(cv2.LUT(picture, curve.clipped_table().astype(np.uint8))) > MANY_CLIPPED)
-    if not luma.measured:
-        return picture, {"method": "none"}, ("picture too small for its blur to be measured, left alone",)
-    if luma.expected_gain_db < MIN_GAIN_DB and not clipped:
-        reason = f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
-        return picture, {"method": "none"}, (reason,)
+    share = 1.0 if clipped or anchor != 0.5 else _trusted_share(luma, settings.deblur)
+    why_not = _too_little_to_gain(luma, clipped, share)
+    if why_not:
+        return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(
         picture, curve, (luma, chroma), lambda centres: kernel_field(motion, centres, anchor), longest_px
     )
     sharp = deblur(blurred, settings)
-    share = 1.0
     if anchor == 0.5:
-        share = 1.0 if clipped else _trusted_share(luma.expected_gain_db, settings.deblur)
         part = np.float32(share) * _blurred_part(motion, settings.min_blur_px)
         sharp = [light + part * (s - light) for s, light in zip(sharp, blurred.light, strict=True)]
     restored = encode_picture(sharp, curve)
@@ -250,6 +251,17 @@ def _deblurred(
     return restored, details, ()
 
 
+def _too_little_to_gain(luma: PictureStatistics, clipped: bool, share: float) -> str:
+    """Why the picture is better left as it was recorded; empty: it is not."""
+    if not luma.measured:
+        return "picture too small for its blur to be measured, left alone"
+    if luma.expected_gain_db < MIN_GAIN_DB and not clipped:
+        return f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
+    if share < MIN_SHARE:
+        return f"noise of {luma.noise_levels:.1f} grey levels drowns the detail, left alone"
+    return ""
+
+
 def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32]:
     """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on."""
     width, height = motion.profile.width, motion.profile.height
@@ -259,14 +271,16 @@ def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32]:
     return cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def _trusted_share(expected_gain_db: float, method: str) -> float:
+def _trusted_share(luma: PictureStatistics, method: str) -> float:
     """How much of a restored picture to take, the rest being the recorded one.
 
     Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
-    both pictures is better than either.  A whole-picture solution errs less than a tiled one.
+    both pictures is better than either.  A whole-picture solution errs less than a tiled one.  Under noise far above
+    the picture's own gradients (a coarsely coded movie) the prior wipes out texture that the recorded picture still has.
     """
     least = 0.7 if method == "hyper-laplacian-global" else 0.5
-    return float(np.clip(least + (1 - least) * expected_gain_db / FULL_TRUST_DB, least, 1.0))
+    share = float(np.clip(least + (1 - least) * luma.expected_gain_db / FULL_TRUST_DB, least, 1.0))
+    return share * min(1.0, FULL_TRUST_NOISE * luma.gradient_scale / luma.noise_levels)
 
 
 class _Clock:
