@@ -17,16 +17,22 @@ from virest.camera.response import ResponseCurve
 from virest.capture.files import is_present
 from virest.capture.folder import MOVIE, read_capture
 from virest.capture.stills import Still, capture_bracket, read_bracket
-from virest.errors import CaptureError, OutputError
+from virest.errors import CaptureError, OutputError, SettingsError
 from virest.report.figures import FORMATS, response_figure
 
 log = logging.getLogger(__name__)
 
-DIGITS = 7
+DIGITS = 8
+"""Significant digits of a written curve."""
 
 
 def calibrate_curve(
-    source: Path, *, exposures: Path | None = None, kind: str = "auto", out: Path | None = None, plot: Path | None = None
+    source: Path,
+    *,
+    exposures: Path | None = None,
+    kind: str = "auto",
+    out: Path | None = None,
+    plot: Path | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Fit the curve and write its files; returns the mapping for ``--json`` and the table for people.
 
@@ -92,15 +98,17 @@ def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, A
 
 
 def _rounded(block: dict[str, Any]) -> dict[str, Any]:
+    # two neighbours of a table may become equal: then all digits are written
     def shorten(value: Any) -> Any:
         if isinstance(value, list):
             return [shorten(item) for item in value]
-        return round(value, DIGITS) if isinstance(value, float) else value
+        return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
-    short = {key: shorten(value) for key, value in block.items()}
+    short: dict[str, Any] = {key: shorten(value) for key, value in block.items()}
     try:
-        ResponseCurve(**{key: tuple(v) if isinstance(v, list) else v for key, v in short.items()})
-    except ValueError:
+        arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in short.items()}
+        ResponseCurve(**arguments)
+    except SettingsError:
         return block
     return short
 
@@ -113,7 +121,7 @@ def format_curve(facts: dict[str, Any]) -> str:
         f"# fit error: {facts['rms_grey_levels']:.3f} grey levels rms; exposures covered: {low:.6g} to {high:.6g}",
     ]
     for p in facts["pictures"]:
-        error = "left out" if p["exposure_error_ev"] is None else f"{p['exposure_error_ev']:+.3f} EV"
+        error = "left out" if p["exposure_error_ev"] is None else f"{round(p['exposure_error_ev'], 3) + 0.0:+.3f} EV"
         mark = f", contradicts the others; likely {p['likely_exposure_s']:.6g} s" if p["contradicts"] else ""
         lines.append(f"# {_one_line(p['file'])}: {p['exposure_s']:.6g} s, error {error}{mark}")
     block = yaml.safe_dump({"response": facts["response"]}, sort_keys=False, default_flow_style=None, width=110)
@@ -128,9 +136,10 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
     """The result for people: one line for the curve, a table of the pictures, the notes."""
     rows = []
     for p in facts["pictures"]:
-        error = "–" if p["exposure_error_ev"] is None else f"{p['exposure_error_ev']:+.3f}"
+        error = "–" if p["exposure_error_ev"] is None else f"{round(p['exposure_error_ev'], 3) + 0.0:+.3f}"
         likely = f"{p['likely_exposure_s']:.6g}" if p["contradicts"] else ""
-        rows.append([_one_line(p["file"]), f"{p['exposure_s']:.6g}", error, "yes" if p["contradicts"] else "no", likely])
+        verdict = "yes" if p["contradicts"] else "no"
+        rows.append([_one_line(p["file"]), f"{p['exposure_s']:.6g}", error, verdict, likely])
     low, high = facts["covered_exposure"]
     block = dict(facts["response"])
     name = block.pop("kind")

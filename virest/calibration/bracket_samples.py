@@ -162,8 +162,8 @@ def _limits(means: Array, variances: Array, pixels: int) -> tuple[float, float, 
         # of squares that hold nothing but noise, this share has a smaller variance than chance x the true one
         chance = float(chi2.ppf(FLAT_SHARE, pixels - 1)) / (pixels - 1)
         bins = np.digitize(greys, np.linspace(8, 247, 13))
-        points = [(greys[bins == i].mean(), np.quantile(spread[bins == i], FLAT_SHARE) / chance) for i in np.unique(bins)
-                  if (bins == i).sum() >= 15]  # fmt: skip
+        groups = [bins == i for i in np.unique(bins) if (bins == i).sum() >= 15]
+        points = [(greys[g].mean(), np.quantile(spread[g], FLAT_SHARE) / chance) for g in groups]
         x, y = np.array(points).T if len(points) > 1 else (np.array([0.0, 255.0]), np.array([1.0, 1.0]))
         b = float(np.clip(np.polyfit(x, y, 1)[0], 0.0, 1.0)) if len(x) > 2 else 0.0
         a = float(np.clip(np.median(y - b * x), 0.05, 400.0))
@@ -246,17 +246,15 @@ def _shift_between(first: NDArray[Any], second: NDArray[Any], first_name: str, s
     if pair is None:
         return np.zeros(2)
     shift, gain = _tested_shift(*pair)
-    if gain < MIN_GAIN:
-        return np.zeros(2)
     parts = [_tested_shift(*(rank[part] for rank in pair)) for part in _quarters(first.shape)]
-    clear = np.array([part for part, part_gain in parts if part_gain > 2 * MIN_GAIN])
-    if len(clear) > 1 and np.hypot(*np.ptp(clear, axis=0)) > RIGID_PX:
+    clear = np.array([part for part, part_gain in parts if part_gain > 1.5 * MIN_GAIN])
+    apart_px = float(np.hypot(*np.ptp(clear, axis=0))) if len(clear) > 1 else 0.0
+    if apart_px > RIGID_PX:
         raise CalibrationError(
-            f"between {first_name} and {second_name} parts of the picture move by {np.hypot(*np.ptp(clear, axis=0)):.1f}"
-            " px against each other",
+            f"between {first_name} and {second_name} parts of the picture move by {apart_px:.1f} px against each other",
             hint="a turn, a near object or a moving scene; take the bracket of a still scene from a tripod",
         )
-    return shift
+    return shift if gain >= MIN_GAIN else np.zeros(2)
 
 
 def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:

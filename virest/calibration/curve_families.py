@@ -49,13 +49,17 @@ def make_family(kind: str, first: FirstCurve, low: float, high: float, top: floa
             slope = np.polyfit(np.log(first.grey[3:] / 255), first.log_light[3:], 1)[0]
             start = np.array([np.log(np.clip(slope, 0.3, 6.0))])
             bounds = np.log([[0.11], [9.0]])
-            return Family(kind, start, bounds[0], bounds[1], lambda p: ResponseCurve("gamma", gamma=float(np.exp(p[0]))))
+            return Family(kind, start, bounds[0], bounds[1], _gamma_curve)
         case "five_segment":
             return _five_segment(first, high, top)
         case "table":
             return _table(first, low, high, top)
     none = np.zeros(0)
     return Family(kind, none, none, none, lambda _p: ResponseCurve(kind))
+
+
+def _gamma_curve(p: Array) -> ResponseCurve:
+    return ResponseCurve("gamma", gamma=float(np.exp(p[0])))
 
 
 # ── five segments ────────────────────────────────────────────────────────────────────────────────────────────────
@@ -86,7 +90,8 @@ def _five_segment(first: FirstCurve, high: float, top: float) -> Family:
         begin = np.clip(np.append(guess, np.log(max(rise, 0.01))), lo + 1e-7, hi - 1e-7)
         found = least_squares(miss, begin, bounds=(lo, hi), max_nfev=25).x[:4]
         # off the bounds, where a trust region would creep
-        starts.append(np.clip(found, lower + [1e-7, 0.01, 0.02, 1e-7], upper - [1e-7, 0.01, 0.02, 1e-7]))
+        inside = np.array([1e-7, 0.01, 0.02, 1e-7])
+        starts.append(np.clip(found, lower + inside, upper - inside))
     return Family("five_segment", starts[0], lower, upper, five_segment_curve, others=tuple(starts[1:]))
 
 
@@ -149,9 +154,9 @@ class LogLookup:
 
 
 def log_lookup(curve: ResponseCurve) -> LogLookup:
-    """Tabulate a curve, denser where it is dark."""
+    """Tabulate a curve, denser at its dark and at its bright end."""
     low, high = (float(v) for v in curve.encode(np.array(curve.light_range)))
-    grey = low + (high - low) * np.linspace(0, 1, FIT_LEVELS) ** 1.5
+    grey = low + (high - low) * (0.5 - 0.5 * np.cos(np.pi * np.linspace(0, 1, FIT_LEVELS)))
     light = np.log(np.maximum(curve.linearise(grey), SMALLEST_LIGHT))
     light = light + 1e-9 * np.arange(FIT_LEVELS)
     slope = np.gradient(255 * grey, light)

@@ -362,18 +362,19 @@ def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: B
     structure = residual_structure(samples.grey[use], left[use])
     tabulated = trials["table"]
     if chosen != "table" and _beaten(trials[chosen], tabulated):
-        gain = 1.0 - (tabulated.held_out_rms / max(trials[chosen].held_out_rms, 1e-9))
+        before = trials[chosen].held_out_rms
+        gain = 1.0 - tabulated.held_out_rms / max(before, 1e-9)
         notes.append(
-            f"{chosen} does not follow the data: residuals share {structure:.2f} grey levels at one grey; a table lowers "
-            f"the held-out rms from {trials[chosen].held_out_rms:.2f} to {tabulated.held_out_rms:.2f} ({gain:.0%}), "
-            "see --kind table"
+            f"{chosen} does not follow the data: residuals share {structure:.2f} grey levels at one grey; a table "
+            f"lowers the held-out rms from {before:.2f} to {tabulated.held_out_rms:.2f} ({gain:.0%}): "
+            "--kind table"
         )
     elif structure > STRUCTURE_LEVELS:
         notes.append(f"structure in the residuals over grey level: {structure:.2f} levels that no kind explains")
     if chosen == "table" and "five_segment" in trials:
         five = trials["five_segment"].held_out_rms
-        notes.append(f"no simpler kind follows: held-out rms {five:.2f} with five_segment, {tabulated.held_out_rms:.2f} "
-                     "with table")  # fmt: skip
+        table = tabulated.held_out_rms
+        notes.append(f"no simpler kind follows: held-out rms {five:.2f} with five_segment, {table:.2f} with table")
     if len(samples.exposure) < MIN_PICTURES:
         notes.append(f"{len(samples.exposure)} pictures are too few to find wrong exposures")
     if samples.exposure.max() / samples.exposure.min() < FEW_RATIO:

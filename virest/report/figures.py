@@ -33,6 +33,11 @@ def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -
     return buffer.getvalue()
 
 
+def _literal(text: str) -> str:
+    """Text that is drawn as it stands: no formula, one line."""
+    return "".join(c if c.isprintable() else "?" for c in text).replace("$", r"\$")
+
+
 def _thinned(fit: CurveFit) -> slice:
     return slice(None, None, max(len(fit.cloud.grey) // MAX_POINTS, 1))
 
@@ -48,9 +53,9 @@ def _draw_curve(axes: Any, fit: CurveFit, title: str) -> None:
     axes.set_xscale("log")
     axes.set_xlim(light[0], light[-1])
     axes.set_ylim(-5, 260)
-    axes.set_xlabel("exposure (brightest covered = 1)")
+    axes.set_xlabel("exposure, the curve's own unit")
     axes.set_ylabel("grey level")
-    axes.set_title(f"{title}  rms {fit.rms_grey_levels:.2f} levels".strip())
+    axes.set_title(f"{_literal(title)}  rms {fit.rms_grey_levels:.2f} levels".strip())
     axes.legend(loc="upper left")
 
 
@@ -79,7 +84,7 @@ def _draw_pictures(axes: Any, fit: CurveFit) -> None:
     reach = max(0.05, 1.15 * max(abs(e) for e in errors))
     axes.set_ylim(-reach, reach)
     labels = [p.file if len(p.file) <= 18 else "…" + p.file[-17:] for p in fit.pictures]
-    axes.set_xticks(range(len(errors)), [text.replace("$", r"\$") for text in labels], rotation=60, ha="right",
+    axes.set_xticks(range(len(errors)), [_literal(text) for text in labels], rotation=60, ha="right",
                     fontsize=8)  # fmt: skip
     axes.set_ylabel("listed / true exposure, EV")
     axes.set_title("exposure error of each picture")

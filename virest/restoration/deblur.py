@@ -31,6 +31,7 @@ BORDER_NOISE_TO_SIGNAL = 0.003
 """Least N / S of tiles that see beyond the picture."""
 RESIDUAL_SHARE = 0.1
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
+SlopeMaker = Callable[[int], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
 
 
@@ -40,8 +41,8 @@ class BlurredPicture:
 
     light: list[Image]
     """Linear light of each channel, (height, width)."""
-    slope: Image
-    """Grey levels per unit of light, smoothed over the neighbourhood, (height, width, 3)."""
+    slopes: SlopeMaker
+    """Grey levels per unit of light of a channel, by its number, smoothed over the neighbourhood, (height, width)."""
     dark: list[Image | None]
     """1.0 where a channel's light was too little to be measured; None: nowhere."""
     clipped: list[Image | None]
@@ -65,12 +66,14 @@ def blurred_picture(
     """Take a picture (height, width, 3) through the inverse of the exposure curve."""
     light = list(cv2.split(cv2.LUT(picture, curve.linear_table())))
     reach = 2 * int(np.ceil(longest_px / 2)) + 3
-    smooth = cv2.blur(picture, (reach, reach))
-    slope = cv2.LUT(smooth, curve.slope_table())
     channels = cv2.split(picture)
     dark = [_dark(channel, curve) for channel in channels]
     clipped = [_clipped(channel, curve) for channel in channels]
-    return BlurredPicture(light, slope, dark, clipped, *statistics, field, longest_px)
+
+    def slopes(channel: int) -> Image:
+        return cv2.LUT(cv2.blur(channels[channel], (reach, reach)), curve.slope_table())
+
+    return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px)
 
 
 def _dark(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
@@ -242,7 +245,7 @@ def _tile_hyper_laplacian(blurred: BlurredPicture, plane: Image, settings: Resto
     gradients = tiles.gradient_power(deconvolution.size)
     projected = deconvolution.back_projected(plane)
     sharp = deconvolution.blend([s * f for s, f in zip(projected, first, strict=True)])
-    scale = blurred.slope[..., 1] * np.float32(1.0 / unit)
+    scale = blurred.slopes(1) * np.float32(1.0 / unit)
     for beta in _beta_schedule(settings.iterations):
         weights = [(guarded if border else trust) / np.float32(beta) for border in deconvolution.at_border]
         factors = [1.0 / (p * w + gradients) for p, w in zip(deconvolution.powers, weights, strict=True)]
@@ -347,7 +350,8 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
     first = _by_tile_hyper_laplacian(blurred, replace(settings, iterations=4))
     reach = _path_reach(blurred) if any(c is not None for c in blurred.clipped) else None
     sharp = []
-    for channel, (light, slope, start) in enumerate(zip(blurred.light, cv2.split(blurred.slope), first, strict=True)):
+    for channel, (light, start) in enumerate(zip(blurred.light, first, strict=True)):
+        slope = blurred.slopes(channel)
         weight, bound = _data_weight(slope, blurred.dark[channel], blurred.clipped[channel], reach)
         result = hyper_laplacian(
             light,

@@ -236,7 +236,8 @@ def _deblurred(
     sharp = deblur(blurred, settings)
     if anchor == 0.5:
         part = np.float32(share) * _blurred_part(motion, settings.min_blur_px)
-        sharp = [light + part * (s - light) for s, light in zip(sharp, blurred.light, strict=True)]
+        if part.min() < 1.0:
+            sharp = [light + part * (s - light) for s, light in zip(sharp, blurred.light, strict=True)]
     restored = encode_picture(sharp, curve)
     details = {
         "method": settings.deblur,

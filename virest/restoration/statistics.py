@@ -30,7 +30,7 @@ _ROUNDING_POWER = 1 / 12
 _SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _FIT_STEPS = 6
 _CELLS = 64
-_MAX_TILES = 16
+_MAX_TILES = 12
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _NOISE_SLOPE = 0.7
@@ -104,11 +104,15 @@ def measure_picture(picture: NDArray[np.uint8], field: KernelField) -> tuple[Pic
     kernels = field.arrays()
     passed = np.stack([_passed(kernels[i]) for i in chosen])
 
-    def observed(plane: NDArray[np.uint8]) -> NDArray[np.float32]:
-        return np.stack([_windowed_power(_cut(plane, corners[i])) for i in chosen])
+    def observed(plane: NDArray[np.uint8], where: NDArray[np.intp]) -> NDArray[np.float32]:
+        return np.stack([_windowed_power(_cut(plane, corners[i])) for i in where])
 
-    both = np.concatenate([observed(red), observed(blue)]), np.concatenate([passed, passed])
-    return _fit_rings(observed(luma), passed, white_noise(luma)), _fit_rings(*both, white_noise(red))
+    fewer = chosen[::2]
+    both = (
+        np.concatenate([observed(red, fewer), observed(blue, fewer)]),
+        np.concatenate([passed[::2], passed[::2]]),
+    )
+    return _fit_rings(observed(luma, chosen), passed, white_noise(luma)), _fit_rings(*both, white_noise(red))
 
 
 def white_noise(plane: NDArray[np.uint8]) -> float:

@@ -1,0 +1,116 @@
+"""``virest calibrate-curve`` as its users meet it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from bracket_making import FIVE, SRGB, make_bracket
+
+from virest.app.calibrate_curve import calibrate_curve
+from virest.app.simulate import simulate_command
+from virest.calibration.response_curve import curve_distance_levels
+from virest.camera.profile import parse_profile
+from virest.camera.response import ResponseCurve
+
+
+def virest(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the program."""
+    command = [sys.executable, "-m", "virest", *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
+
+
+def write_bracket(folder: Path, curve: ResponseCurve, wrong: dict[int, float] | None = None) -> Path:
+    """Write PNGs and their CSV; returns the CSV. ``wrong``: factors on listed exposures."""
+    folder.mkdir(exist_ok=True)
+    lines = ["file,exposure_s"]
+    for i, picture in enumerate(make_bracket(curve, np.random.default_rng(4), width=300, height=220)):
+        cv2.imwrite(str(folder / picture.file), picture.levels[..., ::-1])
+        lines.append(f"{picture.file},{picture.exposure * (wrong or {}).get(i, 1.0):.9g}")
+    table = folder / "exposures.csv"
+    table.write_text("\n".join(lines) + "\n")
+    return table
+
+
+def test_a_bracket_becomes_a_block_for_the_profile(tmp_path: Path) -> None:
+    """JSON as the contract has it, a YAML block that a profile takes, and a figure; nothing else is left behind."""
+    table = write_bracket(tmp_path / "bracket", FIVE, {2: 1.5})
+    done = virest("calibrate-curve", "bracket", "--exposures", table, "--out", "c.yaml", "--plot", "c.png", "--json",
+                  cwd=tmp_path)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["response"]["kind"] == "five_segment"
+    assert {"rms_grey_levels", "covered_exposure", "pictures", "notes"} <= set(facts)
+    assert [p["contradicts"] for p in facts["pictures"]] == [i == 2 for i in range(8)]
+    assert facts["pictures"][2]["exposure_error_ev"] == pytest.approx(np.log2(1.5), abs=0.03)
+    block = yaml.safe_load((tmp_path / "c.yaml").read_text())
+    assert block == {"response": facts["response"]}
+    profile = parse_profile({"virest_profile": 1, "image": {"width": 720, "height": 1280}, **block})
+    assert profile.response is not None
+    assert curve_distance_levels(profile.response, FIVE, tuple(facts["covered_exposure"])) < 1.5
+    assert cv2.imread(str(tmp_path / "c.png")) is not None
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bracket", "c.png", "c.yaml"]
+
+
+def test_people_read_a_table(tmp_path: Path) -> None:
+    """Each picture with its exposure, its error and the verdict; curve.yaml unless named."""
+    table = write_bracket(tmp_path / "bracket", SRGB)
+    done = virest("calibrate-curve", "bracket", "--exposures", table, "--kind", "srgb", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("srgb\n")
+    assert len([line for line in done.stdout.splitlines() if line.startswith("0") and " no" in line]) == 8
+    assert (tmp_path / "curve.yaml").is_file()
+    assert done.stderr == ""
+
+
+def test_refusals_are_one_line_with_their_code(tmp_path: Path) -> None:
+    """Nothing is written, nothing is printed but the line."""
+    table = write_bracket(tmp_path / "bracket", SRGB)
+    rows = table.read_text().splitlines()
+    (tmp_path / "one.csv").write_text("\n".join(rows[:2]) + "\n")
+    (tmp_path / "same.csv").write_text("\n".join([rows[0], *(r.split(",")[0] + ",0.01" for r in rows[1:])]) + "\n")
+    (tmp_path / "nan.csv").write_text("\n".join([rows[0], rows[1].split(",")[0] + ",nan"]) + "\n")
+    cases: list[tuple[tuple[object, ...], int, str]] = [
+        (("bracket", "--exposures", "one.csv"), 6, "1 picture"),
+        (("bracket", "--exposures", "same.csv"), 6, "one exposure"),
+        (("bracket", "--exposures", "nan.csv"), 4, "line 2"),
+        (("bracket",), 4, "EXIF"),
+        (("nowhere",), 4, "no such folder"),
+        (("bracket", "--kind", "cubic"), 2, "five_segment"),
+        (("bracket", "--plot", "c.doc"), 2, ".png"),
+        (("bracket", "--exposures", table, "--out", "no/where.yaml"), 8, "does not exist"),
+    ]
+    for arguments, code, says in cases:
+        result = virest("calibrate-curve", *arguments, cwd=tmp_path)
+        assert result.returncode == code, (arguments, result.stderr)
+        assert len(result.stderr.splitlines()) == 1, result.stderr
+        assert says in result.stderr
+        assert result.stdout == ""
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bracket", "nan.csv", "one.csv", "same.csv"]
+
+
+@pytest.mark.parametrize("truth", [SRGB, FIVE], ids=lambda c: c.kind)
+def test_a_capture_with_changing_exposure_gives_the_curve(tmp_path: Path, truth: ResponseCurve) -> None:
+    """A still scene through H.264, its light changed by known factors that are logged as exposure: within 2 levels."""
+    gains = [2.0 ** (0.6 * (i // 2) - 2.4) for i in range(18)]
+    simulate_command(tmp_path / "trip", width=240, height=320, frames=18, exposure_ms=6, rate_rad_s=1e-4, readout_ms=5,
+                     response=truth, seed=3, effects=["gain_drift=" + ",".join(f"{g:.6f}" for g in gains)])  # fmt: skip
+    path = tmp_path / "trip/movie_metadata.csv"
+    head, *rows = path.read_text().splitlines()
+    column = head.split(",").index("Exposure time[nanosec]")
+    for i, row in enumerate(rows):
+        cells = row.split(",")
+        cells[column] = str(round(float(cells[column]) * gains[i]))
+        rows[i] = ",".join(cells)
+    path.write_text("\n".join([head, *rows]) + "\n")
+    facts, _ = calibrate_curve(tmp_path / "trip")
+    block = {k: tuple(v) if isinstance(v, list) else v for k, v in facts["response"].items()}
+    assert curve_distance_levels(ResponseCurve(**block), truth, tuple(facts["covered_exposure"])) < 2.0
+    assert len(facts["pictures"]) == 9
+    assert not any(p["contradicts"] for p in facts["pictures"])
