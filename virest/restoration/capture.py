@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.profile import CameraProfile
+from virest.camera.profile import CameraProfile, Extensions
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.join import outside_reason
@@ -117,6 +117,9 @@ def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[str, ...]:
         warnings.append("exposure times unknown: frames are not deblurred")
     if profile.depth_m is None:
         warnings.append("translation and depth not estimated: rotation only")
+    extended = [f.name for f in fields(Extensions) if getattr(profile.extensions, f.name) != f.default]
+    if extended:
+        warnings.append(f"extensions not applied to the pictures: {', '.join(extended)}")
     return tuple(warnings)
 
 
