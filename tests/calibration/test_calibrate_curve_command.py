@@ -81,8 +81,6 @@ def test_refusals_are_one_line_with_their_code(tmp_path: Path) -> None:
         (("bracket", "--exposures", "same.csv"), 6, "one exposure"),
         (("bracket", "--exposures", "nan.csv"), 4, "line 2"),
         (("bracket",), 4, "EXIF"),
-        (("nowhere",), 4, "no such folder"),
-        (("bracket", "--kind", "cubic"), 2, "five_segment"),
         (("bracket", "--plot", "c.doc"), 2, ".png"),
         (("bracket", "--exposures", table, "--out", "no/where.yaml"), 8, "does not exist"),
     ]

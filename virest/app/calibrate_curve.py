@@ -143,7 +143,8 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
     low, high = facts["covered_exposure"]
     block = dict(facts["response"])
     name = block.pop("kind")
-    shape = "" if name == "table" else ", ".join(f"{key} {value}" for key, value in block.items())
+    numbers = ", ".join(f"{key} {value}" for key, value in block.items())
+    shape = "" if name == "table" else numbers.removeprefix("gamma ")
     lines = [
         f"{name} {shape}".strip(),
         f"fit error {facts['rms_grey_levels']:.2f} grey levels rms, exposures {low:.4g} to {high:.4g} covered",

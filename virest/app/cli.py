@@ -346,7 +346,7 @@ def calibrate_curve(
 
     \b
     $ virest calibrate-curve bracket --exposures bracket/exposures.csv --plot curve.png
-    gamma gamma 2.1998
+    gamma 2.1998
     fit error 0.47 grey levels rms, exposures 0.0009 to 0.92 covered
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
