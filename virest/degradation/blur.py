@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -44,9 +45,15 @@ class TileGrid:
 
     def windows(self) -> list[Image]:
         """Window (side, side) of each tile: ramps over the overlaps, 1 at the picture's own edges."""
-        rows = _ramps(self.tops, self.side, self.overlap)
-        columns = _ramps(self.lefts, self.side, self.overlap)
-        return [np.outer(r, c).astype(np.float32) for r in rows for c in columns]
+        return _windows(self)
+
+
+@lru_cache(maxsize=8)
+def _windows(grid: TileGrid) -> list[Image]:
+    """The same for every frame of a movie; not to be written to."""
+    rows = _ramps(grid.tops, grid.side, grid.overlap)
+    columns = _ramps(grid.lefts, grid.side, grid.overlap)
+    return [np.outer(r, c).astype(np.float32) for r in rows for c in columns]
 
 
 def tile_grid(height: int, width: int, side: int, overlap: int) -> TileGrid:

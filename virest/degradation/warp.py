@@ -16,7 +16,9 @@ from virest.camera.intrinsics import Intrinsics
 from virest.degradation.row_motion import RowMotion
 
 Array = NDArray[np.float64]
-FIXED_POINT_STEPS = 6
+FIXED_POINT_PX = 1e-5
+"""Rows are known well enough once points move less than this."""
+FIXED_POINT_STEPS = 8
 """Row times depend on where a point lands; each step shrinks the error about thirtyfold."""
 
 
@@ -57,8 +59,11 @@ def seen_by_rows(motion: RowMotion, points_px: Array, at_s: Any, anchor: float, 
     """
     seen = points_px
     for _ in range(FIXED_POINT_STEPS if motion.readout_time_s else 1):
+        before = seen
         row_s = motion.row_start_s(seen) + anchor * motion.exposure_s
         seen = moved_between(motion, points_px, at_s, row_s, inverse_depth)
+        if np.abs(seen - before).max(initial=0.0) < FIXED_POINT_PX:
+            break
     return seen
 
 

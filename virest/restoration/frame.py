@@ -277,7 +277,7 @@ def _trusted_share(luma: PictureStatistics, method: str) -> float:
 
     Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
     both pictures is better than either.  A whole-picture solution errs less than a tiled one.  Under noise far above
-    the picture's own gradients (a coarsely coded movie) the prior wipes out texture that the recorded picture still has.
+    the picture's own gradients (a coarsely coded movie) the prior wipes out texture that the recorded picture has.
     """
     least = 0.7 if method == "hyper-laplacian-global" else 0.5
     share = float(np.clip(least + (1 - least) * luma.expected_gain_db / FULL_TRUST_DB, least, 1.0))

@@ -8,6 +8,7 @@ side, so real filters are plain products.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -104,6 +105,7 @@ def doubled(packed: Image) -> Image:
     return packed
 
 
+@lru_cache(maxsize=8)
 def gradient_power(size: int) -> Image:
     """|Dx|² + |Dy|² of forward differences, as a packed real factor (size, size)."""
     frequency = 4 * np.sin(np.pi * np.arange(size) / size) ** 2
