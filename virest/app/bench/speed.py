@@ -17,8 +17,8 @@ from virest.app.bench.peers import PEERS, frame_motions, peer_deblurred
 from virest.app.bench.tables import table
 from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process, simulated
 
-FRAMES = {"fast": 60, "balanced": 40, "best": 10}
-QUICK_FRAMES = {"fast": 20, "balanced": 10, "best": 5}
+FRAMES = {"fast": 120, "balanced": 80, "best": 20}
+QUICK_FRAMES = {"fast": 60, "balanced": 40, "best": 4}
 JOBS = 2
 PEER_TRIES = 2
 """The quicker one counts."""
