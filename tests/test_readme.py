@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import pytest
 import typer
 from pydantic import BaseModel
 
@@ -17,8 +16,6 @@ TEXT = README.read_text(encoding="utf-8")
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive"}
 """Options of pip and git that a README may name."""
-
-pytestmark = pytest.mark.skipif(len(TEXT.splitlines()) < 20, reason="the README is not written yet")
 
 
 def options_of(command: Any) -> set[str]:

@@ -54,6 +54,7 @@ def test_frames_of_a_car_ride_agree_better_with_a_global_shutter(virest, realdat
     raw, straight = (residuals_px(tracked, camera_matrix(capture)) for tracked in pairs)
     assert len(straight) > 0.7 * len(raw)
     report = f"median residual: raw {np.median(raw):.4f} px, straightened {np.median(straight):.4f} px"
+    print(report)
     assert np.median(straight) < 0.9 * np.median(raw), report
     assert np.quantile(straight, 0.75) < 0.9 * np.quantile(raw, 0.75), report
 
