@@ -3,7 +3,8 @@
 import pytest
 import yaml
 
-from virest.camera.kalibr import is_kalibr, parse_camchain, read_camchain
+from virest.camera.kalibr import is_kalibr, parse_camchain
+from virest.capture.profile_source import read_any_profile
 from virest.errors import SettingsError
 
 CHAIN = {
@@ -24,7 +25,7 @@ def test_a_camchain_file_becomes_a_profile(tmp_path):
     """Intrinsics, distortion, pose, time shift and line delay arrive in the profile."""
     path = tmp_path / "camchain-imucam.yaml"
     path.write_text(yaml.safe_dump(CHAIN))
-    profile = read_camchain(path)
+    profile = read_any_profile(path)
     assert (profile.width, profile.height) == (1280, 720)
     assert profile.intrinsics.coefficients == (0.1, -0.2, 0.001, 0.002, 0.0)
     assert profile.intrinsics.fy_px == 913.0

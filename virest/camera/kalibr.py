@@ -7,10 +7,9 @@ gives the readout.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-from virest.camera.profile import CameraProfile, load_yaml_mapping, parse_profile
+from virest.camera.profile import CameraProfile, parse_profile
 from virest.errors import SettingsError
 
 _DISTORTIONS = {
@@ -25,13 +24,11 @@ def is_kalibr(content: dict[str, Any]) -> bool:
     return "cam0" in content and "virest_profile" not in content
 
 
-def read_camchain(path: Path) -> CameraProfile:
-    """The first camera of a Kalibr camera chain. Raises SettingsError with the key that is missing or not usable."""
-    return parse_camchain(load_yaml_mapping(path), path.name)
-
-
 def parse_camchain(content: dict[str, Any], name: str = "camchain") -> CameraProfile:
-    """Build a profile from the chain's mapping; ``name`` is used in messages."""
+    """The chain's first camera as a profile; ``name`` is used in messages.
+
+    Raises SettingsError with the key that is missing or not usable.
+    """
     camera = content["cam0"]
     if not isinstance(camera, dict):
         raise SettingsError(f"{name}: cam0 has no keys", hint="is it a Kalibr camchain?")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +79,6 @@ def plan_restoration(
     profile: CameraProfile,
     settings: RestorationSettings,
     read_gray: GrayReader,
-    progress: Callable[..., Any] | None = None,
 ) -> RestorationPlan:
     """Fill what the profile leaves open from a few dozen frames, and ask whether pictures and gyroscope agree at all.
 

@@ -198,7 +198,7 @@ def _source_map(
     """Where each pixel of the output was recorded; None where nothing would move."""
     corners = corner_points(motion.profile.width, motion.profile.height)
     moved_px = np.abs(straightened_points(motion, corners, anchor) - corners).max()
-    if deblurred == "none" and moved_px < MIN_WARP_PX:
+    if deblurred == "none" and (moved_px < MIN_WARP_PX or not motion.profile.readout_known):
         return None
     return perspective_map(motion, anchor) if settings.shutter == "perspective" else rowwise_map(motion, anchor)
 
