@@ -3,7 +3,7 @@
 #   make test     all tests: the fast ones first, then the scenarios
 #   make bench    quality and speed tables
 #   make lint     ruff and mypy
-#   make sample   write sample_data/ anew
+#   make sample   write sample_data/ and the README's pictures anew
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -37,6 +37,10 @@ lint: $(READY)
 
 sample: $(READY)
 	$(BIN)/python -m virest.app.sample sample_data --picture docs/before_after.png
+	$(BIN)/virest simulate demo-out/bracket --auto-exposure 5:9 --rate 0 --exposure-ms 4 --frames 27 \
+		--width 640 --height 480 --response five_segment --overwrite --quiet
+	$(BIN)/virest calibrate-curve demo-out/bracket --out demo-out/curve.yaml --plot docs/curve.png
+	rm -rf demo-out/bracket demo-out/curve.yaml
 
 clean:
 	rm -rf demo-out bench-out virest-out build dist .pytest_cache .mypy_cache .ruff_cache

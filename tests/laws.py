@@ -18,7 +18,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
-from virest.degradation.row_motion import RowMotion, row_motion
+from virest.degradation.row_motion import FrameTranslation, RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
@@ -104,8 +104,10 @@ class TurningCamera:
     @property
     def motion(self) -> RowMotion:
         """What the package makes of it."""
-        velocity = None if self.velocity_m_s is None else np.array(self.velocity_m_s)
-        return row_motion(self.trajectory, self.profile, self.stamp_s, self.exposure_s, self.reference, velocity)
+        translation = None
+        if self.velocity_m_s is not None:
+            translation = FrameTranslation(np.array(self.velocity_m_s), np.zeros(3), np.zeros(3))
+        return row_motion(self.trajectory, self.profile, self.stamp_s, self.exposure_s, self.reference, translation)
 
     def seen(self, points_px: Array, from_s: Any, to_s: Any, reference_s: float, depth_m: float = np.inf) -> Array:
         """Truth: pixels (n, 2) at ``to_s`` of what is seen at pixels (n, 2) at ``from_s``, times (n,) or scalars.

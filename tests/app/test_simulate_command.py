@@ -26,6 +26,17 @@ def test_a_simulated_capture_can_be_inspected_and_processed(virest: Virest, tmp_
     assert [json.loads(line)["frame"] for line in done.stdout.splitlines()] == [0, 1, 2]
 
 
+def test_a_still_bracket_can_be_asked_for(virest: Virest, tmp_path: Path) -> None:
+    """``--auto-exposure 4:2 --rate 0``: two exposures 4 EV apart, and the summary names their range."""
+    made = virest("simulate", "trip", *SMALL, "--auto-exposure", "4:2", "--rate", 0, "--json", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    facts = json.loads(made.stdout)
+    assert facts["auto_exposure_ev"] == 4.0
+    assert facts["blur_px"] == 0.0
+    low, high = (e * iso for e, iso in zip(facts["exposure_range_ms"], facts["iso_range"], strict=True))
+    assert high / low == pytest.approx(16, rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
@@ -33,6 +44,9 @@ def test_a_simulated_capture_can_be_inspected_and_processed(virest: Virest, tmp_
         (("--scene", "moon"), 3, "leaves"),
         (("--frames", 0), 3, "frames"),
         (("--exposure-ms", "10;20"), 2, "milliseconds"),
+        (("--auto-exposure", "much"), 2, "6:9"),
+        (("--auto-exposure", "20"), 3, "12"),
+        (("--auto-exposure", "3:1"), 3, "at least 2"),
         (("--direction", "up"), 2, "top_to_bottom"),
     ],
 )

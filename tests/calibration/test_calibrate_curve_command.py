@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from bracket_making import FIVE, SRGB, make_bracket
+from bracket_making import FIVE, FIVE_LOW_TOP, SRGB, make_bracket
 
 from virest.app.calibrate_curve import calibrate_curve
 from virest.app.simulate import simulate_command
@@ -93,22 +95,56 @@ def test_refusals_are_one_line_with_their_code(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bracket", "nan.csv", "one.csv", "same.csv"]
 
 
-@pytest.mark.parametrize("truth", [SRGB, FIVE], ids=lambda c: c.kind)
-def test_a_capture_with_changing_exposure_gives_the_curve(tmp_path: Path, truth: ResponseCurve) -> None:
-    """A still scene through H.264, its light changed by known factors that are logged as exposure: within 2 levels."""
-    gains = [2.0 ** (0.6 * (i // 2) - 2.4) for i in range(18)]
-    simulate_command(tmp_path / "trip", width=240, height=320, frames=18, exposure_ms=6, rate_rad_s=1e-4, readout_ms=5,
-                     response=truth, seed=3, effects=["gain_drift=" + ",".join(f"{g:.6f}" for g in gains)])  # fmt: skip
-    path = tmp_path / "trip/movie_metadata.csv"
-    head, *rows = path.read_text().splitlines()
-    column = head.split(",").index("Exposure time[nanosec]")
-    for i, row in enumerate(rows):
-        cells = row.split(",")
-        cells[column] = str(round(float(cells[column]) * gains[i]))
-        rows[i] = ",".join(cells)
-    path.write_text("\n".join([head, *rows]) + "\n")
+@pytest.mark.parametrize(
+    ("truth", "exposures"),
+    [(SRGB, {"auto_exposure_ev": 5.0, "auto_exposure_steps": 9, "frames": 27}),
+     (FIVE_LOW_TOP, {"auto_exposure_ev": 5.0, "auto_exposure_steps": 9, "frames": 27}),
+     (FIVE, {"auto_exposure_ev": 4.0, "frames": 45})],
+    ids=["srgb-steps", "low-top-steps", "five-walk"],
+)  # fmt: skip
+def test_a_still_capture_under_auto_exposure_gives_the_curve(
+    tmp_path: Path, truth: ResponseCurve, exposures: dict[str, Any]
+) -> None:
+    """Exposure and ISO change by steps or by a walk, through H.264 at the recorder's bit rate: within 2 grey levels."""
+    simulate_command(tmp_path / "trip", width=320, height=240, exposure_ms=5, rate_rad_s=0.0, readout_ms=10,
+                     response=truth, seed=3, **exposures)  # fmt: skip
     facts, _ = calibrate_curve(tmp_path / "trip")
     block = {k: tuple(v) if isinstance(v, list) else v for k, v in facts["response"].items()}
-    assert curve_distance_levels(ResponseCurve(**block), truth, tuple(facts["covered_exposure"])) < 2.0
-    assert len(facts["pictures"]) == 9
+    found, covered = ResponseCurve(**block), tuple(facts["covered_exposure"])
+    assert curve_distance_levels(found, truth, covered) < 2.0
+    low, high = 255 * found.encode(np.array(covered))
+    assert low < 30
+    assert high > 0.93 * 255 * truth.y_max
     assert not any(p["contradicts"] for p in facts["pictures"])
+
+
+def test_a_capture_whose_exposure_stays_is_refused(tmp_path: Path) -> None:
+    """Exit 6: one exposure says nothing of the curve."""
+    simulate_command(tmp_path / "trip", width=160, height=120, frames=6, rate_rad_s=0.0)
+    done = virest("calibrate-curve", "trip", cwd=tmp_path)
+    assert done.returncode == 6
+    assert "1 picture" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_brackets_that_determine_nothing_leave_by_6(tmp_path: Path) -> None:
+    """A folder of one picture, pictures all clipped, and two exposures too far apart to overlap."""
+    light = np.random.default_rng(8).uniform(0.0, 1.0, (90, 120, 1)).repeat(3, axis=2) ** 2 * 200 + 20
+    scene = cv2.GaussianBlur(light, (0, 0), 3)
+    white, black = np.full((90, 120, 3), 255, np.uint8), np.zeros((90, 120, 3), np.uint8)
+    folders = {
+        "one": ([scene], [0.01], "1 picture"),
+        "clipped": ([white, black, white, black], [0.01, 0.02, 0.04, 0.08], "clipped throughout"),
+        "apart": ([scene / 60, np.minimum(scene * 60, 255)], [0.0001, 0.36], "no overlap|clipped throughout"),
+    }
+    for name, (pictures, exposures, says) in folders.items():
+        (tmp_path / name).mkdir()
+        for i, picture in enumerate(pictures):
+            cv2.imwrite(str(tmp_path / name / f"{i}.png"), np.rint(picture).astype(np.uint8))
+        rows = [f"{i}.png,{exposure}" for i, exposure in enumerate(exposures)]
+        (tmp_path / name / "e.csv").write_text("\n".join(["file,exposure_s", *rows]) + "\n")
+        done = virest("calibrate-curve", name, "--exposures", f"{name}/e.csv", cwd=tmp_path)
+        assert done.returncode == 6, (name, done.stderr)
+        assert re.search(says, done.stderr), done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.glob("*.yaml"))

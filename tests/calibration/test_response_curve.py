@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from bracket_making import FIVE, FIVE_LOW_TOP, GAMMA, LINEAR, SRGB, make_bracket, make_scene, take
 
-from virest.calibration.bracket_samples import BracketPicture, align_pictures
+from virest.calibration.bracket_samples import BracketPicture, align_pictures, sample_bracket
 from virest.calibration.curve_families import log_lookup, table_curve
-from virest.calibration.exposure_check import outlying, robust_line
+from virest.calibration.exposure_check import fit_first_curve, outlying, robust_line
 from virest.calibration.response_curve import curve_distance_levels, fit_response, residual_structure, scale_exposure
 from virest.camera.response import ResponseCurve
 from virest.errors import CalibrationError, SettingsError
@@ -131,6 +131,32 @@ def test_clipped_pixels_and_a_moving_corner_do_not_pull(rng: np.random.Generator
     assert fit.curve.kind == "srgb"
     assert fit.pictures[-1].exposure_error_ev is None
     assert any(note.startswith("white.png") and "clipped" in note for note in fit.notes)
+
+
+def test_a_picture_with_hardly_a_usable_grey_does_not_spoil_the_rest(rng: np.random.Generator) -> None:
+    """An all but black picture whose few greys a codec raised: the first curve keeps its slope, nobody is accused."""
+    bracket = make_bracket(FIVE_LOW_TOP, rng)
+    levels = 255 * FIVE_LOW_TOP.encode(FIVE_LOW_TOP.linearise(bracket[0].levels / 255) * 0.6)
+    dark = BracketPicture("dark.png", np.rint(levels * 1.5 + 2).astype(np.uint8), bracket[0].exposure * 0.4)
+    samples = sample_bracket([dark, *bracket], rng)
+    first = fit_first_curve(samples.take(samples.measured.sum(axis=1) >= 2))
+    light = FIVE_LOW_TOP.linearise(first.grey / 255)
+    span = np.log(light[10] / light[2])
+    assert first.log_light[10] - first.log_light[2] == pytest.approx(span, rel=0.15)
+    assert np.abs(first.correction_ev[1:]).max() < 0.3
+
+
+def test_a_plateau_below_white_is_seen_through_overshoot(rng: np.random.Generator) -> None:
+    """A curve that ends at level 237 is known to, although a few pixels beyond edges reach 255."""
+    bracket = make_bracket(FIVE_LOW_TOP, rng)
+    for picture in bracket:
+        picture.levels[(rng.uniform(size=picture.levels.shape[:2]) < 2e-3) & (picture.levels[..., 1] > 225)] = 255
+    samples = sample_bracket(bracket, rng)
+    assert 234 < samples.top < 240
+    assert samples.high < 237
+    fit = fit_response(bracket)
+    assert fit.curve.kind == "five_segment"
+    assert curve_distance_levels(fit.curve, FIVE_LOW_TOP, fit.covered_exposure) < 0.8
 
 
 # ── misalignment ─────────────────────────────────────────────────────────────────────────────────────────────────

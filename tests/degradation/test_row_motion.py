@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
 from virest.capture.imu import ImuSamples
-from virest.degradation.row_motion import row_motion
+from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.motion.integration import integrate_gyro
 
 CAMERA = TurningCamera(phone(), velocity_m_s=(0.4, -0.25, 0.6))
@@ -36,6 +36,37 @@ def test_poses_carry_the_translation() -> None:
     expected = Rotation.from_rotvec(-since * np.array(CAMERA.rate_rad_s)).apply(point - since * velocity)
     assert translation is not None
     np.testing.assert_allclose(rotation @ point + translation, expected, atol=1e-6)
+
+
+SWAY = FrameTranslation(
+    np.array([0.4, -0.25, 0.6]), np.array([-3.0, 5.0, 2.0]), np.array([0.08, -0.11, 0.45]), 1 / 0.45, "profile"
+)
+"""A camera that also accelerates, before a plane that leans away."""
+
+
+def test_an_accelerated_camera_is_where_the_law_puts_it() -> None:
+    """The centre is at v (t − ref) + ½ a (t − ref)² in the axes at the reference; its velocity is v + a (t − ref)."""
+    motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=SWAY)
+    since = 0.0231
+    rotation, shift = motion.pose(motion.reference_s + since)
+    assert shift is not None
+    centre = -rotation.T @ shift
+    np.testing.assert_allclose(centre, since * SWAY.velocity_m_s + since**2 / 2 * SWAY.acceleration_m_s2, atol=1e-7)
+    np.testing.assert_allclose(SWAY.velocity_at(0.1), [0.1, 0.25, 0.8])
+
+
+def test_the_plane_stays_where_it_is_while_the_camera_moves() -> None:
+    """A point on the plane has, at any time, the inverse depth that the plane gives on the ray to it."""
+    motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=SWAY)
+    rays = np.array([[0.3, -0.2, 1.0], [-0.4, 0.25, 1.0]])
+    points = rays / (rays @ SWAY.inverse_depth_plane)[:, None]
+    for since in (0.0, 0.011, 0.03):
+        time_s = motion.reference_s + since
+        rotation, shift = motion.pose(time_s)
+        seen = points @ rotation.T + shift
+        np.testing.assert_allclose(motion.inverse_depth(seen / seen[:, 2:], time_s), 1 / seen[:, 2], atol=1e-9)
+    beyond = np.array([[0.0, 9.0, 1.0]])
+    assert motion.inverse_depth(beyond, motion.reference_s).tolist() == [0.0]
 
 
 def test_relative_poses_compose() -> None:

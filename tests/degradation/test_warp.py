@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.camera.shutter import READOUT_DIRECTIONS
+from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.degradation.warp import (
     corner_points,
     dense_map,
-    move_points,
     moved_between,
     recorded_points,
     seen_by_rows,
     straightened_points,
 )
+from virest.motion.optics import MovingLens, stabiliser_shift
 
 LENSES = [pytest.param(lens, id=lens[0]) for lens in (UNDISTORTED, RADTAN, FISHEYE)]
 
@@ -40,11 +41,9 @@ def _points() -> NDArray[np.float64]:
 )
 def test_points_move_against_the_camera(axis: str, start: tuple[float, float], expected: tuple[int, int]) -> None:
     """A camera that turns right moves points left; one that looks up moves them down; clockwise, them anticlockwise."""
-    turn = {"yaw right": (0, 0.01, 0), "pitch up": (0.01, 0, 0), "roll clockwise": (0, 0, 0.01)}[axis]
-    lens = phone().intrinsics
-    assert lens is not None
-    rotation = Rotation.from_rotvec(turn).inv().as_matrix()  # R_t_ref of a camera whose axes turn by `turn`
-    moved = move_points(lens, np.array([start]), rotation, None)[0] - start
+    turn = {"yaw right": (0, 1, 0), "pitch up": (1, 0, 0), "roll clockwise": (0, 0, 1)}[axis]
+    motion = TurningCamera(phone(), rate_rad_s=turn).motion
+    moved = (moved_between(motion, np.array([start]), motion.start_s, motion.start_s + 0.01) - start)[0]
     assert np.sign(np.round(moved, 1)).tolist() == list(expected)
     assert np.abs(moved).max() == pytest.approx(0.01 * (76 if axis == "roll clockwise" else 218), rel=0.03)
 
@@ -146,7 +145,44 @@ def test_corners_go_round_clockwise_from_the_top_left() -> None:
 
 def test_geometry_without_a_lens_is_refused() -> None:
     """Where the focal length is unknown no point can be moved."""
-    motion = TurningCamera(phone()).motion
-    blind = replace(motion, profile=replace(motion.profile, intrinsics=None))
+    blind = TurningCamera(replace(phone(), intrinsics=None)).motion
     with pytest.raises(ValueError, match="intrinsics"):
         straightened_points(blind, _points())
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_points_of_the_frames_plane_move_as_points_in_space(lens: tuple[str, tuple[float, ...]]) -> None:
+    """Turn, shift, drift and stabiliser together: each end is an explicit projection at its own time."""
+    plane = np.array([0.06, -0.1, 0.5])
+    sway = FrameTranslation(np.array([0.5, -0.3, 0.2]), np.array([-2.0, 4.0, 1.0]), plane, 2.0, "profile")
+    profile = phone(lens=lens)
+    moving = replace(profile.extensions, focal_drift_per_s=0.3, stabilisation_fraction=0.8, stabilisation_cutoff_hz=1.5)
+    camera = TurningCamera(replace(profile, extensions=moving))
+    motion = row_motion(camera.trajectory, camera.profile, 0.1, 0.012, translation=sway)
+    points = _points()
+    rays = motion.optics.rays(points, motion.reference_s)
+    space = rays / (rays @ plane)[:, None]
+    since = np.linspace(0.001, 0.03, len(points))
+    at_s = motion.reference_s + since
+    centre = since[:, None] * (sway.velocity_m_s + since[:, None] / 2 * sway.acceleration_m_s2)
+    turned = Rotation.from_rotvec(-since[:, None] * np.array(camera.rate_rad_s)).apply(space - centre)
+    expected = motion.optics.project(turned, at_s)
+    there = moved_between(motion, points, motion.reference_s, at_s)
+    np.testing.assert_allclose(there, expected, atol=1e-3)
+    np.testing.assert_allclose(moved_between(motion, there, at_s, motion.reference_s), points, atol=1e-6)
+    straight = straightened_points(motion, recorded_points(motion, points, 0.5), 0.5)
+    np.testing.assert_allclose(straight, points, atol=1e-4)
+    assert np.abs(there - moved_between(motion, points, motion.reference_s, at_s, 0.0)).max() > 1.0
+
+
+def test_the_stabiliser_holds_the_picture() -> None:
+    """With the whole of yaw and pitch cancelled and next to no cutoff, the picture's middle stays where it is."""
+    rate = (0.35, -0.8, 0.0)
+    motion = TurningCamera(phone(), rate).motion
+    time_s = motion.start_s + np.linspace(0, 0.03, 31)
+    shift = stabiliser_shift(time_s, np.tile(rate, (31, 1)), 1.0, 1e-6)
+    held = replace(motion, lens=MovingLens(motion.optics.lens, 0.0, time_s, shift))
+    centre = np.array([[104.0, 63.92]])
+    free, kept = (moved_between(m, centre, m.start_s, m.start_s + 0.02) - centre for m in (motion, held))
+    assert np.abs(free).max() > 3
+    np.testing.assert_allclose(kept, 0, atol=0.02)

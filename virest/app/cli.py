@@ -227,6 +227,16 @@ def _parse_exposures(text: str) -> list[float]:
         raise typer.BadParameter(f"{text!r} is no list of milliseconds; write 10 or 5,10,20") from None
 
 
+def _parse_auto_exposure(text: str | None) -> tuple[float | None, int | None]:
+    """Parse a range in EV, and the number of exposures where a staircase is asked for: ``4`` or ``6:9``."""
+    if text is None:
+        return None, None
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(?::\s*([0-9]{1,6})\s*)?", text, re.ASCII)
+    if found is None:
+        raise typer.BadParameter(f"{text!r} is no range of exposures; write 4 (a smooth walk), or 6:9 (nine steps)")
+    return float(found[1]), None if found[2] is None else int(found[2])
+
+
 def _describe_simulation(facts: dict[str, Any]) -> str:
     effects = [
         f"{effect['name']} ({', '.join(f'{name} {value}' for name, value in effect['parameters'].items())})"
@@ -251,13 +261,20 @@ def simulate(
     frames: Annotated[int, typer.Option(metavar="N")] = 12,
     fps: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
     exposure_ms: Annotated[str, typer.Option(metavar="MS[,MS...]", help="Exposure; several are taken in turn.")] = "10",
+    auto_exposure: Annotated[
+        str | None,
+        typer.Option(
+            metavar="EV[:STEPS]",
+            help="Exposure x ISO and the brightness change by EV: a smooth walk, or STEPS exposures. [they stay]",
+        ),
+    ] = None,
     readout_ms: Annotated[float, typer.Option(metavar="MS", help="First row to one past the last.")] = 20.0,
     direction: Annotated[
         str | None,
         typer.Option(metavar="DIRECTION", callback=_one_of(DIRECTIONS), help=f"Readout: {', '.join(DIRECTIONS)}."),
     ] = None,
     focal_px: Annotated[float | None, typer.Option(metavar="PX", help="Focal length.")] = None,
-    rate: Annotated[float, typer.Option(metavar="RAD_S", help="How fast the hand turns.")] = 1.0,
+    rate: Annotated[float, typer.Option(metavar="RAD_S", help="How fast the hand turns; 0: not at all.")] = 1.0,
     noise: Annotated[float, typer.Option(metavar="LEVELS", help="Noise of the picture, grey levels.")] = 1.5,
     response: Annotated[
         str, typer.Option(metavar="CURVE", help="srgb, linear, gamma:2.2, five_segment[:xb,yb,xc,yc,y_max].")
@@ -284,9 +301,14 @@ def simulate(
     $ virest simulate leaves --frames 20 --rate 1.5 --effect time_offset=0.012
     leaves: 20 frames of 720x1280, blur 9.1 px, effects: time_offset (time_offset_s 0.012)
     $ virest process leaves
+
+    \b
+    $ virest simulate bracket --auto-exposure 5:9 --rate 0 --exposure-ms 4 --frames 27
+    $ virest calibrate-curve bracket
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     exposures_ms = _parse_exposures(exposure_ms)
+    auto_exposure_ev, auto_exposure_steps = _parse_auto_exposure(auto_exposure)
     _one_thread_each()
     from virest.app.simulate import simulate_command
     from virest.camera.profile import read_profile
@@ -300,6 +322,8 @@ def simulate(
             frames=frames,
             fps=fps,
             exposure_ms=exposures_ms,
+            auto_exposure_ev=auto_exposure_ev,
+            auto_exposure_steps=auto_exposure_steps,
             readout_ms=readout_ms,
             direction=direction,
             focal_px=focal_px,

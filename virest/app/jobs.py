@@ -29,6 +29,7 @@ from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.video import MovieIndex, read_frames
 from virest.errors import OutputError, SettingsError, VirestError
+from virest.motion.optics import settling_time_s
 from virest.restoration.capture import RestorationPlan, restore_frames
 from virest.restoration.frame import RestoredFrame
 
@@ -84,20 +85,23 @@ def cut_frames(frames: Sequence[Frame], keyframes: Iterable[int]) -> list[tuple[
 
 
 def cut_imu(imu: ImuSamples, frames: Sequence[Frame], plan: RestorationPlan) -> ImuSamples:
-    """The samples that cover these frames' exposures, with a second to spare on both sides."""
+    """The samples that cover these frames' exposures, with a second to spare on both sides.
+
+    A stabiliser's place depends on the motion before; its samples begin early enough for the cut not to matter.
+    """
     profile = plan.profile
     rate, offset_s = 1.0 + profile.clock_skew, profile.time_offset_s or 0.0
     longest_s = max((frame.exposure_s or 0.0) for frame in frames) * profile.shutter.exposure_scale
     spare_s = IMU_MARGIN_S + longest_s + profile.shutter.readout_time_s + profile.extensions.frame_lag_s
     start_s, end_s = (frames[i].time_s * rate + offset_s for i in (0, -1))
-    return imu.between(start_s - spare_s, end_s + spare_s)
+    return imu.between(start_s - spare_s - settling_time_s(profile), end_s + spare_s)
 
 
 def make_segment(
     frames: tuple[Frame, ...], capture: Capture, name: str, index: MovieIndex, plan: RestorationPlan, run: RunFolder
 ) -> Segment:
     """One segment as a worker takes it."""
-    return Segment(name, capture.movie, index, frames, cut_imu(capture.imu, frames, plan), plan, run)
+    return Segment(name, capture.movie, index, frames, cut_imu(capture.imu, frames, plan), plan.of(frames), run)
 
 
 # ── the work on one segment ──────────────────────────────────────────────────────────────────────────────────────

@@ -50,7 +50,7 @@ from virest.capture.folder import (
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, OutputError, SettingsError
-from virest.restoration.capture import RestorationPlan, plan_restoration
+from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration
 from virest.restoration.settings import RestorationSettings
 
 log = logging.getLogger(__name__)
@@ -188,8 +188,8 @@ def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> 
     profile, source = resolve_profile(capture, options.config)
     log.info("%s: camera profile from %s", name, source)
     chosen = sorted(range(len(capture.frames))[options.frames])
-    keep = options.settings.keep_start_up or profile.extensions.frame_lag_frames > 0
-    selected = tuple(_admit(capture.frames[i], keep_start_up=keep) for i in chosen)
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    selected = tuple(_admit(frames[i], keep_start_up=options.settings.keep_start_up) for i in chosen)
     return _Job(name, run, capture, profile, str(source), selected, _request(capture, profile, options, chosen))
 
 
@@ -237,6 +237,8 @@ def _plan(job: _Job, index: MovieIndex, settings: RestorationSettings) -> Restor
         if name not in job.profile.estimates:
             spread = "" if estimate.std is None else f" ± {estimate.std}"
             log.info("%s: %s = %s%s (%s)", job.name, name, estimate.value, spread, estimate.source)
+    for note in plan.notes:
+        log.info("%s: %s", job.name, note)
     for warning in plan.warnings:
         log.warning("%s: %s", job.name, warning)
     if plan.copy_reason:

@@ -11,6 +11,7 @@ import numpy as np
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
+from virest.simulation.auto_exposure import AutoExposure
 from virest.simulation.effects import EffectContext, hide_effects
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import Session, SessionSettings, nominal_camera, plan_session
@@ -25,6 +26,8 @@ def simulate_command(
     frames: int = 12,
     fps: float = 30.0,
     exposure_ms: float | Sequence[float] = 10.0,
+    auto_exposure_ev: float | None = None,
+    auto_exposure_steps: int | None = None,
     readout_ms: float = 20.0,
     direction: str | None = None,
     focal_px: float | None = None,
@@ -51,8 +54,12 @@ def simulate_command(
 ) -> dict[str, Any]:
     """Simulate a recording and write it to ``out``; returns a summary for ``--json``.
 
-    exposure_ms: one exposure, or several that the frames take in turn.  direction: right_to_left for an upright picture
-    and top_to_bottom for one on its side, unless given.  depth_m: distance of the scene's plane, None for infinity.
+    exposure_ms: one exposure, or several that the frames take in turn; the ISO makes up for a change.
+    auto_exposure_ev: exposure × ISO, and the brightness with them, walk smoothly over so many EV about exposure_ms;
+    with auto_exposure_steps they climb a staircase of so many exposures.  rate_rad_s: 0 is a camera that does not turn;
+    where it does not sway either (no depth_m, or sway_m 0), the pictures are still.  direction: right_to_left for an
+    upright picture and top_to_bottom for one on its side, unless given.  depth_m: distance of the scene's plane, None
+    for infinity.
     effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), hidden from everything but ``truth/``.
     reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  profile: use this camera as the nominal
     one; width, height, focal_px, distortion, readout_ms, direction and response are then taken from it.
@@ -75,6 +82,7 @@ def simulate_command(
         frames=frames,
         fps=fps,
         exposure_s=tuple(e / 1000 for e in exposures_ms),
+        auto_exposure=_auto_exposure(auto_exposure_ev, auto_exposure_steps),
         rate_rad_s=rate_rad_s,
         sway_m=sway_m,
         tilt_rad=(float(np.deg2rad(tilt_deg[0])), float(np.deg2rad(tilt_deg[1]))),
@@ -103,7 +111,26 @@ def simulate_command(
         "readout_direction": nominal.shutter.readout_direction,
         "seed": seed,
         "blur_px": _blur_px(session),
+        **_exposed(session),
         "effects": [{"name": effect.name, "parameters": effect.parameters} for effect in applied],
+    }
+
+
+def _auto_exposure(range_ev: float | None, steps: int | None) -> AutoExposure | None:
+    if range_ev is None and steps is not None:
+        raise SettingsError(f"{steps} exposures over no range", hint="give the range in EV too")
+    return None if range_ev is None else AutoExposure(range_ev, steps)
+
+
+def _exposed(session: Session) -> dict[str, Any]:
+    """What auto-exposure did: shortest and longest logged exposure, lowest and highest ISO."""
+    if session.settings.auto_exposure is None:
+        return {}
+    exposures = session.exposures
+    return {
+        "auto_exposure_ev": session.settings.auto_exposure.range_ev,
+        "exposure_range_ms": [round(float(e) * 1000, 4) for e in (exposures.logged_s.min(), exposures.logged_s.max())],
+        "iso_range": [int(exposures.iso.min()), int(exposures.iso.max())],
     }
 
 

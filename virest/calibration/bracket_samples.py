@@ -31,6 +31,8 @@ MIN_SITES = 40
 FLAT_SHARE = 0.1
 PILE = 0.02
 """Share of the samples within the noise of the darkest or brightest that makes it a place where greys pile up."""
+ABOVE_PILE = 0.1
+"""Greys brighter than a pile that is the curve's end are fewer than this share of it."""
 MIN_SHARED = 25
 """Samples that two pictures must both see unclipped, so that their exposures can be compared."""
 
@@ -170,10 +172,26 @@ def _limits(means: Array, variances: Array, pixels: int) -> tuple[float, float, 
     margin = float(np.clip(3.0 * np.sqrt(a + 128 * b), 2.0, 12.0))
     bottom, top = (float(v) for v in np.quantile(means, [0.001, 0.999]))
     low = bottom + margin if np.mean(means < bottom + margin) > PILE else bottom
+    top = min(top, _plateau(means, margin))
     high = top - margin if np.mean(means > top - margin) > PILE else top
     # the floor keeps rounding of the levels, which neighbours share, from counting as precision
     noise = (a / pixels + 0.15**2, b / pixels)
     return max(low, margin), min(high, 255.0 - margin), top, noise
+
+
+def _plateau(means: Array, margin: float) -> float:
+    """The bright grey at which greys pile up with next to nothing above it; 255 without such a pile.
+
+    A curve may end below 255, and what a movie's codec adds at edges there still reach 255: no quantile finds the end.
+    """
+    counts = np.bincount(np.rint(means).ravel().astype(np.int64), minlength=256)
+    reach = int(np.ceil(margin))
+    pile = np.convolve(counts, np.ones(2 * reach + 1), "same")
+    place = 128 + int(np.argmax(pile[128:]))
+    lonely = counts[place + reach + 1 :].sum() < ABOVE_PILE * pile[place]
+    if pile[place] < PILE * means.size or not lonely:
+        return 255.0
+    return float(np.median(means[np.abs(means - place) <= reach + 0.5]))
 
 
 def _flat_sites(

@@ -56,7 +56,7 @@ def fit_first_curve(samples: BracketSamples) -> FirstCurve:
     robust = np.ones(samples.grey.shape)
     correction = np.zeros(len(log_t))
     for _ in range(PASSES):
-        slope = np.interp(samples.grey, 0.5 * (greys[1:] + greys[:-1]), np.maximum(np.diff(g) / np.diff(greys), 1e-4))
+        slope = np.interp(samples.grey, 0.5 * (greys[1:] + greys[:-1]), _smooth_slopes(g, greys))
         weight = np.where(measured, 1.0 / (slope * samples.sigma) ** 2, 0.0) * robust
         g, correction, residual = _solve(basis, weight, log_t, greys)
         g = np.maximum.accumulate(g) + 1e-5 * np.arange(KNOTS)
@@ -64,6 +64,16 @@ def fit_first_curve(samples: BracketSamples) -> FirstCurve:
         scale = max(1.4826 * float(np.median(normal[measured])), 0.5)
         robust = 1.0 / np.maximum(1.0, normal / (2.0 * scale))
     return _untrended(greys, g, correction, log_t)
+
+
+def _smooth_slopes(g: Array, greys: Array) -> Array:
+    """(k − 1,) slopes of g between the knots, evened out over neighbours.
+
+    Weights go by the slope: were it taken as it stands, a flat piece would gain weight, grow flatter, and the curve
+    would turn into stairs that follow equal steps of exposure.
+    """
+    slopes = np.log(np.maximum(np.diff(g) / np.diff(greys), 1e-4))
+    return np.exp(np.convolve(np.pad(slopes, 2, "edge"), np.full(5, 0.2), "valid"))
 
 
 def _hats(values: Array, knots: Array) -> Array:
@@ -88,17 +98,22 @@ def _solve(basis: Array, weight: Array, log_t: Array, greys: Array) -> tuple[Arr
     normal = flat.T @ (flat * wide[:, None])
     right = flat.T @ (wide * target.ravel())
     strength = float(np.trace(normal)) / len(normal)
-    for row, factor in _side_conditions(greys, log_t):
+    for row, factor in _side_conditions(greys, log_t, weight.sum(axis=0)):
         normal += factor * strength * np.outer(row, row)
     solution = np.linalg.solve(normal + 1e-12 * strength * np.eye(len(normal)), right)
     return solution[: len(greys)], solution[len(greys) :], design @ solution - target
 
 
-def _side_conditions(greys: Array, log_t: Array) -> list[tuple[Array, float]]:
-    """(row, strength): no sum and no trend of the corrections, g zero at the top, g smooth over ln grey."""
+def _side_conditions(greys: Array, log_t: Array, known: Array) -> list[tuple[Array, float]]:
+    """(row, strength): no sum and no trend of the corrections, g zero at the top, g smooth over ln grey.
+
+    Sum and trend count each picture by what is ``known`` of it.  Were all counted alike, a picture with hardly a usable
+    grey could take on a huge correction for nothing, and with it the trend that makes g vanish.
+    """
     count, knots = len(log_t), len(greys)
+    share = known / known.sum()
     conditions: list[tuple[Array, float]] = []
-    for pattern in (np.ones(count), log_t - log_t.mean()):
+    for pattern in (share, share * (log_t - share @ log_t)):
         row = np.concatenate([np.zeros(knots), pattern / max(float(np.linalg.norm(pattern)), 1e-12)])
         conditions.append((row, 1e3))
     conditions.append((np.eye(knots + count)[knots - 1], 1.0))

@@ -35,6 +35,8 @@ FEW_RATIO = 2**1.5
 STEP = 1e-4
 MOVED_LEVELS = 8.0
 MAX_MOVED = 0.2
+USUAL_MISSES = 3.0
+"""A place whose worst miss is so many times the usual worst miss is left out."""
 OUTLIER_LEVELS = 20.0
 SCORE_CAP = 16.0
 """The most that one grey, in units of its variance, counts against a curve."""
@@ -164,19 +166,26 @@ def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> N
 
 
 def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]:
-    """Samples that one light explains at every exposure. Raises CalibrationError where too many do not."""
+    """Samples that one light explains at every exposure. Raises CalibrationError where too many do not.
+
+    A scene that moves is wrong at most exposures; what a movie's codec gets wrong at one exposure, it does at all
+    places: so the refusal goes by the rms over the exposures, and single misses are judged by what is usual.
+    """
     lookup = LogLookup(first.log_light, first.grey, np.gradient(first.grey, first.log_light))
     log_t = np.log(samples.exposure) + LN2 * first.correction_ev
     log_light = _project(lookup, samples, log_t)
     miss = np.where(samples.measured, np.abs(lookup.level(log_light[:, None] + log_t) - samples.grey), 0.0)
-    moved = miss.max(axis=1) > np.maximum(MOVED_LEVELS, 8.0 * samples.sigma.max())
+    limit = max(MOVED_LEVELS, 8.0 * float(samples.sigma.max()))
+    rms = np.sqrt((miss**2).sum(axis=1) / np.maximum(samples.measured.sum(axis=1), 1))
+    moved = rms > limit
     if moved.mean() > MAX_MOVED:
         text = f"the scene is not still, or the exposures are wrong throughout: {moved.mean():.0%} of the places change"
         raise CalibrationError(
             f"{text} by more than {MOVED_LEVELS:g} grey levels against any curve",
             hint="take a still scene in steady light from a tripod",
         )
-    return ~moved
+    worst = miss.max(axis=1)
+    return worst <= max(limit, USUAL_MISSES * float(np.median(worst)))
 
 
 # ── variable projection ──────────────────────────────────────────────────────────────────────────────────────────

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
-_FAST_SIZES = (64, 80, 96, 128, 144, 160, 192, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
+FAST_SIZES = (64, 80, 96, 128, 144, 160, 192, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def _ramps(starts: tuple[int, ...], side: int, overlap: int) -> list[NDArray[np.
 
 def fast_size(at_least: int) -> int:
     """The next size at which the Fourier transform is quick."""
-    return next((size for size in _FAST_SIZES if size >= at_least), cv2.getOptimalDFTSize(at_least))
+    return next((size for size in FAST_SIZES if size >= at_least), cv2.getOptimalDFTSize(at_least))
 
 
 class SpaceVariantBlur:

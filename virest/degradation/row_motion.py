@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
+from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
 
 Array = NDArray[np.float64]
@@ -16,6 +17,38 @@ STEP_S = 2e-4
 """Grid of the tabulated motion: at 50 rad/s² a straight line over it is off by 2.5e-7 rad."""
 OUTSIDE_FRACTION = 0.25
 """The table reaches this part of the readout beyond the first and last row, for points outside the picture."""
+
+_LEAST_DISTANCE = 0.05
+"""The camera never comes nearer to the plane than this part of its distance at the reference time."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTranslation:
+    """How the camera's centre moved while one frame was taken, and what it looked at.
+
+    All in camera axes at the frame's reference time t_ref: the centre is at v (t − t_ref) + ½ a (t − t_ref)².
+    """
+
+    velocity_m_s: Array
+    """(3,) at the reference time."""
+    acceleration_m_s2: Array
+    """(3,) constant over the frame, without gravity."""
+    inverse_depth_plane: Array
+    """(3,) 1/m: the inverse depth along the optical axis of a ray r with z = 1 is plane · r, floored at 0."""
+    depth_m: float | None = None
+    """At the picture's centre, for the log; None: unknown."""
+    source: str = "none"
+    """Where the depth is from: ``triangulated``, ``profile`` or ``none``."""
+
+    def position_m(self, since_reference_s: Array) -> Array:
+        """Centre (..., 3) at times (...) from the reference."""
+        since = np.asarray(since_reference_s, float)[..., None]
+        return since * (np.asarray(self.velocity_m_s) + 0.5 * since * np.asarray(self.acceleration_m_s2))
+
+    def velocity_at(self, since_reference_s: Any) -> Array:
+        """Velocity (..., 3) of the centre at times (...) from the reference, still in the axes at the reference."""
+        since = np.asarray(since_reference_s, float)[..., None]
+        return np.asarray(self.velocity_m_s) + since * np.asarray(self.acceleration_m_s2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +72,17 @@ class RowMotion:
     reference_s: float
     """The time that the restored picture shows, IMU clock."""
     profile: CameraProfile
+    lens: MovingLens | None = None
+    """At every instant of the frame; None: no focal length, no geometry."""
+    translation: FrameTranslation | None = None
+    """What translation_m was tabulated from; None: unknown, rotation only."""
+
+    @property
+    def optics(self) -> MovingLens:
+        """The lens; raises ValueError where there is none."""
+        if self.lens is None:
+            raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
+        return self.lens
 
     def row_start_s(self, points_px: Array) -> Array:
         """Start of exposure of the rows through pixels (..., 2)."""
@@ -65,6 +109,18 @@ class RowMotion:
             return rotation, None
         return rotation, t_to - np.squeeze(rotation @ t_from[..., None], -1)
 
+    def inverse_depth(self, rays: Array, time_s: Any) -> Array:
+        """1 / depth (...) along the optical axis at times (...) of where rays (..., 3), z = 1, meet the frame's plane.
+
+        0 without a plane.  n · X = 1 at the reference becomes (R n) · X = 1 + (R n) · t at another time.
+        """
+        rotation, shift = self.pose(time_s)
+        if self.translation is None or shift is None:
+            return np.zeros(rays.shape[:-1])
+        turned = rotation @ np.asarray(self.translation.inverse_depth_plane, float)
+        nearer = np.maximum(1 + (turned * shift).sum(-1), _LEAST_DISTANCE)
+        return np.maximum((turned * rays).sum(-1) / nearer, 0.0)
+
     @property
     def _step_s(self) -> float:
         return float(self.time_s[1] - self.time_s[0])
@@ -76,18 +132,18 @@ def row_motion(
     stamp_s: float,
     logged_exposure_s: float | None,
     reference: str = "exposure-start",
-    velocity_m_s: Array | None = None,
+    translation: FrameTranslation | None = None,
+    lens: MovingLens | None = None,
 ) -> RowMotion:
     """Tabulate the motion around one frame.
 
     stamp_s: the frame's stamp, camera clock from stamp_0.  reference: ``exposure-start`` of the first row read, or
-    ``frame-middle`` = that + readout/2 + exposure/2.  velocity_m_s: (3,) of the camera in camera axes at the
-    reference time, constant over the frame; None: unknown.
+    ``frame-middle`` = that + readout/2 + exposure/2.  translation: of the camera's centre; None: unknown.  lens: of the
+    whole trajectory, where that is at hand; it is worked out otherwise.
     """
     exposure_s = profile.shutter.true_exposure_s(logged_exposure_s or 0.0)
     readout_s = profile.shutter.readout_time_s
-    start_s = float(profile.imu_time_s(profile.shutter.first_row_start_s(stamp_s, logged_exposure_s or 0.0)))
-    reference_s = start_s + (0.5 * (readout_s + exposure_s) if reference == "frame-middle" else 0.0)
+    start_s, reference_s = frame_times_s(profile, stamp_s, logged_exposure_s, reference)
     first_s = start_s - OUTSIDE_FRACTION * readout_s - STEP_S
     last_s = start_s + (1 + OUTSIDE_FRACTION) * readout_s + exposure_s + STEP_S
     steps = np.arange(int(np.ceil((last_s - first_s) / STEP_S)) + 2, dtype=np.float64)
@@ -95,10 +151,25 @@ def row_motion(
     r_world_ref = trajectory.orientation(reference_s)
     r_world_t = trajectory.orientation(time_s)
     r_t_ref = np.swapaxes(r_world_t, -1, -2) @ r_world_ref
-    translation = None
-    if velocity_m_s is not None:
-        moved = (time_s - reference_s)[:, None] * np.asarray(velocity_m_s)
-        translation = -np.squeeze(r_t_ref @ moved[..., None], -1)
+    shift = None
+    if translation is not None:
+        shift = -np.squeeze(r_t_ref @ translation.position_m(time_s - reference_s)[..., None], -1)
+    if lens is None and profile.intrinsics is not None:
+        lens = moving_lens(trajectory, profile)
+    if lens is not None:
+        lens = lens.between(float(time_s[0]), float(time_s[-1]))
+    vector = vector_from_rotation(r_t_ref)
     return RowMotion(
-        time_s, vector_from_rotation(r_t_ref), translation, start_s, exposure_s, readout_s, reference_s, profile
-    )
+        time_s, vector, shift, start_s, exposure_s, readout_s, reference_s, profile, lens, translation
+    )  # fmt: skip
+
+
+def frame_times_s(
+    profile: CameraProfile, stamp_s: float, logged_exposure_s: float | None, reference: str
+) -> tuple[float, float]:
+    """(start of the first row's exposure, reference time) of a frame, IMU clock; arguments as :func:`row_motion`."""
+    logged = logged_exposure_s or 0.0
+    start_s = float(profile.imu_time_s(profile.shutter.first_row_start_s(stamp_s, logged)))
+    if reference != "frame-middle":
+        return start_s, start_s
+    return start_s, start_s + 0.5 * (profile.shutter.readout_time_s + profile.shutter.true_exposure_s(logged))

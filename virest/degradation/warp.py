@@ -1,18 +1,19 @@
 """Where points go: the one map p(t) ~ K (R_t_ref K⁻¹ p_ref + t_t_ref / Z) (forward_model, section 5; eqs 23-28).
 
 Rolling shutter, blur paths and the log's corner points are this map between different times.  Points are undistorted
-before it and distorted after it.  Depth is along the optical axis, in metres; its inverse 0 means rotation only.
+before it and distorted after it, by the lens as it is at either time.  Depth is along the optical axis where a point is
+seen first, in metres; its inverse 0 means rotation only, and None that of the frame's plane.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.intrinsics import Intrinsics
 from virest.degradation.row_motion import RowMotion
 
 Array = NDArray[np.float64]
@@ -22,23 +23,12 @@ FIXED_POINT_STEPS = 8
 """Row times depend on where a point lands; each step shrinks the error about thirtyfold."""
 
 
-def move_points(
-    lens: Intrinsics, points_px: Array, rotation: Array, translation_m: Array | None, inverse_depth: Any = 0.0
-) -> Array:
-    """Pixels (..., 2) after the camera's change of pose (eqs 25, 28): rotation (..., 3, 3), translation (..., 3)."""
-    moved = np.squeeze(rotation @ lens.rays(points_px)[..., None], -1)
-    if translation_m is not None:
-        moved = moved + translation_m * np.asarray(inverse_depth)[..., None]
-    return lens.project(moved)
-
-
-def moved_between(motion: RowMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = 0.0) -> Array:
+def moved_between(motion: RowMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = None) -> Array:
     """Where points seen at pixels (..., 2) at one time are seen at another."""
-    rotation, translation = motion.relative_pose(from_s, to_s)
-    return move_points(_lens(motion), points_px, rotation, translation, inverse_depth)
+    return _shown(motion, *_fixed_points(motion, points_px, from_s, inverse_depth), to_s)
 
 
-def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = 0.0) -> Array:
+def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
     """p_g of eq 28: where points of the recorded picture, (..., 2), belong at the reference time.
 
     anchor: the part of its exposure at which each row is taken to be seen; 0 its start (the paper), 0.5 its middle.
@@ -47,21 +37,22 @@ def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0
     return moved_between(motion, points_px, seen_s, motion.reference_s, inverse_depth)
 
 
-def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = 0.0) -> Array:
+def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
     """The inverse of :func:`straightened_points`: where points of the picture at the reference time were recorded."""
     return seen_by_rows(motion, points_px, motion.reference_s, anchor, inverse_depth)
 
 
-def seen_by_rows(motion: RowMotion, points_px: Array, at_s: Any, anchor: float, inverse_depth: Any = 0.0) -> Array:
+def seen_by_rows(motion: RowMotion, points_px: Array, at_s: Any, anchor: float, inverse_depth: Any = None) -> Array:
     """Where points seen at pixels (..., 2) at time ``at_s`` lie in the picture whose rows are seen at their anchors.
 
     A fixed point, since the row that sees a point depends on where it sees it.
     """
     seen = points_px
+    fixed = _fixed_points(motion, points_px, at_s, inverse_depth)
     for _ in range(FIXED_POINT_STEPS if motion.readout_time_s else 1):
         before = seen
         row_s = motion.row_start_s(seen) + anchor * motion.exposure_s
-        seen = moved_between(motion, points_px, at_s, row_s, inverse_depth)
+        seen = _shown(motion, *fixed, row_s)
         if np.abs(seen - before).max(initial=0.0) < FIXED_POINT_PX:
             break
     return seen
@@ -72,16 +63,21 @@ def corner_points(width: int, height: int) -> Array:
     return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
 
 
-def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = 0.0) -> NDArray[np.float32]:
+def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = None) -> NDArray[np.float32]:
     """:func:`recorded_points` of every pixel, (height, width, 2) as cv2.remap takes it.
 
     Computed on a grid and filled in by straight lines; the map is smooth, so this is off by less than 0.01 px.
     """
+    return grid_filled(motion, lambda points: recorded_points(motion, points, anchor, inverse_depth), spacing_px)
+
+
+def grid_filled(motion: RowMotion, mapping: Callable[[Array], Array], spacing_px: int = 16) -> NDArray[np.float32]:
+    """A smooth map of pixels, worked out on a grid and filled in by straight lines, (height, width, 2)."""
     width, height = motion.profile.width, motion.profile.height
     nodes = np.stack(np.meshgrid(_nodes(width, spacing_px), _nodes(height, spacing_px)), -1)
-    source = recorded_points(motion, nodes, anchor, inverse_depth).astype(np.float32)
-    size = (source.shape[1] * spacing_px, source.shape[0] * spacing_px)
-    filled = cv2.resize(source, size, interpolation=cv2.INTER_LINEAR)
+    values = mapping(nodes).astype(np.float32)
+    size = (values.shape[1] * spacing_px, values.shape[0] * spacing_px)
+    filled = cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
     return filled[spacing_px : spacing_px + height, spacing_px : spacing_px + width]
 
 
@@ -91,8 +87,21 @@ def _nodes(length: int, spacing: int) -> Array:
     return (cells + 0.5) * spacing - 0.5
 
 
-def _lens(motion: RowMotion) -> Intrinsics:
-    lens = motion.profile.intrinsics
-    if lens is None:
-        raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
-    return lens
+def _fixed_points(motion: RowMotion, points_px: Array, at_s: Any, inverse_depth: Any) -> tuple[Array, Array | None]:
+    """Points (..., 3), camera axes at the reference time, in units of their depths at ``at_s``; 1 / those, (...)."""
+    rays = motion.optics.rays(points_px, at_s)
+    rotation, translation = motion.pose(at_s)
+    back = np.swapaxes(rotation, -1, -2)
+    if translation is None:
+        return np.squeeze(back @ rays[..., None], -1), None
+    nearness = motion.inverse_depth(rays, at_s) if inverse_depth is None else np.asarray(inverse_depth, float)
+    return np.squeeze(back @ (rays - translation * nearness[..., None])[..., None], -1), nearness
+
+
+def _shown(motion: RowMotion, points: Array, nearness: Array | None, at_s: Any) -> Array:
+    """Pixels (..., 2) at which the points of :func:`_fixed_points` are seen at times (...)."""
+    rotation, translation = motion.pose(at_s)
+    moved = np.squeeze(rotation @ points[..., None], -1)
+    if translation is not None and nearness is not None:
+        moved = moved + translation * nearness[..., None]
+    return motion.optics.project(moved, at_s)

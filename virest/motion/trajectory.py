@@ -37,6 +37,12 @@ class Trajectory:
         a, b, c, d = self.rate_polynomials[:, interval]
         return ((a * since + b) * since + c) * since + d
 
+    def angular_acceleration_rad_s2(self, time_s: Any) -> Array:
+        """Change of the camera-frame rate (..., 3) at times (...)."""
+        interval, since = self._locate(np.asarray(time_s, float))
+        a, b, c, _ = self.rate_polynomials[:, interval]
+        return (3 * a * since + 2 * b) * since + c
+
     def orientation(self, time_s: Any) -> Array:
         """R_world_cam (..., 3, 3) at times (...)."""
         time_s = np.asarray(time_s, float)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
-from virest.capture.join import outside_reason
-from virest.degradation.row_motion import row_motion
+from virest.capture.join import median_period_s, outside_reason
+from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.motion.alignment import OffsetEstimate, check_agreement, choose_pairs, estimate_time_offset
 from virest.motion.integration import integrate_gyro
+from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.restoration.frame import (
     RestoredFrame,
@@ -47,6 +48,17 @@ class RestorationPlan:
     """Why no frame may be restored; None: they may."""
     imu_gaps_s: tuple[tuple[float, float], ...] = ()
     """Holes in the inertial data: frames that reach into one are left out."""
+    notes: tuple[str, ...] = ()
+    """What the profile adds to the nominal model and is applied."""
+    translations: Mapping[int, FrameTranslation] | None = None
+    """By movie index, at the reference time that the settings name; None or missing: rotation only."""
+
+    def of(self, frames: Iterable[Frame]) -> RestorationPlan:
+        """The plan as a worker needs it who has these frames only."""
+        if self.translations is None:
+            return self
+        numbers = [frame.index for frame in frames]
+        return replace(self, translations={n: self.translations[n] for n in numbers if n in self.translations})
 
 
 def restore_frames(
@@ -55,13 +67,23 @@ def restore_frames(
     """Restore frames one by one; ``imu`` covers them. Frames without a picture are passed over."""
     profile = plan.profile
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
+    lens = moving_lens(trajectory, profile) if trajectory is not None else None
+    translations = plan.translations or {}
     for frame, picture in frames:
         if picture is None:
             continue
         if trajectory is None:
             yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN)
             continue
-        motion = row_motion(trajectory, profile, frame.time_s, frame.exposure_s, plan.settings.reference)
+        motion = row_motion(
+            trajectory,
+            profile,
+            frame.time_s,
+            frame.exposure_s,
+            plan.settings.reference,
+            translations.get(frame.index),
+            lens,
+        )
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, imu.time_s, plan.imu_gaps_s)
         if outside:
@@ -74,6 +96,34 @@ def restore_frames(
         yield restore_frame(frame, picture, motion, trajectory, plan.settings)
 
 
+def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequence[int] = ()) -> tuple[Frame, ...]:
+    """All frames of a movie, those of the recorder's start-up at the times and exposures of what they show.
+
+    frame_lag: slot k shows capture k + lag − repeats so far; exact repeats use the lag up over the first slots.
+    repeats: slots that were seen to repeat; where they are not as many as the lag, they are taken as evenly spread.
+    Frames that only the start-up speaks against may then be used.
+    """
+    lagging = profile.extensions.frame_lag_frames
+    period_s = median_period_s(np.array([frame.time_s for frame in frames]))
+    lag = round(profile.extensions.frame_lag_s / period_s) if period_s > 0 else 0
+    if not lagging or not lag:
+        return tuple(frames)
+    seen = np.array([slot for slot in repeats if 0 < slot <= lagging])
+    spread = np.round(np.arange(1, lag + 1) * lagging / lag).astype(int)
+    used = np.sort(seen) if len(seen) == lag else spread
+    shows = np.arange(len(frames)) + lag - np.searchsorted(used, np.arange(len(frames)), side="right")
+    early = [_showing(frame, frames, int(shows[k]), period_s) for k, frame in enumerate(frames[: lagging + 1])]
+    return (*early, *frames[lagging + 1 :])
+
+
+def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float) -> Frame:
+    """A slot's frame with the time and exposure of the capture that it shows; stamp and place stay the slot's."""
+    source = frames[min(capture, len(frames) - 1)]
+    time_s = source.time_s + max(capture - len(frames) + 1, 0) * period_s
+    frame = replace(frame, time_s=time_s, exposure_s=source.exposure_s)
+    return replace(frame, skip_reason=None, skip_codes=()) if frame.only_startup else frame
+
+
 def plan_restoration(
     capture: Capture,
     profile: CameraProfile,
@@ -84,20 +134,79 @@ def plan_restoration(
 
     read_gray: gives (index, luma) of the frames asked for, in order.  The cost does not grow with the movie.
     """
-    plan = RestorationPlan(profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s)
+    plan = RestorationPlan(
+        profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
+    )
     frames = tuple(
-        replace(f, skip_reason=None) if settings.keep_start_up and f.only_startup else f for f in capture.frames
+        replace(f, skip_reason=None) if settings.keep_start_up and f.only_startup else f
+        for f in capture.frames[profile.extensions.frame_lag_frames :]
     )
     if not any(f.skip_reason is None for f in frames):
         return plan
-    pairs = track_pairs(read_gray(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0)))
+    tracked = track_pairs(read_gray(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0)))
+    pairs = _through_resting_lens(tracked, capture, profile)
     if profile.time_offset_s is None or profile.intrinsics is None:
         plan = _filled(plan, capture, pairs)
+        pairs = _through_resting_lens(tracked, capture, plan.profile)
     if plan.copy_reason is None:
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
         if not agreement.agrees:
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
     return plan
+
+
+def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
+    """What the profile adds to the nominal model, one line each, and what becomes of it."""
+    ext = profile.extensions
+    lines = {
+        f"focal drift of {ext.focal_drift_per_s:+g} a second: followed": ext.focal_drift_per_s,
+        f"stabiliser cancelling {ext.stabilisation_fraction:g} above {ext.stabilisation_cutoff_hz:g} Hz: followed": (
+            ext.stabilisation_fraction
+        ),
+        f"frame lag of {ext.frame_lag_s:g} s at the start: first {ext.frame_lag_frames} frames at their true times": (
+            ext.frame_lag_frames
+        ),
+        f"vignetting of {ext.vignetting_corner_loss:g}: moved with the picture's place": ext.vignetting_corner_loss,
+        f"flicker of {ext.flicker_amplitude:g} at {ext.flicker_frequency_hz:g} Hz: undone": ext.flicker_amplitude,
+        f"gain of {len(ext.gain)} frames: kept, it is common to a whole frame": len(ext.gain),
+        f"defocus of {ext.defocus_sigma_px:g} px: undone with the blur": ext.defocus_sigma_px,
+    }
+    return tuple(line for line, size in lines.items() if size)
+
+
+def _through_resting_lens(pairs: list[TrackPair], capture: Capture, profile: CameraProfile) -> list[TrackPair]:
+    """Tracks as the profile's lens would show them at stamp_0 and with its stabiliser at rest.
+
+    Where clocks or focal length are not known yet, the lens's path is not either, and tracks stay as they are.
+    """
+    ext = profile.extensions
+    moves = ext.focal_drift_per_s or ext.stabilisation_fraction
+    if not moves or profile.intrinsics is None or profile.time_offset_s is None:
+        return pairs
+    lens = moving_lens(integrate_gyro(capture.imu, profile), profile)
+
+    def resting(index: int, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        return resting_points(lens, profile, capture.frames[index], points_px)
+
+    return [
+        replace(
+            pair,
+            points_first_px=resting(pair.first, pair.points_first_px),
+            points_second_px=resting(pair.second, pair.points_second_px),
+        )
+        for pair in pairs
+    ]
+
+
+def resting_points(
+    lens: MovingLens, profile: CameraProfile, frame: Frame, points_px: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points (n, 2) of a frame, each seen in the middle of its row's exposure, through the lens at rest."""
+    shutter, logged = profile.shutter, frame.exposure_s or 0.0
+    start_s = profile.imu_time_s(shutter.first_row_start_s(frame.time_s, logged))
+    rows_s = shutter.readout_fraction(points_px, profile.width, profile.height) * shutter.readout_time_s
+    time_s = start_s + rows_s + 0.5 * shutter.true_exposure_s(logged)
+    return lens.lens.project(lens.rays(points_px, time_s))
 
 
 def _times(capture: Capture) -> tuple[list[float], list[float | None]]:
@@ -115,9 +224,6 @@ def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[str, ...]:
         warnings.append("exposure times unknown: frames are not deblurred")
     if profile.depth_m is None:
         warnings.append("translation and depth not estimated: rotation only")
-    extended = [f.name for f in fields(Extensions) if getattr(profile.extensions, f.name) != f.default]
-    if extended:
-        warnings.append(f"extensions not applied to the pictures: {', '.join(extended)}")
     return tuple(warnings)
 
 

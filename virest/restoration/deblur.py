@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -26,7 +26,17 @@ CLIPPED_LEVELS = 2.0
 """A pixel this close to the top was clipped."""
 PULLED_DOWN_LEVELS = 8.0
 """Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
+LUMA_RED, LUMA_BLUE = 0.299, 0.114
 COLOUR_SCALE = 2.0
+COLOUR_TILE_PX = 384
+"""Colour differences hold so little detail that kernels need not follow the paths as closely."""
+CODEC_REACH_PX = 2.5
+"""A lamp's edge is smeared about so far by the movie's codec."""
+FEW_ITERATIONS = 2
+COARSE_OVERLAP, FINE_OVERLAP = 6, 4
+"""Tiles overlap by this part of their side, with few iterations and with more."""
+BAND_ROWS = 64
+"""Of a picture, that stay in the cache."""
 BORDER_NOISE_TO_SIGNAL = 0.003
 """Least N / S of tiles that see beyond the picture."""
 RESIDUAL_SHARE = 0.1
@@ -64,9 +74,9 @@ def blurred_picture(
     longest_px: float,
 ) -> BlurredPicture:
     """Take a picture (height, width, 3) through the inverse of the exposure curve."""
-    light = list(cv2.split(cv2.LUT(picture, curve.linear_table())))
     reach = 2 * int(np.ceil(longest_px / 2)) + 3
     channels = cv2.split(picture)
+    light = [cv2.LUT(channel, curve.linear_table()) for channel in channels]
     dark = [_dark(channel, curve) for channel in channels]
     clipped = [_clipped(channel, curve) for channel in channels]
 
@@ -78,78 +88,81 @@ def blurred_picture(
 
 def _dark(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
     """1.0 where the channel is below the curve's A."""
-    dark = cv2.LUT(channel, (curve.censored_table() & ~curve.clipped_table()).astype(np.uint8))
-    return dark.astype(np.float32) if dark.any() else None
+    table = curve.censored_table() & ~curve.clipped_table()
+    return cv2.LUT(channel, table.astype(np.float32)) if table[int(channel.min())] else None
 
 
 def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
     """1.0 where the channel is clipped, and where its neighbours are and the codec has pulled it down a little."""
-    clipped = cv2.LUT(channel, curve.clipped_table(CLIPPED_LEVELS).astype(np.uint8))
-    if not clipped.any():
+    table = curve.clipped_table(CLIPPED_LEVELS)
+    if not table[int(channel.max())]:
         return None
+    clipped = cv2.LUT(channel, table.astype(np.uint8))
     near = cv2.dilate(clipped, np.ones((5, 5), np.uint8))
     return (near & cv2.LUT(channel, curve.clipped_table(PULLED_DOWN_LEVELS).astype(np.uint8))).astype(np.float32)
 
 
 def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
     """The sharp picture's light, channel by channel, at the kernels' anchor."""
-    match settings.deblur:
-        case "inverse" | "wiener" | "gradient-wiener":
-            return _by_tile_filter(blurred, settings)
-        case "hyper-laplacian":
-            return _by_tile_hyper_laplacian(blurred, settings)
-        case "richardson-lucy":
-            return _by_richardson_lucy(blurred, settings)
-        case "hyper-laplacian-global":
-            return _by_global_hyper_laplacian(blurred, settings)
-    raise ValueError(f"no deblurring method '{settings.deblur}'")
+    methods: dict[str, Callable[[BlurredPicture, RestorationSettings], list[Image]]] = {
+        "inverse": _by_tile_filter,
+        "wiener": _by_tile_filter,
+        "gradient-wiener": _by_tile_filter,
+        "hyper-laplacian": _by_tile_hyper_laplacian,
+        "richardson-lucy": _by_richardson_lucy,
+        "hyper-laplacian-global": _by_global_hyper_laplacian,
+    }
+    if settings.deblur not in methods:
+        raise ValueError(f"no deblurring method '{settings.deblur}'")
+    return _with_unseen_kept(methods[settings.deblur](blurred, settings), blurred)
+
+
+def _with_unseen_kept(sharp: list[Image], blurred: BlurredPicture) -> list[Image]:
+    """The recorded light where nothing says more: a censored pixel with all its neighbours along the path censored."""
+    if all(mask is None for mask in (*blurred.dark, *blurred.clipped)):
+        return sharp
+    reach = _path_reach(blurred)
+    kept = []
+    for plane, light, *masks in zip(sharp, blurred.light, blurred.dark, blurred.clipped, strict=True):
+        for mask in masks:
+            if mask is not None:
+                cv2.copyTo(light, cv2.erode(mask, reach).astype(np.uint8), plane)
+        kept.append(plane)
+    return kept
 
 
 # ── tile by tile ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _tile_deconvolution(blurred: BlurredPicture, side: int, scale: float = 1.0) -> tiles.TileDeconvolution:
+def _luma_tiles(blurred: BlurredPicture, settings: RestorationSettings) -> tiles.TileDeconvolution:
+    """Tiles over the picture; more steps are worth a closer blend of neighbouring kernels."""
+    overlap_parts = FINE_OVERLAP if settings.iterations > FEW_ITERATIONS else COARSE_OVERLAP
+    return _tile_deconvolution(blurred, settings.tile_px, overlap_parts)
+
+
+def _tile_deconvolution(
+    blurred: BlurredPicture, side: int, overlap_parts: int, scale: float = 1.0
+) -> tiles.TileDeconvolution:
     """Tiles over the picture, or over one that is ``scale`` times smaller, with kernels to its measure."""
     height, width = (int(np.ceil(length / scale)) for length in blurred.light[0].shape)
-    grid = tile_grid(height, width, int(side / scale), int(side / scale) // 4)
+    margin = int(np.clip(blurred.longest_px / scale, 16 / scale, 96))
+    grid = tiles.quick_grid(height, width, int(side / scale), margin, overlap_parts)
     field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
-    kernels = replace(field, paths_px=field.paths_px / scale).arrays()
-    return tiles.TileDeconvolution(grid, kernels, int(np.clip(blurred.longest_px / scale, 16 / scale, 96)))
+    kernels = field.scaled(1 / scale).arrays()
+    return tiles.TileDeconvolution(grid, kernels, margin)
 
 
 def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
-    streaks = _streaks(blurred)
-    luma, *differences = _to_opponents(_without_streaks(blurred.light, streaks))
-    deconvolution = _tile_deconvolution(blurred, settings.tile_px)
-    sharp = _filtered(deconvolution, luma, _tile_factors(deconvolution, settings, blurred.statistics))
-    colour = _filtered_colour(blurred, differences, settings)
-    return _with_streaks(_from_opponents([sharp, *colour]), blurred.light, streaks)
-
-
-def _filtered(deconvolution: tiles.TileDeconvolution, plane: Image, factors: list[Image]) -> Image:
-    spectra = deconvolution.back_projected(plane)
-    return deconvolution.blend([np.multiply(s, f, out=s) for s, f in zip(spectra, factors, strict=True)])
-
-
-def _filtered_colour(blurred: BlurredPicture, differences: list[Image], settings: RestorationSettings) -> list[Image]:
-    """The colour differences, filtered at half size: a movie stores no more of them."""
-    height, width = differences[0].shape
-    deconvolution = _tile_deconvolution(blurred, settings.tile_px, COLOUR_SCALE)
-    factors = _tile_factors(deconvolution, settings, blurred.chroma, COLOUR_SCALE)
-    size = (deconvolution.grid.width, deconvolution.grid.height)
-    small = [cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in differences]
-    return [
-        cv2.resize(_filtered(deconvolution, plane, factors), (width, height), interpolation=cv2.INTER_LINEAR)
-        for plane in small
-    ]
+    deconvolution = _luma_tiles(blurred, settings)
+    projected = _projected_luma(blurred, deconvolution, settings)
+    factors = _tile_factors(deconvolution, settings, blurred.statistics)
+    sharp = deconvolution.blend(cv2.multiply(s, f) for s, f in zip(projected, factors, strict=True))
+    return _with_colour(blurred, sharp, settings)
 
 
 def _tile_factors(
-    deconvolution: tiles.TileDeconvolution,
-    settings: RestorationSettings,
-    statistics: PictureStatistics,
-    scale: float = 1.0,
-) -> list[Image]:
+    deconvolution: tiles.TileDeconvolution, settings: RestorationSettings, statistics: PictureStatistics
+) -> Iterator[Image]:
     """What follows conj(K) in each tile: by the method that the settings name, the measured N / S one by default."""
     match settings.deblur:
         case "inverse":
@@ -160,34 +173,96 @@ def _tile_factors(
             ratio = np.full((deconvolution.size,) * 2, settings.strength**2 * flat, np.float32)
             ratio[0, 0] = 0.0  # the mean is no noise
             return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
-    noise_to_signal = settings.strength**2 * statistics.noise_to_signal
-    ratio = on_spectrum(statistics, noise_to_signal, deconvolution.size, scale)
-    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)
-    guarded[0, 0] = ratio[0, 0]
+    ratio, guarded = _noise_to_signal(deconvolution, settings, statistics)
     return deconvolution.filters(
         lambda power: tiles.wiener_filter(power, ratio), lambda power: tiles.wiener_filter(power, guarded)
     )
 
 
-def _to_opponents(light: list[Image]) -> list[Image]:
-    """Luma and two colour differences of linear light: noise and detail differ between them, so must the filters."""
+def _noise_to_signal(
+    deconvolution: tiles.TileDeconvolution,
+    settings: RestorationSettings,
+    statistics: PictureStatistics,
+    scale: float = 1.0,
+) -> tuple[Image, Image]:
+    """Measured N / S on a tile's spectrum: for tiles inside the picture, and for those that see beyond it."""
+    ratio = on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size, scale)
+    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)
+    guarded[0, 0] = ratio[0, 0]
+    return ratio, guarded
+
+
+# ── colour ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _luma(light: list[Image]) -> Image:
+    """Luma of linear light; it and the colour differences are restored apart: noise and detail differ between them."""
     red, green, blue = light
-    luma = 0.299 * red + 0.587 * green + 0.114 * blue
-    return [luma.astype(np.float32), red - luma, blue - luma]
+    return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, 1 - LUMA_RED - LUMA_BLUE, 0.0))
 
 
-def _from_opponents(planes: list[Image]) -> list[Image]:
-    luma, red, blue = planes
-    green = luma - (0.299 / 0.587) * red - (0.114 / 0.587) * blue
-    return [luma + red, green.astype(np.float32), luma + blue]
+def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> list[Image]:
+    """Red, green and blue of a sharp luma and the colour differences, which hold little detail.
+
+    These are filtered at half size, since a movie stores no more of them, by the measured Wiener filter.
+    """
+    height, width = sharp.shape
+    deconvolution = _tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, COLOUR_SCALE)
+    ratios = _noise_to_signal(deconvolution, settings, blurred.chroma, COLOUR_SCALE)
+    red, blue = (
+        cv2.resize(
+            deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(plane), *ratios)),
+            (width, height),
+            interpolation=cv2.INTER_LINEAR,
+        )
+        for plane in _small_differences(blurred, deconvolution.grid)
+    )
+    green_luma = 1 - LUMA_RED - LUMA_BLUE
+    green = cv2.scaleAdd(blue, -LUMA_BLUE / green_luma, cv2.scaleAdd(red, -LUMA_RED / green_luma, sharp))
+    return [cv2.add(sharp, red), green, cv2.add(sharp, blue)]
 
 
-def _streaks(blurred: BlurredPicture) -> Image | None:
-    """1 where a clipped pixel's light may have gone or come from along the blur path, falling to 0 around it."""
-    masks = [c for c in blurred.clipped if c is not None]
-    if not masks:
-        return None
-    return cv2.GaussianBlur(cv2.dilate(np.maximum.reduce(masks), _path_reach(blurred)), (0, 0), 1.5)
+def _small_differences(blurred: BlurredPicture, grid: TileGrid) -> list[Image]:
+    """Red and blue less luma, at the grid's size; clipped ones, which show no colour, from around them."""
+    size = (grid.width, grid.height)
+    red, green, blue = (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in blurred.light)
+    luma = _luma([red, green, blue])
+    differences = [cv2.subtract(plane, luma) for plane in (red, blue)]
+    holes = _holes(blurred)
+    if holes is None:
+        return differences
+    known = 1 - cv2.resize(cv2.dilate(holes, np.ones((3, 3), np.uint8)), size, interpolation=cv2.INTER_AREA)
+    return [_filled_in(plane, known) for plane in differences]
+
+
+def _filled_in(plane: Image, known: Image) -> Image:
+    """Weighted means of what is known, over wider and wider neighbourhoods."""
+    weight, filled = known, plane * known
+    for side in (3, 9, 27, 81):
+        near = cv2.blur(weight, (side, side))
+        reached = near > 1e-2
+        mean = np.where(reached, cv2.blur(filled, (side, side)) / np.maximum(near, 1e-2), 0)
+        filled = filled + (1 - weight) * mean
+        weight = np.where(reached, np.float32(1), weight)
+    return np.asarray(filled, np.float32)
+
+
+# ── clipped light ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _holes(blurred: BlurredPicture) -> Image | None:
+    """1.0 where any channel is clipped: what is recorded there is no measurement."""
+    masks = [mask for mask in blurred.clipped if mask is not None]
+    return np.maximum.reduce(masks) if masks else None
+
+
+def _measured_part(holes: Image) -> Image:
+    """0 in holes, rising to 1 around them: the codec spreads a lamp's edge over its neighbours.
+
+    A sharp edge of the weights would show as an outline around the lamp.
+    """
+    wide = cv2.GaussianBlur(cv2.dilate(holes, np.ones((5, 5), np.uint8)), (0, 0), CODEC_REACH_PX)
+    return (1 - holes) * (1 - wide)
 
 
 def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
@@ -197,61 +272,40 @@ def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
     return (path + path[::-1, ::-1] > 2e-3).astype(np.uint8)
 
 
-def _without_streaks(light: list[Image], streaks: Image | None) -> list[Image]:
-    """Clipped light is no linear blur, and a filter cannot leave pixels out: fill the streaks in from around them."""
-    if streaks is None:
-        return light
-    known = 1 - np.minimum(streaks * 4, 1)
-    return [_filled_in(plane, known) for plane in light]
-
-
-def _filled_in(plane: Image, known: Image) -> Image:
-    """Weighted means of what is known, over wider and wider neighbourhoods, at half the size."""
-    height, width = plane.shape
-    size = ((width + 1) // 2, (height + 1) // 2)
-    weight = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
-    filled = cv2.resize(plane * known, size, interpolation=cv2.INTER_AREA)
-    for side in (3, 9, 27, 81):
-        near = cv2.blur(weight, (side, side))
-        reached = near > 1e-2
-        mean = np.where(reached, cv2.blur(filled, (side, side)) / np.maximum(near, 1e-2), 0)
-        filled = filled + (1 - weight) * mean
-        weight = np.where(reached, np.float32(1), weight)
-    smooth = cv2.resize(filled.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    return plane * known + (1 - known) * smooth
-
-
-def _with_streaks(sharp: list[Image], light: list[Image], streaks: Image | None) -> list[Image]:
-    """Put the recorded light back where the streaks were."""
-    return sharp if streaks is None else [s + streaks * (p - s) for s, p in zip(sharp, light, strict=True)]
+def _projected_luma(
+    blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
+) -> list[Image]:
+    """Spectrum of Kᵀ g of each tile; tiles with clipped light are settled."""
+    luma, holes = _luma(blurred.light), _holes(blurred)
+    if holes is not None:
+        numbers = deconvolution.touched(holes)
+        kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
+        deconvolution.settle(numbers, kernels, luma, _measured_part(holes))
+    return list(deconvolution.back_projected(luma))
 
 
 def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
-    """Hyper-Laplacian for the luma, measured Wiener for the colour differences, which hold little detail."""
-    streaks = _streaks(blurred)
-    luma, *differences = _to_opponents(_without_streaks(blurred.light, streaks))
-    sharp = _tile_hyper_laplacian(blurred, luma, settings)
-    colour = _filtered_colour(blurred, differences, settings)
-    return _with_streaks(_from_opponents([sharp, *colour]), blurred.light, streaks)
+    """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
+    return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
 
 
-def _tile_hyper_laplacian(blurred: BlurredPicture, plane: Image, settings: RestorationSettings) -> Image:
-    deconvolution = _tile_deconvolution(blurred, settings.tile_px)
-    first = _tile_factors(deconvolution, settings, blurred.statistics)
+def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> Image:
+    deconvolution = _luma_tiles(blurred, settings)
     statistics = blurred.statistics
     unit = statistics.gradient_scale
     noise = settings.strength * np.array([statistics.noise_levels, _border_noise(blurred)])
-    trust, guarded = ((unit / noise) ** 2).astype(np.float32)
+    trust, guarded = (float(t) for t in (unit / noise) ** 2)
     gradients = tiles.gradient_power(deconvolution.size)
-    projected = deconvolution.back_projected(plane)
-    sharp = deconvolution.blend([s * f for s, f in zip(projected, first, strict=True)])
+    projected = _projected_luma(blurred, deconvolution, settings)
+    ratios = _noise_to_signal(deconvolution, settings, statistics)
+    sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
     scale = blurred.slopes(1) * np.float32(1.0 / unit)
     for beta in _beta_schedule(settings.iterations):
-        weights = [(guarded if border else trust) / np.float32(beta) for border in deconvolution.at_border]
-        factors = [1.0 / (p * w + gradients) for p, w in zip(deconvolution.powers, weights, strict=True)]
         pull = _gradient_targets(sharp, scale, shrinkage_levels(beta))
-        sharp = _tile_solve(deconvolution, projected, pull, factors, weights)
-    if settings.iterations > 2:
+        pulled = deconvolution.pulled(projected, pull, beta / trust, beta / guarded)
+        inner, at_border = (gradients * np.float32(beta / t) for t in (trust, guarded))
+        sharp = deconvolution.blend(deconvolution.solutions(pulled, inner, at_border))
+    if settings.iterations > FEW_ITERATIONS:
         sharp += _returned_residual(deconvolution, projected, sharp, statistics)
     return sharp
 
@@ -272,49 +326,44 @@ def _returned_residual(
     """Fine texture that the prior took for noise: the residual g − K f, filtered as a picture of a tenth the power."""
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
     guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
-    factors = deconvolution.filters(lambda power: 1.0 / (power + ratio), lambda power: 1.0 / (power + guarded))
-    padded = deconvolution.padded(sharp)
-    spectra = [
-        (back - power * cv2.dft(deconvolution.periodic(padded, top, left))) * factor
-        for (top, left), back, power, factor in zip(
-            deconvolution.grid.corners(), projected, deconvolution.powers, factors, strict=True
-        )
-    ]
-    return deconvolution.blend(spectra)
+    left = (
+        cv2.subtract(back, cv2.multiply(power, spectrum))
+        for back, power, spectrum in zip(projected, deconvolution.powers, deconvolution.spectra(sharp), strict=True)
+    )
+    return deconvolution.blend(deconvolution.solutions(left, ratio, guarded, unless_settled=True))
 
 
 def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:
-    """Dᵀ w, with w the shrunk gradients; factors: w / v over |v| · 32, as :func:`shrinkage_levels` tabulates it."""
+    """Dᵀ w, with w the shrunk gradients; factors: w / v over |v| · 32, as :func:`shrinkage_levels` tabulates it.
+
+    Band by band: what is worked on stays in the cache.
+    """
     pull = np.zeros_like(sharp)
-    for ahead, behind in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
-        gradient = cv2.subtract(sharp[ahead], sharp[behind])
-        level = cv2.convertScaleAbs(cv2.multiply(gradient, scale[behind]), alpha=LEVELS_PER_UNIT)
-        gradient = cv2.multiply(gradient, cv2.LUT(level, factors))
-        pull[ahead] += gradient
-        pull[behind] -= gradient
+    for top in range(0, len(sharp), BAND_ROWS):
+        rows = slice(top, top + BAND_ROWS + 1)
+        band, steepness, pulled = sharp[rows], scale[rows], pull[rows]
+        _pull_along(band[:-1], band[1:], steepness[:-1], factors, pulled[:-1], pulled[1:])
+        band, steepness, pulled = (p[top : top + BAND_ROWS] for p in (sharp, scale, pull))
+        _pull_along(band[:, :-1], band[:, 1:], steepness[:, :-1], factors, pulled[:, :-1], pulled[:, 1:])
     return pull
 
 
-def _tile_solve(
-    deconvolution: tiles.TileDeconvolution,
-    projected: list[Image],
-    pull: Image,
-    factors: list[Image],
-    weights: list[np.float32],
-) -> Image:
-    padded = deconvolution.padded(pull, cv2.BORDER_CONSTANT)
-    spectra = []
-    for (top, left), back, factor, weight in zip(
-        deconvolution.grid.corners(), projected, factors, weights, strict=True
-    ):
-        spectrum = cv2.dft(deconvolution.periodic(padded, top, left))
-        spectra.append(cv2.multiply(cv2.scaleAdd(back, float(weight), spectrum), factor))
-    return deconvolution.blend(spectra)
+def _pull_along(
+    behind: Image, ahead: Image, steepness: Image, factors: Image, pull_behind: Image, pull_ahead: Image
+) -> None:
+    """Add the shrunk gradient between neighbours to the pull on the one ahead, and take it from the one behind."""
+    if not len(behind):
+        return
+    gradient = cv2.subtract(ahead, behind)
+    level = cv2.convertScaleAbs(cv2.multiply(gradient, steepness), alpha=LEVELS_PER_UNIT)
+    gradient = cv2.multiply(gradient, cv2.LUT(level, factors))
+    pull_ahead += gradient
+    pull_behind -= gradient
 
 
 def _beta_schedule(iterations: int) -> tuple[float, ...]:
     """Rising penalties of the half-quadratic splitting, in units of the gradients' own scale."""
-    if iterations <= 2:
+    if iterations <= FEW_ITERATIONS:
         return (0.2, 2.0)[-max(iterations, 1) :]
     return tuple(float(b) for b in np.geomspace(0.05, 12.0, iterations))
 

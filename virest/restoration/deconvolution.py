@@ -17,6 +17,8 @@ ALPHA = 2.0 / 3.0
 """Exponent of the gradients' hyper-Laplacian (Krishnan & Fergus 2009)."""
 _UNSEEN = 1e-3
 """Added above and below in Richardson-Lucy's update, so that light that no pixel weighs stays as it is."""
+_LEAST_CHANGE = 0.2
+"""Part of a pixel's light that an over-relaxed step of Richardson-Lucy's leaves at least."""
 _TABLE_SIZE = 2048
 _TABLE_END = 8.0
 LEVELS_PER_UNIT = 32.0
@@ -24,17 +26,27 @@ LEVELS_PER_UNIT = 32.0
 
 
 def richardson_lucy(
-    observed: Image, apply: Operator, adjoint: Operator, start: Image, weight: Image, iterations: int
+    observed: Image,
+    apply: Operator,
+    adjoint: Operator,
+    start: Image,
+    weight: Image,
+    iterations: int,
+    relaxation: float = 1.0,
 ) -> Image:
     """Multiplicative updates for Poisson noise (Richardson 1972, Lucy 1974), with weights (Whyte et al. 2014).
 
-    f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.
+    f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.  relaxation: each step goes so many times
+    as far, but never below a fifth.
     """
     sharp: Image = np.maximum(start, 1e-4).astype(np.float32)
     seen = adjoint(weight) + _UNSEEN
     for _ in range(iterations):
         ratio: Image = (weight * observed / np.maximum(apply(sharp), 1e-4)).astype(np.float32)
-        sharp = np.maximum(sharp * np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen, 1e-5).astype(np.float32)
+        change = np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen
+        if relaxation != 1.0:
+            change = np.maximum(1 + np.float32(relaxation) * (change - 1), _LEAST_CHANGE)
+        sharp = np.maximum(sharp * change, 1e-5).astype(np.float32)
     return sharp
 
 

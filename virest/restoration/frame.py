@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,11 +15,12 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import angle_and_length, blur_chords, kernel_field
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, kernel_field
+from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
-from virest.restoration.deblur import blurred_picture, deblur
+from virest.restoration.deblur import BlurredPicture, blurred_picture, deblur
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics import PictureStatistics, measure_picture
@@ -38,6 +39,8 @@ MIN_SHARE = 0.25
 """A picture of which no more would be taken is left alone."""
 FULL_TRUST_NOISE = 1.8
 """Up to this multiple of the gradients' scale, noise does not lessen the trust."""
+MIN_RELIGHT = 0.002
+"""A relative change of light below this is less than half a grey level anywhere."""
 MANY_CLIPPED = 0.003
 """With a larger part of clipped pixels the expected gain says nothing: they are no linear blur."""
 
@@ -74,13 +77,17 @@ def restore_frame(
     curve = motion.profile.response or ResponseCurve("srgb")
     parameters = degradation_parameters(motion, trajectory, settings)
     longest_px = max(tile["length_px"] for tile in parameters["blur"]["tiles"])
+    longest_px = float(equivalent_length_px(motion.profile, longest_px))
     method, why_not = _deblur_method(motion, settings, longest_px)
     straighten = settings.shutter != "none"
     anchor = 0.5 if straighten or settings.reference == "frame-middle" or method == "none" else 0.0
+    light = frame_light(motion, anchor, straighten and motion.profile.readout_known)
     clock.lap("estimate")
     restored, parameters["deblur"] = picture, {"method": "none"}
     if method != "none":
-        restored, parameters["deblur"], why_not = _deblurred(picture, motion, curve, settings, anchor, longest_px)
+        restored, parameters["deblur"], why_not = _deblurred(picture, motion, settings, anchor, longest_px, light)
+    if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
+        restored = _relit(picture, curve, light)
     clock.lap("deblur")
     source = _source_map(motion, settings, anchor, parameters["deblur"]["method"]) if straighten else None
     valid_px = (0, 0, width, height)
@@ -98,8 +105,12 @@ def restore_frame(
 def _limits(motion: RowMotion) -> tuple[str, ...]:
     """What the model leaves out."""
     depth_m = motion.profile.depth_m
-    if motion.translation_m is None and not (depth_m is not None and np.isinf(depth_m)):
+    if depth_m is not None and np.isinf(depth_m):
+        return ()
+    if motion.translation is None:
         return ("camera translation not known: rotation only",)
+    if not np.any(motion.translation.inverse_depth_plane):
+        return ("depth not known: rotation only",)
     return ()
 
 
@@ -109,20 +120,22 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: 
     width, height = profile.width, profile.height
     centre = np.array([[(width - 1) / 2, (height - 1) / 2]])
     row_start_s = float(motion.row_start_s(centre)[0])
-    r_end_start, _ = motion.relative_pose(row_start_s, row_start_s + motion.exposure_s)
+    r_end_start, t_end_start = motion.relative_pose(row_start_s, row_start_s + motion.exposure_s)
+    moved_m = None if t_end_start is None else (-r_end_start.T @ t_end_start).tolist()
+    depth_m, depth_source = _depth(motion)
     grid = tile_grid(height, width, LOG_TILE_PX, LOG_TILE_PX // 4)
     points = np.concatenate([centre, grid.centres_px])
     angle, length = angle_and_length(blur_chords(motion, points))
     corners = straightened_points(motion, corner_points(width, height))
     return {
         "motion": {
-            "delta_position_m": None,
+            "delta_position_m": moved_m,
             "delta_q_wxyz": quaternion_wxyz(r_end_start.T).tolist(),
             "rate_rad_s": trajectory.rate_rad_s(row_start_s + motion.exposure_s / 2).tolist(),
-            "velocity_m_s": None,
+            "velocity_m_s": _velocity_m_s(motion, row_start_s),
         },
-        "depth_m": None,
-        "depth_source": "none",
+        "depth_m": depth_m,
+        "depth_source": depth_source,
         "blur": {
             "angle_rad": float(angle[0]),
             "length_px": float(length[0]),
@@ -139,6 +152,21 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: 
         },
         "response": (profile.response or ResponseCurve("srgb")).describe(),
     }
+
+
+def _depth(motion: RowMotion) -> tuple[float | None, str]:
+    """Depth at the picture's centre and where it is from; a plane at infinity has none."""
+    if motion.translation is None or motion.translation.depth_m is None or np.isinf(motion.translation.depth_m):
+        return None, "none"
+    return motion.translation.depth_m, motion.translation.source
+
+
+def _velocity_m_s(motion: RowMotion, time_s: float) -> list[float] | None:
+    """Velocity of the camera's centre at a time, in its axes at that time (eq 5)."""
+    if motion.translation is None:
+        return None
+    rotation, _ = motion.pose(time_s)
+    return list((rotation @ motion.translation.velocity_at(time_s - motion.reference_s)).tolist())
 
 
 def copied_frame(
@@ -216,15 +244,16 @@ def _deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px:
 def _deblurred(
     picture: NDArray[np.uint8],
     motion: RowMotion,
-    curve: ResponseCurve,
     settings: RestorationSettings,
     anchor: float,
     longest_px: float,
+    light: FrameLight | None,
 ) -> tuple[NDArray[np.uint8], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
+    curve = motion.profile.response or ResponseCurve("srgb")
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
-    luma, chroma = measure_picture(picture, samples)
+    luma, chroma = _measured(picture, samples)
     clipped = bool(np.mean(cv2.LUT(picture, curve.clipped_table().astype(np.uint8))) > MANY_CLIPPED)
     share = 1.0 if clipped or anchor != 0.5 else _trusted_share(luma, settings.deblur)
     why_not = _too_little_to_gain(luma, clipped, share)
@@ -233,12 +262,14 @@ def _deblurred(
     blurred = blurred_picture(
         picture, curve, (luma, chroma), lambda centres: kernel_field(motion, centres, anchor), longest_px
     )
+    if light is not None:
+        blurred = _evened(blurred, light)
     sharp = deblur(blurred, settings)
     if anchor == 0.5:
         part = np.float32(share) * _blurred_part(motion, settings.min_blur_px)
         if part.min() < 1.0:
-            sharp = [light + part * (s - light) for s, light in zip(sharp, blurred.light, strict=True)]
-    restored = encode_picture(sharp, curve)
+            sharp = [plane + part * (s - plane) for s, plane in zip(sharp, blurred.light, strict=True)]
+    restored = encode_picture(sharp if light is None else [plane * light.kept for plane in sharp], curve)
     details = {
         "method": settings.deblur,
         "preset": settings.preset,
@@ -248,8 +279,47 @@ def _deblurred(
         "noise_grey_levels": luma.noise_levels,
         "expected_gain_db": luma.expected_gain_db,
         "share": share,
+        "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
     return restored, details, ()
+
+
+def _measured(picture: NDArray[np.uint8], field: KernelField) -> tuple[PictureStatistics, PictureStatistics]:
+    """Statistics of luma and chroma. Noise shows where the paths cancel; a Gaussian, the same all round, hides it.
+
+    So the paths alone are fitted, which measures the noise and the defocused picture, and that is focused afterwards.
+    """
+    luma, chroma = measure_picture(picture, replace(field, defocus_sigma_px=0.0))
+    return _focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px)
+
+
+def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics:
+    """Spectra of the picture before a Gaussian came over it; where that left less than the noise, S falls as f⁻³."""
+    if not sigma_px or not defocused.measured:
+        return defocused
+    frequency = defocused.frequency
+    left = np.exp(-((2 * np.pi * sigma_px * frequency) ** 2))
+    signal = defocused.signal / left
+    drowned = np.flatnonzero(defocused.passed * defocused.signal < defocused.noise)
+    drowned = drowned[drowned > 0]
+    if len(drowned):
+        last = drowned[0] - 1
+        signal[last + 1 :] = signal[last] * (frequency[last] / frequency[last + 1 :]) ** 3
+    return replace(defocused, signal=signal, passed=defocused.passed * left)
+
+
+def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
+    """The picture without flicker and vignetting: both came after the blur, so they go before it is undone."""
+    planes = [light.evened(plane, mask) for plane, mask in zip(blurred.light, blurred.clipped, strict=True)]
+    recorded_slopes = blurred.slopes
+    return replace(blurred, light=planes, slopes=lambda channel: recorded_slopes(channel) * light.recorded)
+
+
+def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
+    """The picture that is not deblurred, without flicker, and vignetted as where its pixels go."""
+    clipped = cv2.LUT(picture, curve.clipped_table().astype(np.uint8))
+    planes = zip(cv2.split(cv2.LUT(picture, curve.linear_table())), cv2.split(clipped), strict=True)
+    return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
 
 
 def _too_little_to_gain(luma: PictureStatistics, clipped: bool, share: float) -> str:
@@ -268,6 +338,7 @@ def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32]:
     width, height = motion.profile.width, motion.profile.height
     x, y = (np.linspace(0, length - 1, max(2, length // 48)) for length in (width, height))
     length_px = np.linalg.norm(blur_chords(motion, np.stack(np.meshgrid(x, y), -1)), axis=-1)
+    length_px = equivalent_length_px(motion.profile, length_px)
     part = np.clip(length_px / min_blur_px - 1.0, 0.0, 1.0).astype(np.float32)
     return cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)
 

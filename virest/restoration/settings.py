@@ -43,7 +43,7 @@ class RestorationSettings:
 
 
 PRESETS: dict[str, RestorationSettings] = {
-    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=192),
-    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5),
+    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144),
+    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5, tile_px=104),
     "best": RestorationSettings("best", "hyper-laplacian-global", iterations=6, inner_iterations=6, strength=0.6),
 }

@@ -27,7 +27,6 @@ _WINDOW = np.outer(np.hanning(_SIDE + 2)[1:-1], np.hanning(_SIDE + 2)[1:-1]).ast
 _WINDOW_SUM = float(_WINDOW.sum())
 _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 _ROUNDING_POWER = 1 / 12
-_SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _FIT_STEPS = 6
 _CELLS = 64
 _MAX_TILES = 12
@@ -98,11 +97,10 @@ def measure_picture(picture: NDArray[np.uint8], field: KernelField) -> tuple[Pic
     corners = _corners(field, luma.shape)
     if not corners or field.radius_px >= _SIDE // 2:
         return _unknown_picture(), _unknown_picture()
-    clipped = np.array([np.mean(_cut(luma, corner) >= _NEAR_CLIPPING) for corner in corners])
+    clipped = np.array([np.count_nonzero(_cut(luma, corner) >= _NEAR_CLIPPING) for corner in corners]) / _SIDE**2
     chosen = np.flatnonzero(clipped <= max(_MAX_CLIPPED, float(np.quantile(clipped, 0.25))))
     chosen = chosen[:: int(np.ceil(len(chosen) / _MAX_TILES))]
-    kernels = field.arrays()
-    passed = np.stack([_passed(kernels[i]) for i in chosen])
+    passed = np.stack([_passed(kernel) for kernel in field.chosen(chosen).arrays()])
 
     def observed(plane: NDArray[np.uint8], where: NDArray[np.intp]) -> NDArray[np.float32]:
         return np.stack([_windowed_power(_cut(plane, corners[i])) for i in where])
@@ -120,7 +118,9 @@ def white_noise(plane: NDArray[np.uint8]) -> float:
 
     Immerkær 1996, doi:10.1006/cviu.1996.0060; edges and texture are outliers to the median.
     """
-    residual = cv2.filter2D(plane, cv2.CV_32F, _SECOND_DIFFERENCE)[2:-2:4, 2:-2:4]
+    above, here, below = (plane[first : len(plane) - 4 + first : 4].astype(np.int16) for first in (1, 2, 3))
+    down = above - 2 * here + below
+    residual = down[:, 1:-3:4] - 2 * down[:, 2:-2:4] + down[:, 3:-1:4]
     return float(np.median(np.abs(residual))) / 0.6745 / 6.0
 
 
@@ -245,10 +245,20 @@ def on_spectrum(
 
     scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.
     """
-    frequency = packed_frequency(size) / np.float32(scale)
-    values = np.exp(np.interp(frequency, statistics.frequency, np.log(ring_values)))
-    values *= np.minimum(frequency / statistics.frequency[0], 1.0) ** 2
-    return values.astype(np.float32)
+    below, part, falling = _between_rings(size, scale)
+    levels = np.log(ring_values).astype(np.float32)
+    values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below])
+    return np.asarray(values * falling, np.float32)
+
+
+@lru_cache(maxsize=8)
+def _between_rings(size: int, scale: float) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+    """Ring below each place of a packed spectrum, part of the way to the next one, and f² below the lowest ring."""
+    position = packed_frequency(size) / scale * (RINGS / 0.5) - 0.5
+    held = np.clip(position, 0, RINGS - 1)
+    below = np.floor(held).astype(np.intp)
+    falling = np.minimum((position + 0.5) / 0.5, 1.0) ** 2
+    return below, (held - below).astype(np.float32), falling.astype(np.float32)
 
 
 def _bessel_j0(x: Array) -> Array:

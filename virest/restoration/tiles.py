@@ -7,26 +7,34 @@ side, so real filters are plain products.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 
 import cv2
 import numpy as np
 
-from virest.degradation.blur import Image, TileGrid, fast_size
+from virest.degradation.blur import FAST_SIZES, Image, TileGrid, fast_size, tile_grid
+from virest.restoration.deconvolution import richardson_lucy
 
+LEAST_SIDE, LARGEST_SIDE = 0.8, 1.15
+"""Tiles may be so much smaller or larger than asked for, where that makes their transforms quick."""
+SETTLING_ITERATIONS, SETTLING_RELAXATION = 6, 1.7
+"""About as good as ten plain steps of Richardson-Lucy's."""
 Filter = Callable[[Image], Image]
 """Turns a kernel's power spectrum |K|² (packed, real parts doubled) into the real factor that follows conj(K)."""
 
 
 class TileDeconvolution:
-    """Windows, margins and kernels of one picture, ready to filter any number of its channels."""
+    """Windows, margins and kernels of one picture, ready to filter any number of its channels.
+
+    Methods that give spectra give them one by one: a tile that is filtered and blended at once stays in the cache.
+    """
 
     def __init__(self, grid: TileGrid, kernels: Image, margin: int) -> None:
         self.grid = grid
         self.margin = margin = max(margin, kernels.shape[1] // 2 + 1)
         self.patch = grid.side + 2 * margin
-        self.size = fast_size(self.patch + max(8, self.patch // 16))
+        self.size = fast_size(self.patch + margin)
         self.at_border = [
             top < margin
             or left < margin
@@ -36,31 +44,85 @@ class TileDeconvolution:
         ]
         self._windows = grid.windows()
         self._bridge = _bridge(self.size - self.patch)
-        self._kernels = [self._kernel_spectrum(kernel) for kernel in kernels]
-        self.powers = [doubled(cv2.mulSpectrums(k, k, 0, conjB=True)) for k in self._kernels]
+        self._tile = np.empty((self.size, self.size), np.float32)
+        self.kernels = list(_kernel_spectra(kernels, self.size))
+        self.settled: dict[int, Image] = {}
+        """Spectra of tiles that are solved already, by their number."""
+        self.powers = [doubled(cv2.mulSpectrums(k, k, 0, conjB=True)) for k in self.kernels]
 
-    def filters(self, make: Filter, at_border: Filter | None = None) -> list[Image]:
+    def filters(self, make: Filter, at_border: Filter | None = None) -> Iterator[Image]:
         """The packed real factor of each tile; ``at_border`` makes those of tiles that see beyond the picture."""
-        return [
-            (at_border or make)(power) if border else make(power)
-            for power, border in zip(self.powers, self.at_border, strict=True)
-        ]
+        for power, border in zip(self.powers, self.at_border, strict=True):
+            yield (at_border or make)(power) if border else make(power)
 
-    def back_projected(self, channel: Image) -> list[Image]:
+    def back_projected(self, channel: Image) -> Iterator[Image]:
         """Spectrum of Kᵀ g for each tile; channel (height, width) is extended, never wrapped."""
-        padded = self.padded(channel)
+        for spectrum, kernel in zip(self.spectra(channel), self.kernels, strict=True):
+            yield cv2.mulSpectrums(spectrum, kernel, 0, conjB=False)
+
+    def touched(self, mask: Image) -> list[int]:
+        """Numbers of the tiles that see anything of a mask (height, width)."""
+        padded, patch = self.padded(mask), self.patch
         return [
-            cv2.mulSpectrums(cv2.dft(self.periodic(padded, top, left)), spectrum, 0, conjB=False)
-            for (top, left), spectrum in zip(self.grid.corners(), self._kernels, strict=True)
+            number
+            for number, (top, left) in enumerate(self.grid.corners())
+            if cv2.hasNonZero(padded[top : top + patch, left : left + patch])
         ]
 
-    def blend(self, spectra: list[Image]) -> Image:
+    def settle(self, numbers: list[int], kernels: Image, channel: Image, weight: Image) -> None:
+        """Solve some tiles for good, by Richardson-Lucy with weights.
+
+        Around a lamp a linear filter rings, since the light that is missing there is many times what was recorded;
+        multiplicative steps keep light positive and leave the dark beside it alone.  kernels: of these tiles,
+        nowhere negative.  channel, weight: (height, width); the bridges have no weight.
+        """
+        light, weights = self.padded(channel), self.padded(weight)
+        corners, patch = list(self.grid.corners()), self.patch
+        for number, kernel in zip(numbers, _kernel_spectra(kernels, self.size), strict=True):
+            top, left = corners[number]
+            measured = np.zeros((self.size, self.size), np.float32)
+            measured[:patch, :patch] = weights[top : top + patch, left : left + patch]
+            self.settled[number] = cv2.dft(_sharpened(self.periodic(light, top, left), kernel, measured))
+
+    def spectra(self, channel: Image, border: int = cv2.BORDER_REPLICATE) -> Iterator[Image]:
+        """Spectrum of each tile of a channel (height, width); of settled tiles that of their solution."""
+        padded = self.padded(channel, border)
+        for number, (top, left) in enumerate(self.grid.corners()):
+            known = self.settled.get(number)
+            yield cv2.dft(self.periodic(padded, top, left)) if known is None else known
+
+    def solutions(
+        self, projected: Iterable[Image], inner: Image, at_border: Image, unless_settled: bool = False
+    ) -> Iterator[Image]:
+        """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border.
+
+        A settled tile's own spectrum, or with ``unless_settled``, nothing.
+        """
+        for number, (spectrum, power) in enumerate(zip(projected, self.powers, strict=True)):
+            if number in self.settled:
+                yield np.zeros_like(spectrum) if unless_settled else self.settled[number]
+            else:
+                yield cv2.divide(spectrum, cv2.add(power, at_border if self.at_border[number] else inner))
+
+    def pulled(self, projected: Iterable[Image], pull: Image, inner: float, at_border: float) -> Iterator[Image]:
+        """Each tile's spectrum plus that of a picture (height, width) times a factor, of tiles inside or at the border.
+
+        Beyond its edges the picture is 0.
+        """
+        spectra = self.spectra(pull, cv2.BORDER_CONSTANT)
+        for spectrum, back, border in zip(spectra, projected, self.at_border, strict=True):
+            yield cv2.scaleAdd(spectrum, at_border if border else inner, back)
+
+    def blend(self, spectra: Iterable[Image]) -> Image:
         """Tiles back into one picture (height, width), through the windows."""
         grid, side, margin = self.grid, self.grid.side, self.margin
         result = np.zeros((grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
+        tile = self._tile
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, spectra, strict=True):
-            tile = cv2.idft(spectrum, flags=cv2.DFT_SCALE)[margin : margin + side, margin : margin + side]
-            cv2.accumulateProduct(window, tile, result[top : top + side, left : left + side])
+            cv2.idft(spectrum, tile, flags=cv2.DFT_SCALE)
+            inner = tile[margin : margin + side, margin : margin + side]
+            inner *= window
+            result[top : top + side, left : left + side] += inner
         return result[: grid.height, : grid.width]
 
     def padded(self, channel: Image, border: int = cv2.BORDER_REPLICATE) -> Image:
@@ -71,26 +133,57 @@ class TileDeconvolution:
         return cv2.copyMakeBorder(channel, margin, below, margin, right, border)
 
     def periodic(self, padded: Image, top: int, left: int) -> Image:
-        """One tile with its margin, bridged from each edge to the opposite one, (size, size)."""
-        patch = self.patch
-        tile = np.empty((self.size, self.size), np.float32)
+        """One tile with its margin, bridged from each edge to the opposite one, (size, size); good until the next."""
+        patch, tile, bridge = self.patch, self._tile, self._bridge
         tile[:patch, :patch] = padded[top : top + patch, left : left + patch]
-        bridge = self._bridge
-        tile[:patch, patch:] = np.outer(tile[:patch, patch - 1], 1 - bridge) + np.outer(tile[:patch, 0], bridge)
-        tile[patch:] = np.outer(1 - bridge, tile[patch - 1]) + np.outer(bridge, tile[0])
+        np.matmul(tile[:patch, [patch - 1, 0]], bridge, out=tile[:patch, patch:])
+        np.matmul(bridge.T, tile[[patch - 1, 0]], out=tile[patch:])
         return tile
 
-    def _kernel_spectrum(self, kernel: Image) -> Image:
-        """Spectrum of the *flipped* use: conj, so that mulSpectrums applies the transpose of a correlation."""
-        radius = kernel.shape[0] // 2
-        buffer = np.zeros((self.size, self.size), np.float32)
-        buffer[: kernel.shape[0], : kernel.shape[1]] = kernel
-        return cv2.dft(np.roll(buffer, (-radius, -radius), (0, 1)))
+
+def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
+    """Richardson-Lucy over a periodic tile."""
+
+    def through(picture: Image, forward: bool) -> Image:
+        return cv2.idft(cv2.mulSpectrums(cv2.dft(picture), kernel, 0, conjB=forward), flags=cv2.DFT_SCALE)
+
+    def blur(sharp: Image) -> Image:
+        return through(sharp, True)
+
+    def unblur(seen: Image) -> Image:
+        return through(seen, False)
+
+    return richardson_lucy(tile, blur, unblur, tile, weight, SETTLING_ITERATIONS, SETTLING_RELAXATION)
+
+
+def quick_grid(height: int, width: int, side: int, margin: int, overlap_parts: int) -> TileGrid:
+    """Tiles of about ``side``, of the size at which all their transforms together take the least time.
+
+    They overlap by a part of their side, 1 / overlap_parts.  Between margins and bridge of one width: a steep bridge
+    is an edge that the deconvolution carries into the tile.
+    """
+    sides = [size - 3 * margin for size in FAST_SIZES]
+    fitting = [s for s in sides if LEAST_SIDE * side <= s <= LARGEST_SIDE * side] or [side]
+    grids = [tile_grid(height, width, s, s // overlap_parts) for s in fitting]
+    return min(grids, key=lambda grid: len(grid.tops) * len(grid.lefts) * fast_size(grid.side + 3 * margin) ** 2)
+
+
+def _kernel_spectra(kernels: Image, size: int) -> Iterator[Image]:
+    """Spectra of the *flipped* use: conj, so that mulSpectrums applies the transpose of a correlation."""
+    radius = kernels.shape[1] // 2
+    buffer = np.zeros((size, size), np.float32)
+    for kernel in kernels:
+        for rows, from_rows in ((np.s_[: radius + 1], np.s_[radius:]), (np.s_[size - radius :], np.s_[:radius])):
+            buffer[rows, : radius + 1] = kernel[from_rows, radius:]
+            buffer[rows, size - radius :] = kernel[from_rows, :radius]
+        yield cv2.dft(buffer)
 
 
 def _bridge(length: int) -> Image:
+    """Weights of the last and of the first sample on the way from the one to the other, (2, length)."""
     rise = (np.arange(length, dtype=np.float32) + 1) / (length + 1)
-    return (rise * rise * (3 - 2 * rise)).astype(np.float32)
+    smooth = rise * rise * (3 - 2 * rise)
+    return np.stack([1 - smooth, smooth]).astype(np.float32)
 
 
 def doubled(packed: Image) -> Image:

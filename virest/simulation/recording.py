@@ -267,11 +267,10 @@ def _write_stamps(folder: Path, session: Session, options: RecordingOptions) -> 
 
 
 def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -> None:
-    """Write what the phone claims: nominal focal length and readout, logged exposure; exposure × ISO stays."""
+    """Write what the phone claims: nominal focal length and readout, logged exposure and ISO."""
     nominal, lens = session.nominal, session.nominal.intrinsics
     fx, fy = (f"{lens.fx_px:.7g}", f"{lens.fy_px:.7g}") if lens else ("1.0", "1.0")
     readout = round(nominal.shutter.readout_time_s * 1e9)
-    first = session.logged_exposure_s(0)
     rows = []
     for k, stamp in enumerate(session.stamp_ns.tolist()):
         exposure = session.logged_exposure_s(k)
@@ -283,7 +282,7 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
             round(exposure * 1e9),
             round(1e9 / session.settings.fps),
         ]
-        numbers += [readout, round(144 * first / exposure), nominal.focal_length_mm or 3.95, 0.16422288, 3]
+        numbers += [readout, int(session.exposures.iso[k]), nominal.focal_length_mm or 3.95, 0.16422288, 3]
         rows.append([str(n) for n in [*numbers, _unix_ns(stamp, 50_000_000)]])
     columns = ["Timestamp[nanosec]", "fx[px]", "fy[px]", "Frame No.", "Exposure time[nanosec]"]
     columns += [
@@ -333,12 +332,13 @@ def _write_effects(truth: Path, session: Session, applied: tuple[AppliedEffect, 
             "first_row_start_s": round(session.first_row_start_s(capture), 9),
             "middle_s": round(session.middle_s(capture), 9),
             "exposure_s": session.true_exposure_s(capture),
+            **({"light": float(session.exposures.light[capture])} if session.settings.auto_exposure else {}),
         }
         for slot, capture in enumerate(session.shows.tolist())
     ]
     content = {
         "effects": [{"name": a.name, "parameters": a.parameters} for a in applied],
-        "settings": asdict(session.settings),
+        "settings": {k: v for k, v in asdict(session.settings).items() if k != "auto_exposure" or v},
         "scene_plane": {
             "depth_m": scene.depth_m if np.isfinite(scene.depth_m) else "inf",
             "normal": list(scene.normal),

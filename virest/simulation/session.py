@@ -18,6 +18,7 @@ from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
 from virest.errors import SettingsError
+from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
 from virest.simulation.scenes import Scene, make_scene
@@ -46,9 +47,11 @@ class SessionSettings:
     frames: int = 12
     fps: float = 30.0
     exposure_s: tuple[float, ...] = (0.010,)
-    """As logged; frame k takes entry k modulo the length."""
+    """As logged; frame k takes entry k modulo the length. The ISO makes up for a change: the light stays."""
+    auto_exposure: AutoExposure | None = None
+    """Exposure × ISO moves, and the picture's brightness with it; None: it stays."""
     rate_rad_s: float = 1.0
-    """RMS of the angular rate."""
+    """RMS of the angular rate; 0: the camera does not turn, and without a sway stands still, as on a tripod."""
     sway_m: float | None = None
     """RMS of the sway; None: DEFAULT_SWAY_M where the scene has a depth, else none."""
     tilt_rad: tuple[float, float] = (0.0, 0.0)
@@ -83,10 +86,12 @@ class Session:
     """(frames,) which capture each slot of the movie shows; the slot's own index without start-up lag."""
     imu_span_s: tuple[float, float]
     """First and last inertial sample."""
+    exposures: Exposures
+    """Of every capture, the first ``frames`` of them shown or not."""
 
     def logged_exposure_s(self, capture: int) -> float:
         """Exposure that the log gives for a capture."""
-        return self.settings.exposure_s[capture % len(self.settings.exposure_s)]
+        return float(self.exposures.logged_s[capture])
 
     def true_exposure_s(self, capture: int) -> float:
         """Exposure that the sensor made."""
@@ -181,7 +186,8 @@ def plan_session(
     ticks = np.array([_stamp_tick(k, settings.fps) for k in range(settings.frames)])
     stamps = base_ns + np.array([round(_stamp_s(k, settings.fps) * 1e9) for k in range(settings.frames)])
     view = make_view(true, motion, rest_s=span[0])
-    return Session(nominal, true, settings, scene, motion, view, ticks, stamps.astype(np.int64), shows, span)
+    exposures = _plan_exposures(settings, shows)
+    return Session(nominal, true, settings, scene, motion, view, ticks, stamps.astype(np.int64), shows, span, exposures)
 
 
 def render_picture(session: Session, slot: int) -> Picture:
@@ -271,6 +277,13 @@ def _shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[n
     return slots + lag - np.searchsorted(repeats, slots, side="right")
 
 
+def _plan_exposures(settings: SessionSettings, shows: NDArray[np.int64]) -> Exposures:
+    """Of every capture that a slot shows or that has a slot's number."""
+    count = max(settings.frames, int(shows.max()) + 1)
+    rng = np.random.default_rng([settings.seed, 6])
+    return plan_exposures(settings.exposure_s, settings.auto_exposure, count, settings.fps, rng)
+
+
 def _draw_scene(nominal: CameraProfile, motion: HandMotion, settings: SessionSettings, duration_s: float) -> Scene:
     """Draw a chart that covers all that the motion shows, half a second before and after too."""
     lens = nominal.intrinsics
@@ -308,10 +321,14 @@ def _at_median_depth(
 
 
 def _gain(session: Session, slot: int) -> float:
-    """Gain of the first slot that shows this slot's capture, so that repeats are exact."""
+    """Factor on the light: the capture's exposure × ISO, and the hidden gain of the first slot that shows it.
+
+    The first slot's, so that repeats are exact.
+    """
     gain = session.true.extensions.gain
-    first = int(np.argmax(session.shows == session.shows[slot]))
-    return gain[first] if first < len(gain) else 1.0
+    capture = int(session.shows[slot])
+    first = int(np.argmax(session.shows == capture))
+    return float(session.exposures.light[capture]) * (gain[first] if first < len(gain) else 1.0)
 
 
 def _curve(session: Session) -> ResponseCurve:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from virest import __version__
+from virest.app.bench.curves import curves_section
 from virest.app.bench.memory import memory_section
 from virest.app.bench.quality import quality_section
 from virest.app.bench.shutter import shutter_section
@@ -30,6 +31,7 @@ SECTIONS: dict[str, Section] = {
     "shutter": shutter_section,
     "speed": speed_section,
     "memory": memory_section,
+    "curves": curves_section,
 }
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image")
 

@@ -1,0 +1,212 @@
+"""Hidden photometric effects come back from brightness alone, and nothing comes back where nothing is hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from virest.app.simulate import simulate_command
+from virest.camera.profile import CameraProfile, Extensions, read_profile
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import Shutter
+from virest.capture.folder import read_capture
+from virest.capture.video import probe_movie, read_frames
+from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
+from virest.diagnosis.photometry_effects import (
+    BlackLevel,
+    Flicker,
+    GainDrift,
+    ResponseGamma,
+    Vignetting,
+    photometric_effects,
+)
+from virest.diagnosis.photometry_fit import fit_photometry, judge, significance, time_blocks
+from virest.diagnosis.photometry_patches import observe_photometry
+from virest.motion.integration import integrate_gyro
+
+FRAMES, NOISE = 60, 0.5
+NOMINAL = CameraProfile(
+    640, 480, shutter=Shutter(0.018, "bottom_to_top"), response=ResponseCurve("srgb"), time_offset_s=0.002
+)
+
+
+def made_observations(true: CameraProfile, rng: np.random.Generator, products: float = 0.0) -> PhotometricObservations:
+    """Patches that wander through the picture, their grey written down from the contract's model.
+
+    products: spread of the logged exposure × ISO, in log light.
+    """
+    patches = 150
+    frame = np.tile(np.arange(FRAMES), patches)
+    patch = np.repeat(np.arange(patches), FRAMES)
+    sway = 90 * np.stack([np.sin(0.31 * np.arange(FRAMES)), np.cos(0.17 * np.arange(FRAMES))], axis=-1)
+    at = rng.uniform((100, 100), (540, 380), (patches, 2))[patch] + sway[frame]
+    light = np.exp(rng.uniform(np.log(0.02), np.log(0.5), patches))[patch]
+    log_product = products * np.sin(0.4 * frame + 0.3)
+    fraction = 1 - (at[:, 1] + 1) / 480
+    radius = np.hypot(at[:, 0] - 319.5, at[:, 1] - 239.5) / 400.0
+    ext, exposure = true.extensions, 0.007
+    time = frame / 29.7 + 0.002 + fraction * 0.018
+    fine = time[:, None] + exposure * (np.arange(64) + 0.5) / 64
+    wave = 1 + ext.flicker_amplitude * np.sin(2 * np.pi * ext.flicker_frequency_hz * fine + ext.flicker_phase_rad)
+    light = light * np.exp(log_product) * wave.mean(axis=1) * (1 - ext.vignetting_corner_loss * radius**2)
+    light = light * np.array(ext.gain or np.ones(FRAMES))[frame]
+    assert true.response is not None
+    plain = np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light) ** true.response.extra_gamma
+    grey = 255 * (true.response.black_level + (1 - true.response.black_level) * plain)
+    grey += NOISE * rng.normal(size=len(grey))
+    return PhotometricObservations(
+        3 * patch, frame, frame / 29.7, fraction, at[:, 0], at[:, 1], radius, grey, np.full(len(grey), NOISE),
+        np.full(len(grey), exposure), log_product, np.zeros(len(grey)), frame == 0, True, 640, 480,
+    )  # fmt: skip
+
+
+def hidden(gamma: float = 1.0, black: float = 0.0, **extensions: object) -> CameraProfile:
+    """Put effects into the nominal profile."""
+    curve = ResponseCurve("srgb", extra_gamma=gamma, black_level=black)
+    return replace(NOMINAL, response=curve, extensions=Extensions(**extensions))  # type: ignore[arg-type]
+
+
+def test_the_true_profile_leaves_nothing_but_noise(rng: np.random.Generator) -> None:
+    """Under the profile that made the observations, residuals are as large as the noise, whatever the effects."""
+    true = hidden(1.25, 0.04, vignetting_corner_loss=0.35, flicker_amplitude=0.2, flicker_frequency_hz=120.0)
+    left = residuals(made_observations(true, rng, 0.3), true)
+    assert np.std(left) == pytest.approx(NOISE, rel=0.03)
+    assert np.std(residuals(made_observations(true, rng, 0.3), NOMINAL)) > 4 * NOISE
+
+
+def test_each_effect_comes_back_within_its_deviation(rng: np.random.Generator) -> None:
+    """Vignetting and flicker are found at a constant exposure, gamma and black level where it changes."""
+    observed = made_observations(hidden(vignetting_corner_loss=0.35), rng)
+    fit = fit_photometry(observed, NOMINAL, [Vignetting()])
+    assert fit.values[0] == pytest.approx(0.35, abs=3 * fit.std[0] + 1e-9)
+    assert fit.std[0] < 0.01
+    lamp = hidden(flicker_amplitude=0.22, flicker_frequency_hz=100.0, flicker_phase_rad=2.0)
+    fit = fit_photometry(made_observations(lamp, rng), NOMINAL, [Flicker()])
+    np.testing.assert_array_less(np.abs(fit.values - (0.22, 100.0, 2.0)), 4 * fit.std)
+    assert fit.std[0] < 0.01
+    fit = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), NOMINAL, [ResponseGamma(), BlackLevel()])
+    np.testing.assert_array_less(np.abs(fit.values - (1.2, 0.05)), 4 * fit.std)
+    assert fit.std[0] < 0.02 and fit.std[1] < 0.005
+    # the deviation of each knows of the other: alone they would look better known
+    alone = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), hidden(1.2), [BlackLevel()])
+    assert fit.std[1] > 1.3 * alone.std[0]
+
+
+def test_gains_are_judged_on_other_places(rng: np.random.Generator) -> None:
+    """A gain per frame comes back, median 1, and holds for patches that it was not fitted to."""
+    gain = np.exp(0.08 * np.sin(0.9 * np.arange(FRAMES)) + 0.05 * np.cos(0.21 * np.arange(FRAMES)))
+    gain /= np.median(gain)
+    observed = made_observations(hidden(gain=tuple(gain)), rng)
+    effect = GainDrift(tuple(range(FRAMES)), FRAMES)
+    fit = fit_photometry(observed, NOMINAL, [effect])
+    off = np.log(fit.profile.extensions.gain) - np.log(gain)
+    assert np.median(fit.profile.extensions.gain) == pytest.approx(1.0, abs=1e-6)
+    assert 0.5 < np.std(off / fit.std) < 1.6
+    held = judge(observed, NOMINAL, [effect])
+    assert held.split == "place" and held.gain > 0.98
+
+
+def test_constant_exposure_leaves_the_curve_open(rng: np.random.Generator) -> None:
+    """Where no light factor changes, brightness says nothing about gamma or black level, and the fit says so."""
+    observed = made_observations(hidden(1.2, 0.05), rng)
+    for effect, wide in ((ResponseGamma(), 0.3), (BlackLevel(), 0.03)):
+        fit = fit_photometry(observed, NOMINAL, [effect])
+        assert fit.std[0] > wide
+        assert significance(fit, effect.name, observed)[1] > 1e-3
+
+
+def test_flicker_that_the_exposure_averages_away_is_not_found(rng: np.random.Generator) -> None:
+    """At an exposure of a whole number of periods the lamp leaves no trace."""
+    observed = made_observations(hidden(flicker_amplitude=0.4, flicker_frequency_hz=1 / 0.007), rng)
+    fit = fit_photometry(observed, NOMINAL, [Flicker()])
+    assert significance(fit, "flicker", observed)[1] > 1e-3
+
+
+def test_the_memory_of_an_encoder_does_not_weaken_flicker(rng: np.random.Generator) -> None:
+    """A movie that follows brightness slowly still gives the lamp's own amplitude and phase."""
+    lamp = hidden(flicker_amplitude=0.2, flicker_frequency_hz=100.0, flicker_phase_rad=1.0)
+    observed = made_observations(lamp, rng)
+    slow = replace(observed, grey=remembered(observed.with_memory(0.3), observed.grey))
+    by_hand = 0.7 * observed.grey[1] + 0.3 * observed.grey[0], observed.grey[FRAMES]
+    np.testing.assert_allclose((slow.grey[1], slow.grey[FRAMES]), by_hand)
+    fit = fit_photometry(slow, NOMINAL, [Flicker()])
+    assert fit.memory == pytest.approx(0.3, abs=0.05)
+    np.testing.assert_array_less(np.abs(fit.values - (0.2, 100.0, 1.0)), 3 * fit.std)
+
+
+def test_blocks_are_contiguous_and_of_several_lengths(rng: np.random.Generator) -> None:
+    """Time blocks never split a frame, follow one another, and do not repeat one length."""
+    observed = made_observations(NOMINAL, rng)
+    block = time_blocks(observed)
+    first = block[:FRAMES]
+    assert np.array_equal(block, np.tile(first, len(block) // FRAMES))
+    assert np.all(np.isin(np.diff(first), (0, 1)))
+    assert len(set(np.bincount(first)[:-1].tolist())) > 1
+
+
+# ── through a movie ────────────────────────────────────────────────────────────────────────────────────────────────
+
+Observe = Callable[..., tuple[PhotometricObservations, CameraProfile, CameraProfile]]
+
+
+@pytest.fixture
+def observe(tmp_path: Path) -> Observe:
+    """Simulate a small capture with hidden effects, and look at its patches with the nominal profile."""
+
+    def run(*effects: str, log_gains: bool = False, **options: object):
+        folder = tmp_path / "capture"
+        simulate_command(
+            folder, width=320, height=240, frames=30, effects=effects, overwrite=True, seed=41,
+            **{"bitrate_bits_per_px": 1.0, **options},  # type: ignore[arg-type]
+        )  # fmt: skip
+        capture = read_capture(folder, look_at_pictures=False)
+        nominal, true = read_profile(folder / "camera.yaml"), read_profile(folder / "truth" / "camera.yaml")
+        gain = true.extensions.gain if log_gains else (1.0,) * 30
+        movie = read_frames(capture.movie, probe_movie(capture.movie), 0, 29)
+        pictures = ((replace(capture.frames[i], iso=144 * gain[i] + 1e-6), picture) for i, picture in movie)
+        trajectory = integrate_gyro(capture.imu, nominal)
+        return observe_photometry(pictures, trajectory, nominal, intra_frames=capture.keyframes), nominal, true
+
+    return run
+
+
+def test_vignetting_is_found_although_the_geometry_is_wrong(observe: Observe) -> None:
+    """A clock 10 ms off moves patches by several pixels; the loss at the corners still comes back."""
+    observed, nominal, true = observe("vignetting=0.4", "time_offset=0.01", rate_rad_s=1.4)
+    fit = fit_photometry(observed, nominal, [Vignetting()])
+    assert fit.values[0] == pytest.approx(true.extensions.vignetting_corner_loss, abs=0.04)
+    assert fit.values[0] == pytest.approx(true.extensions.vignetting_corner_loss, abs=3 * fit.std[0])
+    assert significance(fit, "vignetting", observed)[1] < 1e-6
+    assert judge(observed, nominal, [Vignetting()]).gain > 0.8
+
+
+def test_a_lamp_is_found_in_a_movie(observe: Observe) -> None:
+    """Amplitude and frequency of a flicker come back from rows and frames."""
+    observed, nominal, _ = observe("flicker=0.25,100,1.3", exposure_ms=8.0)
+    fit = fit_photometry(observed, nominal, [Flicker()])
+    assert fit.values[0] == pytest.approx(0.25, abs=0.03)
+    assert fit.values[1] == pytest.approx(100.0, abs=0.3)
+    assert np.sin(fit.values[2] - 1.3) == pytest.approx(0.0, abs=0.25)
+
+
+def test_a_curve_is_found_where_the_logged_light_changes(observe: Observe) -> None:
+    """With exposure × ISO that changes as logged, a gamma is found and no gain is."""
+    observed, nominal, _ = observe("gain_drift=0.2", "response_curve=1.25", log_gains=True)
+    fit = fit_photometry(observed, nominal, [ResponseGamma()])
+    assert fit.values[0] == pytest.approx(1.25, abs=0.06)
+    assert fit.values[0] == pytest.approx(1.25, abs=3 * fit.std[0] + 0.01)
+    assert log_light_factor(observed, nominal) == pytest.approx(observed.log_product)
+
+
+def test_nothing_hidden_nothing_found(observe: Observe) -> None:
+    """On a capture that its profile describes, no photometric effect is significant, at a wrong clock too."""
+    observed, nominal, _ = observe("time_offset=-0.008", scene="bright")
+    noise = np.sqrt(np.mean(observed.noise**2))
+    assert np.sqrt(np.mean(np.clip(residuals(observed, nominal), -4, 4) ** 2)) < 1.6 * noise
+    for effect in photometric_effects(observed, 30):
+        fit = fit_photometry(observed, nominal, [effect])
+        assert significance(fit, effect.name, observed)[1] > 1e-4, effect.name

@@ -1,0 +1,64 @@
+"""What the exposure curve is worth: the right one beats none and wrong ones, and so does knowing what is clipped."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from story import process, truth_picture
+
+from virest.app.bench.curves import GAMMA, clipping_rows, curve_rows
+from virest.app.simulate import simulate_command
+
+pytestmark = pytest.mark.scenario
+
+SEEDS, FRAMES = (11,), 3
+
+
+def test_the_right_curve_beats_none_by_far_at_gamma_2_2(work: Path):
+    """0.7 dB and more above taking grey for light, in the mean; above a wrong gamma on every frame."""
+    rows = {row["told"]: row for row in curve_rows(work, "gamma 2.2", SEEDS, FRAMES)}
+    assert rows["none (linear)"]["right_minus_this_db"] >= 0.7
+    for told in ("none (linear)", "gamma 1.2", "gamma 1 / 2.2"):
+        assert rows[told]["least_right_minus_this_db"] > 0.0
+
+
+def test_the_right_knots_are_better_on_every_frame(work: Path):
+    """A fifth of the pixels in toe and shoulder: never below no curve or one with other knots."""
+    rows = {row["told"]: row for row in curve_rows(work, "toe and shoulder", SEEDS, FRAMES)}
+    assert 0.1 < sum(rows["right"]["toe_and_shoulder"]) < 0.3
+    for told in ("none (linear)", "other knots", "srgb"):
+        assert rows[told]["right_minus_this_db"] > 0.05
+        assert rows[told]["least_right_minus_this_db"] > 0.0
+
+
+def test_lamps_do_no_harm_where_they_are_known_to_be_clipped(work: Path):
+    """3 % of the pixels several times too bright: 1 dB and more by the mask, of the whole and near the lamps."""
+    rows = {row["told"]: row for row in clipping_rows(work, "lamps", SEEDS, FRAMES)}
+    assert 0.02 < rows["without"]["clipped"] < 0.05
+    for part in ("near_db", "whole_db"):
+        assert rows["with the mask"][part] - rows["without"][part] >= 1.0
+
+
+def test_overexposed_areas_leave_the_rest_of_the_picture_alone(work: Path):
+    """3 % of the pixels a little too bright: elsewhere within 0.3 dB of the same scene in less light, in the mean."""
+    rows = {row["told"]: row for row in clipping_rows(work, "sunlit", (*SEEDS, 12), FRAMES)}
+    assert rows["with the mask"]["clipped"] == pytest.approx(0.03, abs=0.005)
+    assert rows["with the mask"]["elsewhere_db"] > rows["nothing clipped"]["elsewhere_db"] - 0.3
+
+
+def test_changing_exposure_is_light_and_not_grey(virest, work: Path):
+    """Under auto-exposure frames are restored as ever, each with the light that its own exposure gave."""
+    capture = work / "auto"
+    dim = "gain_drift=" + ",".join(["0.5"] * 8)  # so that the brightest exposure does not clip
+    simulate_command(capture, width=480, height=360, frames=8, exposure_ms=10.0, rate_rad_s=1.4, response=GAMMA, seed=9,
+                     auto_exposure_ev=2.0, bitrate_bits_per_px=1.0, effects=[dim])  # fmt: skip
+    result = process(virest, capture, work / "auto-out")
+    light = []
+    for line in result.lines:
+        assert line["status"] == "restored", line["warnings"]
+        x0, y0, x1, y1 = line["valid_px"]
+        pictures = (result.picture(line), truth_picture(capture, line["frame"]))
+        light.append([GAMMA.linearise(picture[y0:y1, x0:x1] / 255).mean() for picture in pictures])
+    restored, true = np.array(light).T
+    np.testing.assert_allclose(restored, true, rtol=0.01)
+    assert true.max() > 3 * true.min()

@@ -1,0 +1,503 @@
+"""`virest calibrate`: clock, readout, axes, bias and lens of a phone from an ordinary capture, without a target.
+
+Coarse: turns of the pictures against the gyroscope's, at every offset within a second and for any axes.  Then one robust
+fit over tracked points, each at its own row's time, first on few points to find the axis and sense of the readout and
+what the camera's translation needs, then on many with everything that was asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Capture
+from virest.errors import CalibrationError
+from virest.motion import profile_terms as terms_of
+from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely
+from virest.motion.observed_tracks import ObservedTracks, observe_tracks
+from virest.motion.scene_motion import FreeMotion, InertialMotion, Motion, free_motion
+from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
+from virest.motion.track_model import TrackTable, ground
+from virest.motion.tracking import TrackPair
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+MIN_PAIRS = 8
+MIN_MOTION_PX = 0.4
+"""Least rms of the pictures' changing turns from frame to frame, at the focal length."""
+MIN_EXPLAINED, MIN_EXPLAINED_BY_PAIR, MAX_MIN_EXPLAINED = 0.5, 5.0, 0.9
+"""Pictures follow the gyroscope if it explains 0.5 + 5 / pairs, at most 0.9, of their turns."""
+MIN_DISTINCT = 1.6
+"""The best offset leaves less than 1 / this of what the runner-up leaves unexplained."""
+FEW_POINTS, MANY_POINTS = 2000, 7000
+START_INVERSE_DEPTH_PER_M = 0.5
+EXPLAINED_SCALE = 1.15
+"""Whitened differences of this size need no translation."""
+TRANSLATION_GAIN = 0.97
+"""A translation stays if it brings the differences below this part."""
+FREE_GAIN = 0.8
+"""A free path replaces the accelerometer's only below this part of what that leaves."""
+DIRECTION_COST = 12.0
+"""Readouts along rows and along columns are told apart from this difference in cost, in units of its own noise."""
+OUTLIER_WEIGHT = 0.1
+MANY_OUTLIERS = 0.1
+STABILISER_SIGMA, STABILISER_FRACTION, STABILISER_GAIN = 6.0, 0.1, 0.9
+LARGE_CORRELATION = 0.9
+
+BASIC = ("time_offset", "readout_time", "imu_rotation", "gyro_bias")
+OPTIONAL = {
+    "focal": terms_of.FOCAL,
+    "distortion": terms_of.K1,
+    "principal-point": terms_of.PRINCIPAL_POINT,
+    "gyro-scale": terms_of.GYRO_SCALE,
+    "clock-skew": terms_of.CLOCK_SKEW,
+    "exposure-scale": terms_of.EXPOSURE_SCALE,
+}
+"""What ``--with`` adds."""
+MAX_STD = {
+    "time_offset": 0.002,
+    "readout_time": 0.002,
+    "imu_rotation": 0.01,
+    "gyro_bias": 0.006,
+    "focal_length": 0.02,
+    "radial_distortion": 0.03,
+    "principal_point": 12.0,
+    "gyro_scale": 0.02,
+    "clock_skew": 0.0015,
+    "exposure_time": 0.25,
+}
+"""Values known no better than this are not determined and stay where they were."""
+FLOOR_STD = {
+    "time_offset": 2.5e-5,
+    "readout_time": 4e-5,
+    "imu_rotation": 3e-4,
+    "gyro_bias": 2e-4,
+    "focal_length": 8e-4,
+    "radial_distortion": 7e-4,
+    "principal_point": 0.15,
+    "gyro_scale": 8e-4,
+    "clock_skew": 1e-5,
+    "exposure_time": 0.03,
+}
+"""Tracking's own bias under changing blur and the codec's: 0.1 % of the motion, some 20 µs late."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedValue:
+    """One value of the profile, before and after."""
+
+    name: str
+    """As in the profile: time_offset_s, readout_time_s, readout_direction, rotation_rad, gyro_bias_rad_s, fx_px ..."""
+    start: float | list[float] | str | None
+    value: float | list[float] | str | None
+    """Fitted; the start where not determined."""
+    std: float | list[float] | None
+    determined: bool
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryCalibration:
+    """A calibrated profile and what it is worth."""
+
+    profile: CameraProfile
+    values: tuple[CalibratedValue, ...]
+    correlations: tuple[tuple[str, str, float], ...]
+    """Pairs of values whose errors go together by more than 0.9."""
+    translation: str
+    """``none``, ``inertial`` (the accelerometer's path before a plane) or ``free`` (a path without accelerometer)."""
+    residual_px: float
+    """Robust standard deviation per coordinate of tracked minus predicted points."""
+    noise_px: float
+    """What tracking alone makes, measured without the model."""
+    before_px: float
+    """The residual of the starting profile, at the offset found coarsely."""
+    explained: float
+    """Part of the pictures' changing turns that the gyroscope explains."""
+    moving_fraction: float
+    """Part of the tracks that do not go with the camera's motion."""
+    pairs: int
+    tracks: int
+    notes: tuple[str, ...]
+    fit: TrackFit
+
+    @property
+    def determined(self) -> bool:
+        """Whether everything asked for was found."""
+        return all(value.determined for value in self.values)
+
+    @property
+    def verdict(self) -> str:
+        """One line for people."""
+        open_values = [value.name for value in self.values if not value.determined]
+        if not open_values:
+            return "calibrated"
+        return f"calibrated but for {', '.join(open_values)}, which this motion does not determine"
+
+
+def calibrate_geometry(
+    capture: Capture,
+    profile: CameraProfile,
+    pairs: Sequence[TrackPair],
+    extra: Sequence[str] = (),
+    progress: Callable[[str], None] | None = None,
+) -> GeometryCalibration:
+    """Fit time offset, readout, IMU-camera rotation and gyroscope bias, and what ``extra`` (keys of OPTIONAL) adds.
+
+    Raises CalibrationError where the data do not determine even the offset: a camera at rest, a steady pan, too few
+    points, pictures that do not follow the gyroscope.
+    """
+    say = progress or (lambda _: None)
+    observed = observe_tracks(capture, pairs, profile)
+    coarse = _require_coarse(observed, capture.imu, profile)
+    unknown_focal = profile.intrinsics is None
+    start = _started(profile, observed, coarse)
+    observed = observed.covered(capture.imu, start)
+    if len(observed.pairs) < MIN_PAIRS:
+        raise CalibrationError(f"{len(observed.pairs)} pairs of frames lie inside the inertial data")
+    say("coarse")
+    wanted = [terms_of.TIME_OFFSET, terms_of.GYRO_BIAS, terms_of.IMU_ROTATION]
+    wanted += [terms_of.FOCAL] if unknown_focal or "focal" in extra else []
+    rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, wanted)
+    say("readout")
+    wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS]
+    names = list(dict.fromkeys([*extra, *(["focal"] if unknown_focal else [])]))
+    wanted += [OPTIONAL[name] for name in names if name in OPTIONAL]
+    table = observed.table(MANY_POINTS)
+    fit = fit_tracks(capture.imu, table, rough.profile, wanted, _grown(rough, capture.imu, table))
+    say("joint")
+    return _conclude(capture, profile, start, observed, coarse, rough, fit)
+
+
+# ── coarse ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _require_coarse(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> CoarseAlignment:
+    if len(observed.pairs) < MIN_PAIRS:
+        raise CalibrationError(
+            f"{len(observed.pairs)} pairs of frames have enough points to follow, {MIN_PAIRS} are needed",
+            hint="film something with texture, for a few seconds",
+        )
+    if len(imu) < 8:
+        raise CalibrationError(f"{len(imu)} gyroscope samples", hint="check gyro_accel.csv")
+    coarse = align_coarsely(observed.turns(profile), imu, profile)
+    if coarse is None:
+        raise CalibrationError(
+            "the inertial data cover the frames at no offset within a second", hint="check the clocks by virest inspect"
+        )
+    motion_px = coarse.motion_rad * observed.lens.fx_px
+    if motion_px < MIN_MOTION_PX:
+        raise CalibrationError(
+            f"the pictures hardly change their turn ({motion_px:.2f} px from frame to frame)",
+            hint="shake the phone about all three axes; a camera at rest or a steady pan determines nothing",
+        )
+    least = min(MIN_EXPLAINED + MIN_EXPLAINED_BY_PAIR / len(observed.pairs), MAX_MIN_EXPLAINED)
+    if coarse.explained < least:
+        raise CalibrationError(
+            f"the pictures do not follow the gyroscope: at best it explains {max(coarse.explained, 0):.0%} of their turns",
+            hint="stabilised in the camera, or not of this recording?",
+        )
+    if coarse.at_end:
+        raise CalibrationError(
+            f"the time offset lies at the end of the search ({coarse.time_offset_s:+.2f} s)",
+            hint="give a time_offset_s to search about",
+        )
+    if 1 - coarse.runner_up < MIN_DISTINCT * (1 - coarse.explained):
+        raise CalibrationError(
+            f"offsets of {coarse.time_offset_s:+.3f} and {coarse.runner_up_s:+.3f} s explain the pictures about equally",
+            hint="move less regularly",
+        )
+    return coarse
+
+
+def _started(profile: CameraProfile, observed: ObservedTracks, coarse: CoarseAlignment) -> CameraProfile:
+    """The profile with the coarse offset and axes, and a guessed lens where it has none."""
+    return replace(
+        profile,
+        time_offset_s=coarse.time_offset_s,
+        r_cam_imu=tuple(map(tuple, coarse.rotation_cam_imu.tolist())),
+        intrinsics=profile.intrinsics or observed.lens,
+    )
+
+
+# ── readout and translation ──────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class _Rough:
+    profile: CameraProfile
+    scene: Motion | None
+    direction_known: bool
+    before: TrackFit
+    """With the starting profile's readout and nothing but what was asked for."""
+
+
+def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term]) -> _Rough:
+    """Fit a readout of either sense along the rows and along the columns, and keep the better axis."""
+    along = "left_to_right" if start.shutter.reads_columns else "top_to_bottom"
+    across = "top_to_bottom" if start.shutter.reads_columns else "left_to_right"
+    before = fit_tracks(imu, table, start, wanted[:1], max_iterations=4)
+    first = _fit_with_translation(imu, table, _without_readout(start, along), [*wanted, terms_of.READOUT])
+    scene = None if first.scene is None else first.scene
+    second = fit_tracks(imu, table, _without_readout(start, across), [*wanted, terms_of.READOUT], scene)
+    difference = (first.cost - second.cost) / max(min(first.scale, second.scale) ** 2, 1e-9)
+    best = second if difference > 0 else first
+    log.debug("readout: cost %.1f %s, %.1f %s", first.cost, along, second.cost, across)
+    return _Rough(best.profile, best.scene, abs(difference) > DIRECTION_COST, before)
+
+
+def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
+    """A global shutter that sees the picture when its middle row was read, ready for a readout of either sense."""
+    shutter = profile.shutter
+    middle = (profile.time_offset_s or 0.0) + 0.5 * shutter.readout_time_s
+    return replace(
+        profile, time_offset_s=middle, shutter=replace(shutter, readout_time_s=0.0, readout_direction=direction)
+    )
+
+
+def _fit_with_translation(imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term]) -> TrackFit:
+    """The simplest translation that explains the points: none, the accelerometer's, or a free one."""
+    plain = fit_tracks(imu, table, start, wanted)
+    best = plain
+    if plain.scale < EXPLAINED_SCALE:
+        return plain
+    known = ground(imu, start, translation=True)
+    if known.displacement is not None:
+        scene = start_scene(imu, known, table, START_INVERSE_DEPTH_PER_M)
+        inertial = fit_tracks(imu, table, start, wanted, scene)
+        best = inertial if inertial.scale < TRANSLATION_GAIN * plain.scale else plain
+    if best.scale < EXPLAINED_SCALE:
+        return best
+    span = np.asarray(start.imu_time_s(np.array([table.first_stamp_s.min(), table.second_stamp_s.max()])))
+    free = fit_tracks(imu, table, start, wanted, free_motion(float(span[0]), float(span[1])))
+    log.debug("translation: none %.3f, accelerometer %.3f, free %.3f", plain.scale, best.scale, free.scale)
+    needed = FREE_GAIN if best is not plain else TRANSLATION_GAIN
+    return free if free.scale < needed * best.scale else best
+
+
+def _grown(rough: _Rough, imu: ImuSamples, table: TrackTable) -> Motion | None:
+    return rough.scene
+
+
+# ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _conclude(
+    capture: Capture,
+    given: CameraProfile,
+    start: CameraProfile,
+    observed: ObservedTracks,
+    coarse: CoarseAlignment,
+    rough: _Rough,
+    fit: TrackFit,
+) -> GeometryCalibration:
+    variances = _variances(fit)
+    determined = {term.name: bool(np.all(np.sqrt(variances[term.name]) <= MAX_STD[term.name])) for term in fit.terms}
+    profile = right_way_round(_held_back(fit, given, start, determined))
+    if not rough.direction_known and not determined["readout_time"]:
+        profile = _with_given_readout(profile, given)
+    values = tuple(_value(name, given, profile, variances, determined) for name in (t.name for t in fit.terms))
+    direction_known = rough.direction_known and determined["readout_time"]
+    values = (*values[:2], _direction_value(given, profile, direction_known), *values[2:])
+    profile = _with_estimates(profile, values)
+    noise = float(np.median(observed.noise_px))
+    moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
+    notes = _notes(capture, coarse, fit, moving, observed, determined)
+    return GeometryCalibration(
+        profile, values, _correlations(fit, variances), _translation(fit), _robust_px(fit), noise,
+        _robust_px(rough.before), coarse.explained, moving, len(observed.pairs), observed.tracks, notes, fit,
+    )  # fmt: skip
+
+
+def right_way_round(profile: CameraProfile) -> CameraProfile:
+    """A negative readout along one sense is a positive one along the other: t₀' = t₀ + r (1 − 1 / rows)."""
+    shutter = profile.shutter
+    if shutter.readout_time_s >= 0:
+        return profile
+    opposite = {
+        "top_to_bottom": "bottom_to_top",
+        "bottom_to_top": "top_to_bottom",
+        "left_to_right": "right_to_left",
+        "right_to_left": "left_to_right",
+    }[shutter.readout_direction]
+    rows = profile.width if shutter.reads_columns else profile.height
+    moved = shutter.readout_time_s * (1 - 1 / rows)
+    return replace(
+        profile,
+        time_offset_s=(profile.time_offset_s or 0.0) + moved,
+        shutter=replace(shutter, readout_time_s=-shutter.readout_time_s, readout_direction=opposite),
+    )
+
+
+def _variances(fit: TrackFit) -> dict[str, Array]:
+    """Variance of each term's values, with tracking's own bias; the offset is that of the first row read."""
+    found = {term.name: fit.std(term.name) ** 2 + FLOOR_STD[term.name] ** 2 for term in fit.terms}
+    if "readout_time" in found:
+        cross = fit.covariance[fit.slices["time_offset"], fit.slices["readout_time"]][0]
+        first_row = found["time_offset"] + 0.25 * found["readout_time"] - cross
+        found["time_offset"] = np.maximum(first_row, found["time_offset"])
+    return found
+
+
+def _held_back(fit: TrackFit, given: CameraProfile, start: CameraProfile, determined: dict[str, bool]) -> CameraProfile:
+    """The fitted profile, with what is not determined put back to where it began."""
+    profile = fit.profile
+    if not determined.get("readout_time", True):
+        profile = _with_given_readout(profile, given)
+    if not determined.get("imu_rotation", True):
+        profile = replace(profile, r_cam_imu=start.r_cam_imu)
+    if not determined.get("gyro_bias", True):
+        profile = replace(profile, gyro_bias_rad_s=given.gyro_bias_rad_s)
+    if not determined.get("gyro_scale", True):
+        profile = replace(profile, gyro_scale=given.gyro_scale)
+    if not determined.get("clock_skew", True):
+        profile = replace(profile, clock_skew=given.clock_skew)
+    if not determined.get("exposure_time", True):
+        scale = given.shutter.exposure_scale
+        profile = replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
+    lens_names = ("focal_length", "radial_distortion", "principal_point")
+    if not all(determined.get(name, True) for name in lens_names):
+        profile = replace(profile, intrinsics=_lens_held_back(profile, given, determined))
+    return profile
+
+
+def _lens_held_back(profile: CameraProfile, given: CameraProfile, determined: dict[str, bool]):  # type: ignore[no-untyped-def]
+    lens, before = profile.intrinsics, given.intrinsics
+    if before is None or lens is None:
+        return before
+    if not determined.get("focal_length", True):
+        lens = replace(lens, fx_px=before.fx_px, fy_px=before.fy_px)
+    if not determined.get("radial_distortion", True):
+        lens = replace(lens, model=before.model, coefficients=before.coefficients)
+    if not determined.get("principal_point", True):
+        lens = replace(lens, cx_px=before.cx_px, cy_px=before.cy_px)
+    return lens
+
+
+def _with_given_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+    """Put the given readout back, the picture's middle row kept where it was."""
+    middle = (profile.time_offset_s or 0.0) + 0.5 * profile.shutter.readout_time_s
+    shutter = replace(
+        profile.shutter,
+        readout_time_s=given.shutter.readout_time_s,
+        readout_direction=given.shutter.readout_direction,
+    )
+    return replace(profile, shutter=shutter, time_offset_s=middle - 0.5 * shutter.readout_time_s)
+
+
+_FIELDS: dict[str, tuple[str, Callable[[CameraProfile], float | list[float] | None]]] = {
+    "time_offset": ("time_offset_s", lambda p: p.time_offset_s),
+    "readout_time": ("readout_time_s", lambda p: p.shutter.readout_time_s if p.readout_known else None),
+    "imu_rotation": ("rotation_rad", lambda p: None),
+    "gyro_bias": ("gyro_bias_rad_s", lambda p: list(p.gyro_bias_rad_s)),
+    "gyro_scale": ("gyro_scale", lambda p: p.gyro_scale[0]),
+    "focal_length": ("fx_px", lambda p: p.intrinsics.fx_px if p.intrinsics else None),
+    "radial_distortion": (
+        "k1",
+        lambda p: p.intrinsics.coefficients[0] if p.intrinsics and p.intrinsics.coefficients else 0.0,
+    ),
+    "principal_point": (
+        "principal_point_px",
+        lambda p: [p.intrinsics.cx_px, p.intrinsics.cy_px] if p.intrinsics else None,
+    ),
+    "clock_skew": ("clock_skew", lambda p: p.clock_skew),
+    "exposure_time": ("exposure_scale", lambda p: p.shutter.exposure_scale),
+}
+
+
+def _value(
+    name: str,
+    given: CameraProfile,
+    profile: CameraProfile,
+    variances: dict[str, Array],
+    determined: dict[str, bool],
+) -> CalibratedValue:
+    field, read = _FIELDS[name]
+    std = np.sqrt(variances[name])
+    before, after = read(given), read(profile)
+    if name == "imu_rotation":
+        turn = profile.rotation_cam_imu @ given.rotation_cam_imu.T
+        before, after = [0.0, 0.0, 0.0], _rotation_vector(turn)
+    if name == "focal_length" and isinstance(after, float):
+        std = std * after
+    if name in ("gyro_scale", "exposure_time") and isinstance(after, float):
+        std = std * after
+    shown = [float(s) for s in std]
+    return CalibratedValue(field, before, after, shown if len(shown) > 1 else shown[0], determined[name])
+
+
+def _rotation_vector(matrix: Array) -> list[float]:
+    from scipy.spatial.transform import Rotation
+
+    return [float(v) for v in Rotation.from_matrix(matrix).as_rotvec()]
+
+
+def _direction_value(given: CameraProfile, profile: CameraProfile, known: bool) -> CalibratedValue:
+    return CalibratedValue(
+        "readout_direction", given.shutter.readout_direction, profile.shutter.readout_direction, None, known
+    )
+
+
+def _with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -> CameraProfile:
+    source = "tracked points against the inertial data"
+    for value in values:
+        if value.determined and value.value is not None:
+            profile = profile.with_estimate(value.name, value.value, value.std, source)
+    known = profile.readout_known or any(v.name == "readout_time_s" and v.determined for v in values)
+    return replace(profile, readout_known=known)
+
+
+def _translation(fit: TrackFit) -> str:
+    if fit.scene is None:
+        return "none"
+    return "inertial" if isinstance(fit.scene, InertialMotion) else "free"
+
+
+def _robust_px(fit: TrackFit) -> float:
+    return float(np.median(np.linalg.norm(fit.difference_px, axis=-1))) / 1.1774
+
+
+def _correlations(fit: TrackFit, variances: dict[str, Array]) -> tuple[tuple[str, str, float], ...]:
+    names = [
+        f"{_FIELDS[t.name][0]}{'' if len(t) == 1 else '[' + str(k) + ']'}" for t in fit.terms for k in range(len(t))
+    ]
+    count = len(names)
+    total = np.sqrt(np.concatenate([variances[t.name] for t in fit.terms]))
+    correlation = fit.covariance[:count, :count] / np.outer(total, total)
+    rows, columns = np.triu_indices(count, 1)
+    strong = np.abs(correlation[rows, columns]) > LARGE_CORRELATION
+    return tuple(
+        (names[i], names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong], strict=True)
+    )
+
+
+def _notes(
+    capture: Capture,
+    coarse: CoarseAlignment,
+    fit: TrackFit,
+    moving: float,
+    observed: ObservedTracks,
+    determined: dict[str, bool],
+) -> tuple[str, ...]:
+    notes = []
+    if coarse.axes_changed:
+        notes.append("the profile's T_cam_imu does not fit: other axes were taken from the turns")
+    if isinstance(fit.scene, FreeMotion):
+        notes.append("the camera travels and no accelerometer tells how: its path was fitted freely")
+    if moving > MANY_OUTLIERS:
+        notes.append(f"{moving:.0%} of the tracks do not go with the camera (moving objects, or a scene out of plane)")
+    if not observed.exposure_known:
+        notes.append("exposure times unknown: the offset counts to the middle of the exposure")
+    elif np.ptp(observed.exposure_s) < 1e-4 and determined["time_offset"]:
+        notes.append(
+            "at constant exposure an offset cannot be told from another meaning of the stamp: "
+            f"exposure_end would give {1e3 * float(np.median(observed.exposure_s)):+.2f} ms more"
+        )
+    return tuple(notes)

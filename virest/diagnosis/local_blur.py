@@ -1,0 +1,217 @@
+"""What local blur the pictures show, against what the profile predicts (forward_model, section 9 (c)).
+
+Two measurements that complete each other:
+
+- *spectra* of the same patch in two frames: their ratio knows the motion only, so it finds the exposure time;
+- *edges* along which the picture hardly moved: their width knows lens and defocus only.
+
+A decoded movie is not what the sensor saw.  H.264 predicts a picture from the one before and codes only part of the
+difference, so a picture also shows some of the blur of its predecessors (MEMORY, fitted freely), and what quantisation
+fills in damps the ratios (DAMPING, known to DAMPING_STD).  Both were measured on movies of known blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.capture.records import Capture
+from virest.diagnosis.local_blur_edges import EdgeSettings, EdgeWidths, join_edges, observe_picture
+from virest.diagnosis.local_blur_model import (
+    across,
+    covariates,
+    fitted_width,
+    path_tensors,
+    predicted_ratios,
+    transfers,
+)
+from virest.diagnosis.local_blur_spectra import (
+    BANDS_PER_PX,
+    MEMORY,
+    SeenFrame,
+    SpectrumRatios,
+    join_ratios,
+    observe_pair,
+    ring_of_bin,
+)
+from virest.motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LENS_SIGMA_PX = 0.70
+"""Width of a sharp edge in a decoded picture: lens, pixel and coding; defocus is what lies beyond."""
+LENS_STD_PX = 0.10
+DAMPING = (0.95, 0.87)
+"""Part of a log ratio that survives the coding, in each ring of frequencies."""
+DAMPING_STD = 0.10
+STILL_PX = 0.4
+"""Edges across which the path's standard deviation is below this are measured."""
+MIN_TRANSFER = 0.25
+"""Bins whose |K|² is predicted below this are noise."""
+PAIR_FRAMES = 4
+"""Frames between the two of a pair: the hand has turned, the patch is still in view."""
+MIN_EDGES = 40
+MIN_ACCEPTED = 0.004
+"""Part of the strong slopes that must be isolated steps: in a scene of smooth things next to none is."""
+MIN_RATIOS = 400
+MIN_CONTRAST = 0.06
+"""Least rms of the predicted log ratios: frames that moved alike say nothing about the exposure."""
+BLOCKS = 8
+"""Time blocks; what lies in one shares its errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlurObservations:
+    """What the pictures show of local blur; rows of residuals are edges first, then the bins of the ratios."""
+
+    edges: EdgeWidths
+    ratios: SpectrumRatios
+    candidates: int
+    """Strong slopes that were tried as edges, across which the picture hardly moved or not."""
+    isolated: int
+    """Those of them that are isolated steps."""
+
+    def __len__(self) -> int:
+        return len(self.edges) + int(self.valid.sum())
+
+    @property
+    def valid(self) -> Mask:
+        """(n, b) which bins of which tiles were measured."""
+        return np.isfinite(self.ratios.log_ratio)
+
+    @property
+    def time_s(self) -> Array:
+        """Stamp of each residual's frame, camera clock; of the first of a pair."""
+        tile, _ = np.nonzero(self.valid)
+        return np.concatenate([self.edges.stamp_s, self.ratios.stamp_s[tile, 0, 0]])
+
+    @property
+    def is_edge(self) -> Mask:
+        """Which residuals are edges."""
+        return np.arange(len(self)) < len(self.edges)
+
+    @property
+    def edges_determined(self) -> bool:
+        """Whether the scene has enough isolated steps to tell a defocused picture from a picture of smooth things."""
+        return len(self.edges) >= MIN_EDGES and self.isolated >= MIN_ACCEPTED * self.candidates
+
+    def covariates(self, profile: CameraProfile, trajectory: Trajectory) -> dict[str, Array]:
+        """What a structure in the residuals may run along, one value a residual."""
+        tile, _ = np.nonzero(self.valid)
+        e, r = self.edges, self.ratios
+        stamps, exposures = (
+            np.concatenate([a, b[tile, 0, 0]]) for a, b in ((e.stamp_s, r.stamp_s), (e.exposure_s, r.exposure_s))
+        )
+        found = covariates(stamps, exposures, np.concatenate([e.points_px, r.points_px[tile, 0]]), profile, trajectory)
+        found["brightness"] = np.concatenate([e.brightness, r.brightness[tile]])
+        found["frame"] = np.concatenate([e.frame, r.frame[tile, 0]]).astype(float)
+        return found
+
+
+def frames_to_read(capture: Capture, pairs: int = 22) -> list[int]:
+    """Movie indices for :func:`observe_blur`: pairs of frames, evenly over the capture."""
+    known = {f.index for f in capture.frames if f.exposure_s and (f.skip_reason is None or f.only_startup)}
+    starts = [k for k in sorted(known) if k + PAIR_FRAMES in known]
+    picked = np.unique(np.linspace(0, len(starts) - 1, min(pairs, len(starts))).round().astype(int)) if starts else []
+    return sorted({starts[i] + step for i in picked for step in (0, PAIR_FRAMES)})
+
+
+def observe_blur(
+    pictures: Iterable[tuple[int, NDArray[np.uint8] | None]],
+    capture: Capture,
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    settings: EdgeSettings | None = None,
+) -> BlurObservations:
+    """Measure a stream of (movie index, grey (h, w)), rising, of the frames of :func:`frames_to_read`.
+
+    PAIR_FRAMES + 1 pictures are in memory at a time.  Profile and trajectory only pick the edges that hardly moved and
+    the frequencies that motion leaves above the noise.
+    """
+    settings = settings or EdgeSettings()
+    curve = profile.response or ResponseCurve("srgb")
+    edges, pairs, kept = [], [], {}
+    for index, picture in pictures:
+        if picture is None or not capture.frames[index].exposure_s:
+            continue
+        edges.append(observe_picture(picture, capture.frames[index], curve, settings))
+        kept[index] = SeenFrame(picture, tuple(capture.frames[max(index - k, 0)] for k in range(MEMORY)))
+        if index - PAIR_FRAMES in kept:
+            pairs.append(observe_pair(kept[index - PAIR_FRAMES], kept[index], curve))
+        kept = {k: seen for k, seen in kept.items() if k > index - PAIR_FRAMES}
+    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory)
+
+
+def _chosen(
+    edges: EdgeWidths, ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory
+) -> BlurObservations:
+    still = edges.select(_motion_px(edges, profile, trajectory) < STILL_PX)
+    through = transfers(ratios, profile, trajectory)[:, :, 0].min(axis=1)
+    ratio = np.where(through > MIN_TRANSFER, ratios.log_ratio, np.nan)
+    return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, len(edges))
+
+
+def residuals(
+    observations: BlurObservations,
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    lens_sigma_px: float = LENS_SIGMA_PX,
+    damping: float = 1.0,
+) -> Array:
+    """Measured less predicted blur, px (n,): widths of edges, then spectra as widths of the motion.
+
+    A log ratio changes by 2 (2π f)² τ δτ with the path's standard deviation τ; it is given as δτ at τ = 1 px.
+    The profile alone carries every effect; lens_sigma_px and damping are nuisances of the measurement.
+    """
+    motion_px = _motion_px(observations.edges, profile, trajectory)
+    widths = fitted_width(motion_px, profile.extensions.defocus_sigma_px, lens_sigma_px)
+    return np.concatenate(
+        [observations.edges.width_px - widths, _ratio_residuals(observations, profile, trajectory, damping)]
+    )
+
+
+def _ratio_residuals(
+    observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, damping: float
+) -> Array:
+    valid = observations.valid
+    ring = np.broadcast_to(ring_of_bin(), valid.shape)[valid]
+    share = damping * np.array(DAMPING)[ring]
+    own, *earlier = (predicted_ratios(observations.ratios, profile, trajectory)[valid] * share[:, None]).T
+    off = observations.ratios.log_ratio[valid] - own
+    scale = 1.0 / (2.0 * (2 * np.pi * (np.array(BANDS_PER_PX[:-1]) + np.array(BANDS_PER_PX[1:])) / 2) ** 2)
+    return (off - _remembered(off, np.stack(earlier, -1) - own[:, None])) * scale[ring]
+
+
+def _remembered(off: Array, columns: Array) -> Array:
+    """What earlier frames' blur adds to the log ratios: robust least squares for the share of each."""
+    weight = np.ones(len(off))
+    fitted = np.zeros(len(off))
+    for _ in range(4 if len(off) > 3 * columns.shape[1] else 0):
+        root = np.sqrt(weight)
+        shares = np.linalg.lstsq(columns * root[:, None], off * root, rcond=None)[0]
+        fitted = columns @ np.clip(shares, 0.0, 0.5)
+        weight = robust_weights(off - fitted)
+    return fitted
+
+
+def robust_weights(residual: Array) -> Array:
+    """Weights (1 + (r / 2 s)²)⁻², s from the median deviation: whatever lies far out counts ever less."""
+    scale = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 1.0
+    return np.asarray((1.0 + (residual / (2.0 * max(scale, 1e-9))) ** 2) ** -2)
+
+
+def _motion_px(edges: EdgeWidths, profile: CameraProfile, trajectory: Trajectory) -> Array:
+    tensors = path_tensors(edges.stamp_s, edges.exposure_s, edges.points_px, profile, trajectory)
+    return np.sqrt(across(tensors, edges.normal))
+
+
+def time_blocks(time_s: Array, count: int = BLOCKS) -> NDArray[np.intp]:
+    """Block (n,) of each residual: equal numbers of distinct stamps in each."""
+    stamps: Sequence[float] = np.unique(time_s)
+    return np.searchsorted(stamps, time_s) * count // max(len(stamps), 1)

@@ -1,0 +1,131 @@
+"""What the profile predicts for the local blur: the one forward model's paths, across edges and in spectra."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from virest.camera.profile import CameraProfile
+from virest.degradation.kernels import angle_and_length, blur_chords, kernel_field
+from virest.degradation.row_motion import row_motion
+from virest.diagnosis.local_blur_edges import STEP_PX, fit_steps
+from virest.diagnosis.local_blur_spectra import MEMORY, SpectrumRatios, spectral_weights
+from virest.motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+_NODES = 4
+_RATIOS = np.linspace(0.0, 6.0, 25)
+
+
+def fitted_width(motion_px: Array, defocus_px: float, lens_px: float) -> Array:
+    """Width that the fit of an edge reports for a straight path and a Gaussian after one another.
+
+    motion_px: standard deviation of the path across the edge.  A path alone is a ramp, not a Gaussian, so the fitted
+    width is not quite the root of the summed variances; the ratio of the two is tabled by fitting such profiles.
+    """
+    still = np.hypot(defocus_px, lens_px)
+    return np.hypot(motion_px, still) * np.interp(motion_px / still, _RATIOS, _shape_table())
+
+
+@lru_cache(maxsize=1)
+def _shape_table() -> Array:
+    """Fitted width over root of summed variances, for paths of _RATIOS times the Gaussian's width."""
+    total, reach = 2.0, 9.0
+    u = np.linspace(-reach, reach, round(2 * reach / STEP_PX) + 1)
+    still = (total / np.hypot(1.0, _RATIOS))[:, None, None]
+    path = _RATIOS[:, None, None] * still * np.sqrt(12.0) * ((np.arange(64) + 0.5) / 64 - 0.5)
+    profiles = erf((u[:, None] - path) / (np.sqrt(2.0) * still)).mean(axis=-1)
+    return fit_steps(profiles, reach)[1] / total
+
+
+def path_tensors(
+    stamp_s: Array, exposure_s: Array, points_px: Array, profile: CameraProfile, trajectory: Trajectory
+) -> Array:
+    """Covariance xx, xy, yy, px², (n, 3), of the blur path at points (n, 2) of frames with stamps and exposures (n,).
+
+    Paths are computed on a few nodes over each frame; their covariance is a smooth function of the place.
+    """
+    nodes, inverse = _nodes(profile.width, profile.height)
+    tensors = np.zeros((len(stamp_s), 3))
+    for rows in _by_frame(stamp_s):
+        motion = row_motion(trajectory, profile, float(stamp_s[rows[0]]), float(exposure_s[rows[0]]))
+        paths = kernel_field(motion, nodes).paths_px
+        centred = paths - paths.mean(axis=1, keepdims=True)
+        spread = np.einsum("nmi,nmj->nij", centred, centred) / paths.shape[1]
+        # Samples in the middles of m equal parts of a straight path lack 1/m² of its variance.
+        flat = spread.reshape(-1, 4)[:, [0, 1, 3]] / (1.0 - 1.0 / paths.shape[1] ** 2)
+        tensors[rows] = _monomials(points_px[rows], profile.width, profile.height) @ (inverse @ flat)
+    return tensors
+
+
+def across(tensors: Array, direction: Array) -> Array:
+    """n' Σ n of tensors (..., 3) and directions (..., 2), not below 0."""
+    x, y = direction[..., 0], direction[..., 1]
+    return np.maximum(tensors[..., 0] * x * x + 2 * tensors[..., 1] * x * y + tensors[..., 2] * y * y, 0.0)
+
+
+def transfers(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory) -> Array:
+    """|K|² of each tile's two frames and of those before them, as the bins see it: (n, 2, MEMORY, b).
+
+    A straight path's |K|² = (sin q / q)² with q² = 3 (2π)² f' Σ f.
+    """
+    points = np.broadcast_to(ratios.points_px[:, :, None], (len(ratios), 2, MEMORY, 2))
+    tensors = path_tensors(
+        ratios.stamp_s.ravel(), ratios.exposure_s.ravel(), points.reshape(-1, 2), profile, trajectory
+    )
+    frequency, weights = spectral_weights()
+    x, y = frequency.T
+    form = np.maximum(tensors @ np.stack([x * x, 2 * x * y, y * y]), 0.0)
+    seen = np.sinc(2.0 * np.sqrt(3.0 * form)) ** 2 @ weights
+    return np.maximum(seen, 1e-6).reshape(len(ratios), 2, MEMORY, -1)
+
+
+def predicted_ratios(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory) -> Array:
+    """log |K1|²/|K2|² of the frames themselves and of those before them: (n, b, MEMORY)."""
+    logs = np.log(transfers(ratios, profile, trajectory))
+    return np.moveaxis(logs[:, 0] - logs[:, 1], 1, 2)
+
+
+def covariates(
+    stamp_s: Array, exposure_s: Array, points_px: Array, profile: CameraProfile, trajectory: Trajectory
+) -> dict[str, Array]:
+    """What a structure in the residuals may run along: row, time, radius, rate, exposure, path length and angle."""
+    width, height = profile.width, profile.height
+    start_s, chords = np.empty(len(stamp_s)), np.empty((len(stamp_s), 2))
+    for rows in _by_frame(stamp_s):
+        motion = row_motion(trajectory, profile, float(stamp_s[rows[0]]), float(exposure_s[rows[0]]))
+        chords[rows] = blur_chords(motion, points_px[rows])
+        start_s[rows] = motion.row_start_s(points_px[rows])
+    angle, length = angle_and_length(chords)
+    middle_s = start_s + 0.5 * profile.shutter.true_exposure_s(exposure_s)
+    off_centre = np.linalg.norm(points_px - np.array([(width - 1) / 2, (height - 1) / 2]), axis=-1)
+    return {
+        "row": profile.shutter.readout_fraction(points_px, width, height),
+        "time": start_s,
+        "radius": off_centre / (0.5 * np.hypot(width, height)),
+        "rate": np.linalg.norm(trajectory.rate_rad_s(middle_s), axis=-1),
+        "exposure": exposure_s,
+        "path_length_px": length,
+        "path_angle_rad": angle,
+    }
+
+
+def _by_frame(stamp_s: Array) -> list[NDArray[np.intp]]:
+    order = np.argsort(stamp_s, kind="stable")
+    return [rows for rows in np.split(order, np.flatnonzero(np.diff(stamp_s[order])) + 1) if len(rows)]
+
+
+@lru_cache(maxsize=4)
+def _nodes(width: int, height: int) -> tuple[Array, Array]:
+    """Places (n, 2), and what turns values there into coefficients of :func:`_monomials`."""
+    part = (np.arange(_NODES) + 0.5) / _NODES
+    points = np.stack(np.meshgrid(part * width, part * height), -1).reshape(-1, 2)
+    return points, np.linalg.pinv(_monomials(points, width, height))
+
+
+def _monomials(points: Array, width: int, height: int) -> Array:
+    x, y = points[:, 0] / width - 0.5, points[:, 1] / height - 0.5
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)

@@ -1,0 +1,232 @@
+"""Brightness of the same scene patches in many frames, and what a profile predicts for it (forward_model, section 9).
+
+Model of one observation of a patch with unknown light L, in grey levels of 255:
+``grey = E(L · product · vignetting(r) · flicker(t) · gain)``, E the profile's curve with its gamma and black level,
+``product`` the logged exposure × ISO.  L is a nuisance: each evaluation profiles it out, patch by patch, in grey levels,
+where the noise is even.  In light a steeper curve would shrink the residuals and so explain anything.
+
+A video encoder of few bits does not pass small changes of brightness on at once: in a patch that is flat and moves it
+repeats its last picture and corrects a part of the difference.  Decoded grey: ``y[k] = x[k] + memory (y[k−1] − x[k])``,
+y = x in frames coded on their own.  At 0.25 bits a pixel memory is about 0.25, and flicker of 100 Hz in 30 frames a
+second appears a third weaker and 0.2 rad late.  The memory belongs to the movie; fits find it along with the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+_LOG_LIGHT = np.arange(-9.5, 0.75, 0.002)
+"""Grid of the tabulated curve, natural logarithm of the light."""
+_LIGHT_STEPS = 3
+_LEAST_SLOPE = 0.02
+"""Grey levels per unit of log light below which an observation says nothing about light."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhotometricObservations:
+    """Mean grey of patches, one entry for each patch, channel and frame that shows it; all arrays (n,)."""
+
+    patch: Indices
+    """Patch and channel: 3 · place + channel. Entries with the same number share one unknown light."""
+    frame: Indices
+    """Movie index."""
+    stamp_s: Array
+    """The frame's stamp, camera clock from stamp_0."""
+    row_fraction: Array
+    """Fraction s of the readout at the patch's middle, by the profile that the patches were looked up with."""
+    x_px: Array
+    y_px: Array
+    radius: Array
+    """Distance from the picture's centre, 1 at the corners."""
+    grey: Array
+    """Mean of the patch, grey levels of 255."""
+    noise: Array
+    """Standard deviation of ``grey``, measured without the camera model (photometry_noise)."""
+    exposure_s: Array
+    """As logged; 0 where unknown."""
+    log_product: Array
+    """Logarithm of logged exposure × ISO against the median frame; 0 where ISO or exposure are not logged."""
+    log_product_std: Array
+    """What the rounding of the logged ISO leaves open."""
+    intra: Mask
+    """Whether the frame is coded on its own, without memory of earlier ones."""
+    product_known: bool
+    """Whether exposure and ISO are logged for every frame; without them no gain can be called unexplained."""
+    width: int
+    height: int
+    memory: float = 0.0
+    """Part of the last decoded brightness that the encoder keeps; a nuisance, fitted with the effects."""
+
+    def __len__(self) -> int:
+        return len(self.grey)
+
+    @property
+    def place(self) -> Indices:
+        """(n,) the patch without its channel."""
+        return self.patch // 3
+
+    @property
+    def frames(self) -> Indices:
+        """(k,) movie indices that occur, rising."""
+        return np.unique(self.frame)
+
+    def row_time_s(self, profile: CameraProfile) -> Array:
+        """Start of exposure of each observation's row, IMU clock from stamp_0, (n,)."""
+        start = profile.imu_time_s(profile.shutter.first_row_start_s(self.stamp_s, self.exposure_s))
+        return np.asarray(start + self.row_fraction * profile.shutter.readout_time_s, float)
+
+    def subset(self, use: Mask) -> PhotometricObservations:
+        """Only the chosen observations."""
+        fields = {name: getattr(self, name) for name in self.__slots__}
+        return replace(self, **{name: v[use] for name, v in fields.items() if isinstance(v, np.ndarray)})
+
+    def with_memory(self, memory: float) -> PhotometricObservations:
+        """The same with another memory of the encoder."""
+        return replace(self, memory=memory)
+
+    def covariates(self, profile: CameraProfile) -> dict[str, Array]:
+        """What residuals may have structure along."""
+        return {
+            "row": self.row_fraction,
+            "time": self.row_time_s(profile),
+            "radius": self.radius,
+            "brightness": self.grey,
+            "exposure": self.exposure_s,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What a profile makes of observations, the patches' light profiled out."""
+
+    residual: Array
+    """(n,) measured − predicted, grey levels of 255."""
+    slope: Array
+    """(n,) change of the predicted grey with log light, grey levels."""
+    share: Array
+    """(n,) part of the observation in its patch's light; sums to 1 over a patch."""
+    observations: PhotometricObservations
+
+    def respond(self, columns: Array) -> Array:
+        """Change of the residuals (n, k) where log light factors change by ``columns`` (n, k), L following."""
+        change = remembered(self.observations, self.slope[:, None] * columns)
+        patch, slope = self.observations.patch, self.slope[:, None]
+        mean = np.stack([np.bincount(patch, self.share * c) for c in (change / slope).T], axis=-1)
+        return -(change - slope * mean[patch])
+
+
+def log_light_factor(observations: PhotometricObservations, profile: CameraProfile) -> Array:
+    """Logarithm of all that multiplies a patch's light, (n,): product, vignetting, flicker, gain (contract, section 4)."""
+    ext = profile.extensions
+    total = observations.log_product.copy()
+    if ext.vignetting_corner_loss:
+        total += np.log(np.maximum(1 - ext.vignetting_corner_loss * observations.radius**2, 1e-3))
+    if ext.flicker_amplitude:
+        total += np.log(np.maximum(_mean_flicker(observations, profile), 1e-3))
+    if ext.gain:
+        total += np.log(np.append(ext.gain, 1.0))[np.minimum(observations.frame, len(ext.gain))]
+    return total
+
+
+def _mean_flicker(observations: PhotometricObservations, profile: CameraProfile) -> Array:
+    """Mean of 1 + A sin(2π f t + φ) over each exposure: the sine at its middle, weaker by sinc(f · exposure)."""
+    ext = profile.extensions
+    exposure = profile.shutter.true_exposure_s(observations.exposure_s)
+    middle = observations.row_time_s(profile) + 0.5 * exposure
+    wave = np.sin(2 * np.pi * ext.flicker_frequency_hz * middle + ext.flicker_phase_rad)
+    return np.asarray(1 + ext.flicker_amplitude * np.sinc(ext.flicker_frequency_hz * exposure) * wave)
+
+
+def predict(observations: PhotometricObservations, profile: CameraProfile, weight: Array | None = None) -> Prediction:
+    """Fit each patch's light to its observations under the profile, and predict their grey.
+
+    weight: (n,) of the observations in that fit; 1 / noise² unless given.
+    """
+    weight = 1.0 / observations.noise**2 if weight is None else weight
+    grey_table, slope_table = _tables(profile.response or ResponseCurve("srgb"))
+    factor = log_light_factor(observations, profile)
+    patch = observations.patch
+    seen = np.interp(observations.grey, grey_table, _LOG_LIGHT) - factor
+    slope = _at(slope_table, seen + factor)
+    light = _patch_sum(patch, weight * slope**2 * seen) / _patch_sum(patch, weight * slope**2)
+    for _ in range(_LIGHT_STEPS):
+        inside = light[patch] + factor
+        residual = observations.grey - remembered(observations, _at(grey_table, inside))
+        slope = _at(slope_table, inside)
+        step = _patch_sum(patch, weight * slope * residual) / _patch_sum(patch, weight * slope**2)
+        light = light + np.clip(step, -1.0, 1.0)
+    inside = light[patch] + factor
+    slope = _at(slope_table, inside)
+    stiffness = weight * slope**2
+    share = stiffness / _patch_sum(patch, stiffness)[patch]
+    residual = observations.grey - remembered(observations, _at(grey_table, inside))
+    return Prediction(residual, slope, share, observations)
+
+
+def remembered(observations: PhotometricObservations, grey: Array) -> Array:
+    """What the encoder makes of true brightnesses (n,) or (n, k): each patch follows with its memory.
+
+    Linear in ``grey``.  A patch that was not seen for some frames forgets accordingly; its first sight is exact.
+    """
+    memory = observations.memory
+    if memory == 0.0 or len(grey) == 0:
+        return grey
+    patch, frame = observations.patch, observations.frame
+    follows = np.append(False, (patch[1:] == patch[:-1]) & (frame[1:] > frame[:-1])) & ~observations.intra
+    kept = np.where(follows, memory ** np.append(1, np.maximum(np.diff(frame), 1)), 0.0)
+    kept = kept.reshape(-1, *(1,) * (grey.ndim - 1))
+    lag = kept * (np.roll(grey, 1, axis=0) - grey)
+    # lag[i] += kept[i] lag[i-1], by doubling: after a few passes memory ** reach is nothing.
+    reach, factor = 1, kept
+    while reach < 64 and memory**reach > 1e-4:
+        lag[reach:] = lag[reach:] + factor[reach:] * lag[:-reach]
+        factor = np.concatenate([np.zeros_like(factor[:reach]), factor[reach:] * factor[:-reach]])
+        reach *= 2
+    return grey + lag
+
+
+def residuals(observations: PhotometricObservations, profile: CameraProfile) -> Array:
+    """Measured − predicted mean grey of the patches, grey levels of 255, (n,); each patch's light profiled out."""
+    return predict(observations, profile).residual
+
+
+def normalised_rms(observations: PhotometricObservations, profile: CameraProfile) -> tuple[float, float]:
+    """(RMS of residuals, RMS of their noise), grey levels, robust: residuals beyond 5 noises count as 5.
+
+    Every patch spends one observation on its light; both figures are of the rest.
+    """
+    limit = 5 * observations.noise
+    left = np.clip(residuals(observations, profile), -limit, limit)
+    spent = np.bincount(observations.patch)[observations.patch]
+    free = np.maximum(1 - 1 / spent, 1e-9)
+    return float(np.sqrt(np.sum(left**2) / free.sum())), float(np.sqrt(np.mean(observations.noise**2)))
+
+
+def _patch_sum(patch: Indices, values: Array) -> Array:
+    return np.maximum(np.bincount(patch, values), 1e-12) if np.all(values >= 0) else np.bincount(patch, values)
+
+
+def _tables(curve: ResponseCurve) -> tuple[Array, Array]:
+    """Grey (255) and its slope per log light on the grid; the grey is kept strictly rising for the inverse."""
+    grey = 255.0 * np.asarray(curve.encode(np.exp(_LOG_LIGHT)), float)
+    slope = np.gradient(grey, _LOG_LIGHT)
+    return grey + 1e-9 * np.arange(len(grey)), np.maximum(slope, _LEAST_SLOPE)
+
+
+def _at(table: Array, log_light: Array) -> Array:
+    """Linear interpolation on the even grid, ends held."""
+    step = _LOG_LIGHT[1] - _LOG_LIGHT[0]
+    position = np.clip((log_light - _LOG_LIGHT[0]) / step, 0, len(_LOG_LIGHT) - 1.001)
+    index = position.astype(np.intp)
+    part = position - index
+    return np.asarray(table[index] * (1 - part) + table[index + 1] * part)

@@ -1,0 +1,391 @@
+"""Fit photometric effects, state how well they are known, and judge them where they were not fitted.
+
+Robust Gauss-Newton (Cauchy weights, iterated) on the residuals in units of their noise, derivatives by finite
+differences.  Residuals are not independent: those of one stretch of time share their frames' registration and coding,
+those of one place its texture.  Covariances count both (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice, product
+
+import numpy as np
+from scipy import stats
+
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
+from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
+
+_CAUCHY = 2.5
+"""Residuals, in noises, at which the weight has fallen to a half."""
+_ITERATIONS = 12
+_MAX_STARTS = 8
+_FIRST_MEMORY = 0.2
+_MOST_MEMORY = 0.6
+_MEMORY_SPREAD = 0.2
+_PRIOR_SCALES = 10.0
+"""Weak knowledge that keeps what the data leave open where it was: this many typical changes."""
+_FRESH_JACOBIAN = (0, 1, 3, 6)
+"""Steps at which the derivatives are taken anew; between them the old ones serve."""
+_SMALL_STEP = 1e-3
+_MEMORY_STEP = 0.01
+_TRIAL_OBSERVATIONS = 6_000
+_PER_FRAME = 100
+"""Observations of a frame that its own value is fitted to; more cost much and tell little."""
+_SETTLED_FALL = 0.05
+"""Falls of the loss, in noises squared, that are no longer worth a step."""
+MEMORY_DOUBT = 0.25
+"""One memory for a movie is a rough model of an encoder: this part of what it changes in a value counts as unsure."""
+LAG_DOUBT = 0.2
+"""Part of a sudden change of a whole frame's brightness that an encoder at 0.25 bits a pixel may leave out."""
+BLOCKS_S = 0.3
+"""About the length of a block of frames: longer than a hand's sway keeps its direction, and than the encoder's memory
+of a picture that moves."""
+RESOLUTION = {"vignetting": 0.01, "flicker": 0.004, "response_curve": 0.01, "black_level": 0.002, "gain_drift": 0.003}
+"""Smaller values are not told from what encoders and slightly textured patches do, whatever the statistics say."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhotometricFit:
+    """Values of effects and what they are worth."""
+
+    effects: tuple[PhotometricEffect, ...]
+    values: Array
+    """(k,) of all effects, one after another."""
+    covariance: Array
+    """(k, k); of a gain drift against the mean of its frames, which is not observable."""
+    profile: CameraProfile
+    """The profile with the values in it."""
+    rms: float
+    """Of the residuals, grey levels, robust."""
+    cost: float
+    """Sum of the robust losses, in noises squared."""
+    memory: float
+    """Of the encoder; found along with the values, its uncertainty is in their covariance."""
+
+    @property
+    def std(self) -> Array:
+        """(k,) standard deviations."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """``effect.parameter`` of each value."""
+        return tuple(f"{effect.name}.{name}" for effect in self.effects for name in effect.parameters)
+
+    def of(self, effect_name: str) -> tuple[Array, Array]:
+        """(values, covariance) of one effect."""
+        start = 0
+        for effect in self.effects:
+            end = start + len(effect.parameters)
+            if effect.name == effect_name:
+                return self.values[start:end], self.covariance[start:end, start:end]
+            start = end
+        raise KeyError(effect_name)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """What effects gain where they were not fitted."""
+
+    before: float
+    """RMS under the profile without them, grey levels."""
+    after: float
+    noise: float
+    split: str
+    """``time``: fitted on some blocks of frames and judged on the others; ``place``: the same of places."""
+
+    @property
+    def gain(self) -> float:
+        """1 − (after² − noise²)/(before² − noise²), held in [0, 1]; 0 where there is nothing to explain."""
+        excess = self.before**2 - self.noise**2
+        if excess <= 1e-9 * self.noise**2:
+            return 0.0
+        return float(np.clip(1 - max(self.after**2 - self.noise**2, 0.0) / excess, 0.0, 1.0))
+
+
+def time_blocks(observations: PhotometricObservations) -> Indices:
+    """Block of each observation, (n,): contiguous frames, about BLOCKS_S long, lengths varied so that nothing beats."""
+    frames = observations.frames
+    stamp = np.array([observations.stamp_s[np.argmax(observations.frame == k)] for k in frames])
+    lengths = BLOCKS_S * np.array([1.0, 0.7, 1.25, 0.85, 1.4])
+    edges = stamp[0] + np.cumsum(np.resize(lengths, int(np.ceil(np.ptp(stamp) / lengths.mean())) + len(lengths)))
+    block = np.searchsorted(edges, stamp, side="right")
+    return np.asarray(block[np.searchsorted(frames, observations.frame)], np.intp)
+
+
+def fit_photometry(
+    observations: PhotometricObservations,
+    profile: CameraProfile,
+    effects: Sequence[PhotometricEffect],
+    use: Mask | None = None,
+) -> PhotometricFit:
+    """Fit all values of the effects together, from every start the effects name, and keep the best."""
+    chosen = observations if use is None else observations.subset(use)
+    effects = tuple(effects)
+    if any(effect.per_frame for effect in effects):
+        chosen = _thinned(chosen, _PER_FRAME * len(chosen.frames))
+    all_starts = product(*(effect.starts(chosen, profile) for effect in effects))
+    starts = [np.concatenate([*start, [_FIRST_MEMORY]]) for start in islice(all_starts, _MAX_STARTS)]
+    values, cost = _descend(chosen, profile, effects, _best_start(chosen, profile, effects, starts))
+    covariance = _covariance(chosen, profile, effects, values)[:-1, :-1]
+    final, memory = _applied(profile, effects, values), _memory(values)
+    rms = normalised_rms(chosen.with_memory(memory), final)[0]
+    return PhotometricFit(effects, values[:-1], covariance, final, rms, cost, memory)
+
+
+def judge(
+    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect]
+) -> HeldOut:
+    """Fit on one half, judge on the other, and the reverse.
+
+    Halves are blocks of time; for effects with a value per frame, which no other frame knows, they are places: a
+    frame's gain is found on half its patches and has to hold for the others.
+    """
+    by_place = any(effect.per_frame for effect in effects)
+    half = (observations.place if by_place else time_blocks(observations)) % 2 == 0
+    before, after, noise = [], [], []
+    for fitted in (half, ~half):
+        if not fitted.any() or fitted.all():
+            continue
+        fit = fit_photometry(observations, profile, effects, fitted)
+        held = _seen_twice(observations.subset(~fitted))
+        without = fit_photometry(observations, profile, (), fitted)
+        before.append(normalised_rms(held.with_memory(without.memory), profile))
+        after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
+        noise.append(before[-1][1])
+    quadratic = [float(np.sqrt(np.mean(np.square(v)))) if v else 0.0 for v in ([b[0] for b in before], after, noise)]
+    return HeldOut(*quadratic, split="place" if by_place else "time")
+
+
+def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:
+    """RMS over the held-out observations alone; their patches' light is found among themselves."""
+    return normalised_rms(observations.subset(held), profile)[0]
+
+
+def significance(fit: PhotometricFit, effect_name: str, observations: PhotometricObservations) -> tuple[float, float]:
+    """(how many standard deviations from no effect, p value), RESOLUTION and the search for a frequency counted in."""
+    values, covariance = fit.of(effect_name)
+    floor = RESOLUTION[effect_name] ** 2
+    if effect_name == "flicker":
+        z2 = values[0] ** 2 / (covariance[0, 0] + floor)
+        span_s = float(np.ptp(observations.stamp_s))
+        trials = max(380.0 * span_s, 1.0)
+        p = float(-np.expm1(trials * np.log1p(-min(np.exp(-0.5 * z2), 1 - 1e-12))))
+    elif effect_name == "gain_drift":
+        rounding = _per_frame(observations, observations.log_product_std)
+        spread = np.diag(covariance) + floor + rounding**2
+        z2 = float(np.sum((values - np.median(values)) ** 2 / spread))
+        p = float(stats.chi2.sf(z2, max(len(values) - 1, 1)))
+    else:
+        off = values[0] - (1.0 if effect_name == "response_curve" else 0.0)
+        z2 = off**2 / (covariance[0, 0] + floor)
+        p = float(stats.chi2.sf(z2, 1))
+    return float(stats.norm.isf(max(p, 1e-300) / 2)), p
+
+
+def _per_frame(observations: PhotometricObservations, values: Array) -> Array:
+    return np.array([values[np.argmax(observations.frame == k)] for k in observations.frames])
+
+
+def _seen_twice(held: PhotometricObservations) -> PhotometricObservations:
+    """Without patches that are held out once only: one observation alone has no residual."""
+    return held.subset(np.bincount(held.patch)[held.patch] >= 2)
+
+
+def _thinned(observations: PhotometricObservations, limit: int) -> PhotometricObservations:
+    """About as many observations as the limit says: some of the places, odd and even ones alike."""
+    thin = max(1, len(observations) // limit)
+    return observations if thin == 1 else observations.subset((observations.place // 2) % thin == 0)
+
+
+def _best_start(
+    observations: PhotometricObservations,
+    profile: CameraProfile,
+    effects: Sequence[PhotometricEffect],
+    starts: list[Array],
+) -> Array:
+    """Descend from each start on a part of the places, and go on from the best."""
+    if len(starts) == 1:
+        return starts[0]
+    part = _thinned(observations, _TRIAL_OBSERVATIONS)
+    return min((_descend(part, profile, effects, start) for start in starts), key=lambda found: found[1])[0]
+
+
+# ── descent ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _applied(profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array) -> CameraProfile:
+    start = 0
+    for effect in effects:
+        profile = effect.apply(profile, values[start : start + len(effect.parameters)])
+        start += len(effect.parameters)
+    return profile
+
+
+def _memory(values: Array) -> float:
+    return float(np.clip(values[-1], 0.0, _MOST_MEMORY))
+
+
+def _cost(residual: Array) -> float:
+    return float(_CAUCHY**2 * np.sum(np.log1p((residual / _CAUCHY) ** 2)))
+
+
+def _weights(residual: Array) -> Array:
+    return 1 / (1 + (residual / _CAUCHY) ** 2)
+
+
+def _prior(effects: Sequence[PhotometricEffect]) -> Array:
+    """Precision of the weak knowledge about each value and the memory, (k + 1,)."""
+    spread = [_PRIOR_SCALES * effect.scale for effect in effects]
+    return 1 / np.concatenate([*spread, [_MEMORY_SPREAD]]) ** 2
+
+
+def _descend(
+    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], start: Array
+) -> tuple[Array, float]:
+    """Gauss-Newton with robust weights; steps that do not lower the loss are damped."""
+    prior, values = _prior(effects), start
+
+    def loss(residual: Array, at: Array) -> float:
+        return _cost(residual) + float(prior @ (at - start) ** 2)
+
+    residual, weight = _settled(observations, profile, effects, values)
+    cost, damping = loss(residual, values), 1e-4
+    jacobian = np.zeros((0, 0))
+    for iteration in range(_ITERATIONS):
+        if iteration in _FRESH_JACOBIAN:
+            jacobian = _jacobian(observations, profile, effects, values, weight)
+        weighted = jacobian * weight[:, None]
+        normal = weighted.T @ jacobian + np.diag(prior)
+        right = -weighted.T @ residual - prior * (values - start)
+        for _ in range(5):
+            step = np.linalg.solve(normal + np.diag(damping * np.diag(normal)), right)
+            trial, trial_weight = _settled(observations, profile, effects, values + step)
+            if loss(trial, values + step) < cost:
+                break
+            damping *= 10
+        else:
+            break
+        values, residual, weight = values + step, trial, trial_weight
+        fall, cost, damping = cost - loss(trial, values), loss(trial, values), damping * 0.2
+        if fall < _SETTLED_FALL:
+            break
+    return values, cost
+
+
+def _settled(
+    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array
+) -> tuple[Array, Array]:
+    """Residuals in noises and their robust weights, which the patches' light takes into account too."""
+    observations, profile = observations.with_memory(_memory(values)), _applied(profile, effects, values)
+    weight = np.ones(len(observations))
+    for _ in range(2):
+        residual = predict(observations, profile, weight / observations.noise**2).residual / observations.noise
+        weight = _weights(residual)
+    return residual, weight
+
+
+def _jacobian(
+    observations: PhotometricObservations,
+    profile: CameraProfile,
+    effects: Sequence[PhotometricEffect],
+    values: Array,
+    weight: Array,
+) -> Array:
+    """Change of the residuals (in noises) with the values, (n, k); central differences, exact for gains."""
+    noise, start, parts = observations.noise, 0, []
+    full = weight / noise**2
+
+    def at(changed: Array) -> Array:
+        seen = observations.with_memory(_memory(changed))
+        return predict(seen, _applied(profile, effects, changed), full).residual / noise
+
+    for effect in effects:
+        if isinstance(effect, GainDrift):
+            here = predict(observations.with_memory(_memory(values)), _applied(profile, effects, values), full)
+            parts.append(here.respond(effect.columns(observations)) / noise[:, None])
+        else:
+            parts.append(_differences(at, values, start, effect.scale * _SMALL_STEP))
+        start += len(effect.parameters)
+    parts.append(_differences(at, values, start, np.array([_MEMORY_STEP])))
+    return np.concatenate(parts, axis=1)
+
+
+def _differences(at: Callable[[Array], Array], values: Array, start: int, steps: Array) -> Array:
+    columns = []
+    for i, step in enumerate(steps):
+        change = np.zeros_like(values)
+        change[start + i] = step
+        columns.append((at(values + change) - at(values - change)) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+# ── covariance ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _covariance(
+    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array
+) -> Array:
+    """Sandwich of the scores summed over blocks of time and over places; never below what white noise gives.
+
+    Values per frame leave nothing of a block's sum, so with them only places count.
+    """
+    residual, weight = _settled(observations, profile, effects, values)
+    jacobian = _jacobian(observations, profile, effects, values, weight)
+    normal = (jacobian * weight[:, None]).T @ jacobian + np.diag(_prior(effects))
+    inverse = np.linalg.inv(normal)
+    if any(effect.per_frame for effect in effects):
+        inverse = _without_common_part(inverse)
+    score = jacobian * (weight * residual)[:, None]
+    spread = _clustered(score, observations.place)
+    if not any(effect.per_frame for effect in effects):
+        spread = spread + _clustered(score, time_blocks(observations)) - score.T @ score
+    white = inverse * max(float(np.sum(weight * residual**2) / np.sum(weight)), 1.0)
+    doubt = MEMORY_DOUBT * _memory(values) * _pull_of_memory(normal)
+    lag = LAG_DOUBT * _changes(effects, values)
+    return _at_least(inverse @ spread @ inverse, white) + np.outer(doubt, doubt) + np.diag(lag**2)
+
+
+def _changes(effects: Sequence[PhotometricEffect], values: Array) -> Array:
+    """How far each value per frame is from the frame before's; 0 for all other values and the memory."""
+    parts, start = [], 0
+    for effect in effects:
+        own = values[start : start + len(effect.parameters)]
+        parts.append(np.abs(np.diff(own, prepend=own[:1])) if effect.per_frame else np.zeros(len(own)))
+        start += len(own)
+    return np.concatenate([*parts, [0.0]])
+
+
+def _without_common_part(inverse: Array) -> Array:
+    """Take the direction that nothing but the prior determines out of an inverse: all gains together."""
+    variance, direction = np.linalg.eigh(inverse)
+    variance[-1] = 0.0
+    return np.asarray((direction * variance) @ direction.T)
+
+
+def _pull_of_memory(normal: Array) -> Array:
+    """How the other values change with the memory, to first order, (k,); 0 for the memory itself."""
+    pull = np.zeros(len(normal))
+    if len(normal) > 1:
+        pull[:-1] = -np.linalg.solve(normal[:-1, :-1], normal[:-1, -1])
+    return pull
+
+
+def _clustered(score: Array, cluster: Indices) -> Array:
+    """Sum over clusters of the outer product of their summed scores, corrected for a small number of clusters."""
+    dense = np.unique(cluster, return_inverse=True)[1]
+    sums = np.stack([np.bincount(dense, column) for column in score.T], axis=-1)
+    count = len(sums)
+    return sums.T @ sums * (count / max(count - 1, 1))
+
+
+def _at_least(covariance: Array, floor: Array) -> Array:
+    """Raise variances that lie below those of white noise to theirs; correlations stay."""
+    have, need = np.diag(covariance), np.diag(floor)
+    if np.any(have <= 0):
+        return floor
+    grow = np.sqrt(np.maximum(need / have, 1.0))
+    return covariance * np.outer(grow, grow)

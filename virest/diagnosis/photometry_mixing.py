@@ -1,0 +1,323 @@
+"""The curve from blur at constant exposure: a hand's blur mixes light before the curve, and so shows the curve.
+
+Of two frames of one place, A nearly sharp and B blurred, with paths k_A and k_B from the gyroscope, both
+``k_B ∗ E′(A)`` and ``k_A ∗ E′(B)`` are the same light blurred by both paths, if E is the curve.  Under a wrong curve the
+bright side of every blurred edge grows or shrinks, whichever way the edge faces; a wrong registration, a wrong length
+of the path and a change of brightness do something else.  They are free in every tile, and only what is left counts.
+
+What a gamma and a black level do this way is nearly the same: each is estimated as if the other were nominal, and they
+are rivals.  Only exposures × ISO that change as logged tell them apart (photometry_fit).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.capture.records import Frame
+from virest.diagnosis.photometry import Array, Indices, Mask
+from virest.diagnosis.photometry_fit import HeldOut
+from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
+from virest.motion.trajectory import Trajectory
+
+Gray = NDArray[np.uint8]
+Plane = NDArray[np.float32]
+ReadGray = Callable[[Sequence[int]], Iterable[tuple[int, Gray | None]]]
+
+STEPS = {"response_curve": np.log([0.8, 1.0, 1.25]), "black_level": np.array([0.0, 0.04, 0.08])}
+"""Where residuals are taken: added to the logarithm of the profile's gamma, or to its black level."""
+DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
+"""(absolute, relative) deviation that encoders of few bits leave, beside the scatter between pairs of frames."""
+_MIN_TILE_PIXELS = 400
+_MARGIN_PX = 24
+_NODE_PX = 16
+
+
+@dataclass(frozen=True, slots=True)
+class MixingSettings:
+    """Which frames are compared. Lengths in pixels."""
+
+    pairs: int = 16
+    blurred_px: tuple[float, float] = (3.5, 16.0)
+    sharp_px: float = 3.0
+    sharp_part: float = 0.45
+    """The sharp frame's path is at most this part of the blurred one's."""
+    reach_frames: int = 8
+    tile_px: int = 80
+
+
+@dataclass(frozen=True, slots=True)
+class MixingEvidence:
+    """What each tile of each pair says; scores are residuals projected on what a change of the curve would do."""
+
+    pair: Indices
+    """(n,) number of the pair of frames."""
+    stiffness: dict[str, Array]
+    """Effect → (n,) squared length of its pattern in noises, per unit of the effect squared."""
+    score: dict[str, Array]
+    """Effect → (n, 3) scores at STEPS; the estimate is where their sum crosses zero."""
+
+    def subset(self, use: Mask) -> MixingEvidence:
+        """Only the chosen tiles."""
+        return MixingEvidence(
+            self.pair[use],
+            {name: v[use] for name, v in self.stiffness.items()},
+            {name: v[use] for name, v in self.score.items()},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MixingEstimate:
+    """One effect of the curve."""
+
+    value: float
+    """Gamma, or black level, as the profile would hold it."""
+    std: float
+    p_value: float
+    """Of no change."""
+    pairs: int
+
+
+def observe_mixing(
+    read_gray: ReadGray,
+    frames: Sequence[Frame],
+    trajectory: Trajectory,
+    profile: CameraProfile,
+    settings: MixingSettings | None = None,
+) -> MixingEvidence:
+    """Compare blurred frames with sharp ones near them. Empty where the hand gives no such pairs."""
+    settings = settings or MixingSettings()
+    pairs = _choose_pairs(frames, trajectory, profile, settings)
+    wanted = sorted({k for pair in pairs for k in pair})
+    pictures = {index: gray for index, gray in read_gray(wanted) if gray is not None}
+    by_index = {frame.index: frame for frame in frames}
+    rows: list[tuple[int, Array]] = []
+    for number, (sharp, blurred) in enumerate(pairs):
+        if sharp in pictures and blurred in pictures:
+            pair = (by_index[sharp], pictures[sharp]), (by_index[blurred], pictures[blurred])
+            rows += [(number, row) for row in _compare(*pair, trajectory, profile, settings)]
+    table = np.array([row for _, row in rows]).reshape(-1, 8)
+    names = tuple(STEPS)
+    return MixingEvidence(
+        np.array([number for number, _ in rows], np.intp),
+        {name: table[:, 4 * i] for i, name in enumerate(names)},
+        {name: table[:, 4 * i + 1 : 4 * i + 4] for i, name in enumerate(names)},
+    )
+
+
+def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_name: str) -> MixingEstimate | None:
+    """Gamma or black level, the other as in the profile; None with fewer than 3 pairs. The std is from leaving pairs out."""
+    pairs = np.unique(evidence.pair)
+    if len(pairs) < 3:
+        return None
+    change = _root(evidence, effect_name)
+    left_out = np.array([_root(evidence.subset(evidence.pair != k), effect_name) for k in pairs])
+    jackknife = (len(pairs) - 1) / len(pairs) * float(np.sum((left_out - left_out.mean()) ** 2))
+    absolute, relative = DOUBT[effect_name]
+    std = float(np.sqrt(jackknife + absolute**2))
+    p_value = float(2 * stats.t.sf(abs(change) / std, len(pairs) - 1))
+    std = float(np.hypot(std, relative * change))
+    curve = profile.response or ResponseCurve("srgb")
+    if effect_name == "response_curve":
+        value = curve.extra_gamma * float(np.exp(change))
+        return MixingEstimate(value, std * value, p_value, len(pairs))
+    return MixingEstimate(curve.black_level + change, std, p_value, len(pairs))
+
+
+def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOut | None:
+    """Find the change on half the pairs and judge it on the others; in units of the effect, RMS over pairs."""
+    pairs = np.unique(evidence.pair)
+    if len(pairs) < 4:
+        return None
+    before, after, noise = [], [], []
+    for odd in (0, 1):
+        change = _root(evidence.subset(np.isin(evidence.pair, pairs[odd::2])), effect_name)
+        for k in pairs[1 - odd :: 2]:
+            own = evidence.subset(evidence.pair == k)
+            alone, stiffness = _root(own, effect_name), own.stiffness[effect_name]
+            scatter = own.score[effect_name][:, 1] + stiffness * (0.0 - alone)
+            before.append(alone)
+            after.append(alone - change)
+            noise.append(float(np.sqrt(np.sum(scatter**2))) / float(np.sum(stiffness)))
+    return HeldOut(*(float(np.sqrt(np.mean(np.square(v)))) for v in (before, after, noise)), split="pairs")
+
+
+def _root(evidence: MixingEvidence, effect_name: str) -> float:
+    """Where the parabola through the three summed scores crosses zero nearest to no change."""
+    x = STEPS[effect_name]
+    total = evidence.score[effect_name].sum(axis=0)
+    straight = -total[1 if effect_name == "response_curve" else 0] * (x[2] - x[0]) / (total[2] - total[0])
+    roots = np.roots(np.polyfit(x, total, 2))
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    best = float(real[np.argmin(np.abs(real - straight))]) if len(real) else float(straight)
+    return float(np.clip(best, 3 * x[0] - 0.1, 3 * x[2]))
+
+
+# ── pairs of frames ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _choose_pairs(
+    frames: Sequence[Frame], trajectory: Trajectory, profile: CameraProfile, settings: MixingSettings
+) -> list[tuple[int, int]]:
+    """(sharp, blurred) movie indices with the most blur between them."""
+    lens = profile.intrinsics
+    if lens is None or any(frame.exposure_s is None for frame in frames) or len(frames) < 2:
+        return []
+    centre = np.array([[(profile.width - 1) / 2, (profile.height - 1) / 2]])
+    paths = np.array([path_over_exposure(centre, frame, trajectory, profile)[0, [0, -1]] for frame in frames])
+    length = np.linalg.norm(paths[:, 1] - paths[:, 0], axis=-1)
+    index = np.array([frame.index for frame in frames])
+    found = []
+    for i in np.flatnonzero((length > settings.blurred_px[0]) & (length < settings.blurred_px[1])):
+        near = np.flatnonzero(np.abs(index - index[i]) <= settings.reach_frames)
+        best = near[np.argmin(length[near])]
+        if length[best] < min(settings.sharp_px, settings.sharp_part * length[i]):
+            found.append((float(length[i] - 1.5 * length[best]), int(index[best]), int(index[i])))
+    return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[: settings.pairs]]
+
+
+def _compare(
+    sharp: tuple[Frame, Gray],
+    blurred: tuple[Frame, Gray],
+    trajectory: Trajectory,
+    profile: CameraProfile,
+    settings: MixingSettings,
+) -> list[Array]:
+    """Stiffness and scores (8,) of each usable tile of one pair."""
+    height, width = blurred[1].shape
+    where = seen_elsewhere(Follower(*blurred), Follower(*sharp), trajectory, profile, _nodes(width, height))
+    if where is None:
+        return []
+    x, y = ((np.arange(n) / _NODE_PX).astype(np.float32) for n in (width, height))
+    place = cv2.remap(where, np.tile(x, (height, 1)), np.tile(y[:, None], (1, width)), cv2.INTER_LINEAR)
+    usable = _usable(sharp[1], blurred[1], place)
+    tiles = _tiles(width, height, settings.tile_px)
+    middles = np.array([((t[1].start + t[1].stop) / 2, (t[0].start + t[0].stop) / 2) for t in tiles])
+    kernels = [
+        [_kernel(path) for path in path_over_exposure(middles, frame, trajectory, profile)]
+        for frame in (sharp[0], blurred[0])
+    ]
+    curve = profile.response or ResponseCurve("srgb")
+
+    def difference(changed: ResponseCurve) -> tuple[Plane, Plane]:
+        table = changed.linear_table()
+        light = cv2.remap(table[sharp[1]], place, None, cv2.INTER_CUBIC), table[blurred[1]]
+        from_sharp, from_blurred = _blurred(light[0], kernels[1], tiles), _blurred(light[1], kernels[0], tiles)
+        grey = 255 * changed.encode(from_sharp)
+        return 255 * changed.encode(from_blurred) - grey, grey
+
+    nominal, grey = difference(curve)
+    gammas = [
+        difference(replace(curve, extra_gamma=curve.extra_gamma * float(np.exp(s))))[0]
+        for s in STEPS["response_curve"][[0, 2]]
+    ]
+    blacks = [difference(replace(curve, black_level=curve.black_level + float(s)))[0] for s in STEPS["black_level"][1:]]
+    stacks = [gammas[0], nominal, gammas[1]], [nominal, *blacks]
+    nuisance = _nuisances(grey)
+    rows = (_tile_scores(stacks, nuisance, tile, usable[tile]) for tile in tiles)
+    return [row for row in rows if row is not None]
+
+
+def _tile_scores(
+    stacks: tuple[list[Plane], list[Plane]], nuisance: list[Plane], tile: tuple[slice, slice], usable: Mask
+) -> Array | None:
+    """Scores of one tile with everything projected out that is no change of the curve; robust weights per pixel."""
+    if usable.sum() < 2 * _MIN_TILE_PIXELS:
+        return None
+    tile = tuple(slice(s.start, s.stop, 2) for s in tile)  # type: ignore[assignment]
+    usable = usable[::2, ::2]
+    if usable.sum() < _MIN_TILE_PIXELS:
+        return None
+    free = np.stack([plane[tile][usable] for plane in nuisance], axis=-1).astype(float)
+    levels = [np.stack([plane[tile][usable] for plane in stack], axis=-1).astype(float) for stack in stacks]
+    patterns = [(level[:, 2] - level[:, 0]) / (x[2] - x[0]) for level, x in zip(levels, STEPS.values(), strict=True)]
+    design, target = np.column_stack([patterns[0], free]), levels[0][:, 1]
+    weight, noise = np.ones(len(target)), 1.0
+    for _ in range(3):
+        fit = np.linalg.lstsq(weight[:, None] * design, weight * target, rcond=1e-8)[0]
+        left = target - design @ fit
+        noise = 1.4826 * float(np.median(np.abs(left))) + 0.2
+        weight = 1 / np.sqrt(1 + (left / (2.5 * noise)) ** 2)
+    base = np.linalg.qr(weight[:, None] * free)[0]
+    row = []
+    for level, pattern in zip(levels, patterns, strict=True):
+        own = weight * pattern
+        own = own - base @ (base.T @ own)
+        row += [float(own @ own) / noise**2, *((own @ (weight[:, None] * level)) / noise**2)]
+    return np.array(row)
+
+
+def _nuisances(grey: Plane) -> list[Plane]:
+    """What a wrong registration, brightness and path length do: slopes, the picture, a constant, the Laplacian."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    slopes = [cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))]
+    bend = cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.5), cv2.CV_32F)
+    planes = [*slopes, grey, np.ones_like(grey), bend]
+    return [np.asarray(plane, np.float32) for plane in planes]
+
+
+def _nodes(width: int, height: int) -> Array:
+    """Pixels (rows, columns, 2) every _NODE_PX, one beyond the picture's end."""
+    x, y = (np.arange(n // _NODE_PX + 2) * float(_NODE_PX) for n in (width, height))
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def _tiles(width: int, height: int, side: int) -> list[tuple[slice, slice]]:
+    columns, rows = (np.linspace(0, n, max(n // side, 1) + 1).astype(int) for n in (width, height))
+    return [
+        (slice(int(a), int(b)), slice(int(c), int(d)))
+        for a, b in zip(rows[:-1], rows[1:], strict=True)
+        for c, d in zip(columns[:-1], columns[1:], strict=True)
+    ]
+
+
+def _usable(sharp: Gray, blurred: Gray, place: Plane) -> Mask:
+    """Pixels whose surroundings are inside both pictures and not clipped in either."""
+    height, width = blurred.shape
+    edge = 8
+    inside = ((place > edge) & (place < (width - 1 - edge, height - 1 - edge))).all(axis=-1)
+
+    def near_clipped(gray: Gray) -> Gray:
+        return np.asarray(
+            cv2.dilate(((gray > 247) | (gray < 4)).astype(np.uint8), np.ones((21, 21), np.uint8)), np.uint8
+        )
+
+    seen = cv2.remap(near_clipped(sharp), place, None, cv2.INTER_NEAREST)
+    return np.asarray(inside & (near_clipped(blurred) == 0) & (seen == 0))
+
+
+def _kernel(path_px: Array) -> Plane:
+    """Weights by which a pixel gathers light from its surroundings along a path (m, 2): at minus the displacement."""
+    fine = np.concatenate(
+        [np.linspace(a, b, 6, endpoint=False) for a, b in zip(path_px[:-1], path_px[1:], strict=True)]
+    )
+    reach = int(np.abs(fine).max() + 2)
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    at = reach - fine
+    whole = np.floor(at).astype(int)
+    part = at - whole
+    for right in (0, 1):
+        for down in (0, 1):
+            share = np.abs(1 - right - part[:, 0]) * np.abs(1 - down - part[:, 1])
+            np.add.at(kernel, (whole[:, 1] + down, whole[:, 0] + right), share)
+    return (kernel / kernel.sum()).astype(np.float32)
+
+
+def _blurred(light: Plane, kernels: list[Plane], tiles: list[tuple[slice, slice]]) -> Plane:
+    """Each tile filtered by its own kernel, with a margin of its neighbours."""
+    height, width = light.shape
+    out = np.empty_like(light)
+    for kernel, (rows, columns) in zip(kernels, tiles, strict=True):
+        top, left = max(rows.start - _MARGIN_PX, 0), max(columns.start - _MARGIN_PX, 0)
+        part = light[top : min(rows.stop + _MARGIN_PX, height), left : min(columns.stop + _MARGIN_PX, width)]
+        part = cv2.filter2D(part, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT)
+        inner = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+        out[rows, columns] = part[inner]
+    return out

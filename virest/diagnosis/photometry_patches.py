@@ -1,0 +1,381 @@
+"""Find flat patches in key frames and see how bright they are in other frames.
+
+Where a patch went is predicted by the rotation between its rows' times, and corrected by what is seen: corners followed
+from the key frame (pyramidal Lucas-Kanade on locally normalised pictures, so that brightness changes do not move them)
+give a smooth field of deviations.  So offset, readout, focal length and parallax of the profile may be wrong by many
+pixels; what they leave is small against the flat surround of a patch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Frame
+from virest.diagnosis.photometry import Array, PhotometricObservations
+from virest.diagnosis.photometry_noise import measured_noise
+from virest.motion.tracking import TrackingSettings, find_corners
+from virest.motion.trajectory import Trajectory
+
+Picture = NDArray[np.uint8]
+
+_FIXED_POINT_STEPS = 4
+_LK_WINDOW = (21, 21)
+_LK_LEVELS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class PatchSettings:
+    """How patches are chosen and looked up. Lengths in pixels hold for a picture 640 px long and grow with it."""
+
+    patch_px: float = 11.0
+    surround_px: float = 23.0
+    """Side of the square around a patch that has to be flat."""
+    cells: int = 9
+    """Cells along the longer side of the picture; each gives its flattest patch."""
+    max_spread_levels: float = 8.0
+    """Largest standard deviation in the surround, grey levels."""
+    key_every: int = 24
+    """Frames between key frames."""
+    active_keys: int = 2
+    """How many key frames are looked for in each frame."""
+    least_seen: int = 6
+    """Patches seen less often are dropped."""
+    min_corners: int = 24
+    max_deviation_px: float = 1.5
+    """Frames whose corners scatter more than this about a smooth field are not compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Key:
+    """A key frame and what is looked for in others."""
+
+    frame: Frame
+    normal: Picture
+    corners_px: NDArray[np.float32]
+    patches_px: Array
+    spread: Array
+    first_place: int
+
+
+def observe_photometry(
+    pictures: Iterable[tuple[Frame, Picture | None]],
+    trajectory: Trajectory | None,
+    profile: CameraProfile,
+    settings: PatchSettings | None = None,
+    intra_frames: Collection[int] = (),
+) -> PhotometricObservations:
+    """Follow flat patches through a stream of (frame, RGB (h, w, 3) or None) in rising order, one pass.
+
+    trajectory: the camera's orientation; None: nothing is predicted, corners are followed from where they were.
+    profile: for the geometry only.  intra_frames: movie indices that the decoder can start from (Capture.keyframes);
+    they are coded on their own, and patches are best chosen there.  A picture that repeats its predecessor is passed over.
+    """
+    settings = settings or PatchSettings()
+    keys: list[_Key] = []
+    places = since = 0
+    rows: list[Array] = []
+    seen: list[Frame] = []
+    before: Picture | None = None
+    for frame, picture in pictures:
+        if picture is None or (before is not None and np.array_equal(picture, before)):
+            continue
+        before = picture
+        seen.append(frame)
+        look = _look(picture, settings)
+        found = [_seen_patches(key, frame, look, trajectory, profile, settings) for key in keys]
+        rows += found
+        fresh = since >= settings.key_every and (frame.index in intra_frames or since >= 2 * settings.key_every)
+        lost = bool(keys) and since >= settings.least_seen and len(found[-1]) < 0.5 * len(keys[-1].patches_px)
+        if not keys or fresh or lost:
+            key = _make_key(frame, look, places, settings)
+            rows.append(_read(key, key.patches_px, frame, look, settings))
+            places += len(key.patches_px)
+            keys, since = [*keys, key][-settings.active_keys :], 0
+        since += 1
+    table = np.concatenate(rows) if rows else np.zeros((0, 8))
+    return _observations(table, seen, profile, settings, intra_frames)
+
+
+# ── one frame ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What is needed of one picture."""
+
+    mean: NDArray[np.float32]
+    """(h, w, 3) mean over the patch's square."""
+    spread: NDArray[np.float32]
+    """(h, w) standard deviation of the grey in the patch's square."""
+    surround: NDArray[np.float32]
+    """(h, w) the same in the surround."""
+    normal: Picture
+    """Grey picture without local mean and contrast, for following corners."""
+
+
+def _scale(width: int, height: int) -> float:
+    return max(width, height) / 640.0
+
+
+def _odd(length: float) -> int:
+    return 2 * int(length / 2) + 1
+
+
+def _look(picture: Picture, settings: PatchSettings) -> _Look:
+    scale = _scale(picture.shape[1], picture.shape[0])
+    side, wide = _odd(settings.patch_px * scale), _odd(settings.surround_px * scale)
+    gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    squared = gray * gray
+    near, far, around = ((n, n) for n in (side, wide, _odd(41 * scale)))
+    mean = cv2.boxFilter(picture, cv2.CV_32F, near, borderType=cv2.BORDER_REFLECT)
+    spread = _spread(gray, squared, near)
+    local = cv2.blur(gray, around)
+    contrast = np.sqrt(np.maximum(cv2.blur(squared, around) - local * local, 0)) + 6.0
+    normal = np.clip(128 + 45 * (gray - local) / contrast, 0, 255).astype(np.uint8)
+    return _Look(np.asarray(mean, np.float32), spread, _spread(gray, squared, far), normal)
+
+
+def _spread(gray: NDArray[np.float32], squared: NDArray[np.float32], box: tuple[int, int]) -> NDArray[np.float32]:
+    mean = cv2.blur(gray, box)
+    return np.asarray(np.sqrt(np.maximum(cv2.blur(squared, box) - mean * mean, 0)), np.float32)
+
+
+def _make_key(frame: Frame, look: _Look, first_place: int, settings: PatchSettings) -> _Key:
+    height, width = look.normal.shape
+    corners = find_corners(look.normal, TrackingSettings(grid=(7, 7), points_per_cell=3))
+    patches = _flat_patches(look, settings)
+    column, row = patches[:, 0].astype(int), patches[:, 1].astype(int)
+    return _Key(frame, look.normal, corners, patches, look.spread[row, column].astype(float), first_place)
+
+
+def _flat_patches(look: _Look, settings: PatchSettings) -> Array:
+    """Middles (n, 2) of the flattest patch of each cell, against its brightness, and of each cell's darkest flat one."""
+    height, width = look.normal.shape
+    brightness = look.mean.mean(axis=-1)
+    edge = int(settings.surround_px * _scale(width, height) / 2) + 1
+    allowed = (look.surround < settings.max_spread_levels) & (look.mean.max(axis=-1) < 244)
+    allowed[:edge], allowed[-edge:], allowed[:, :edge], allowed[:, -edge:] = False, False, False, False
+    relative = np.where(allowed, look.surround / (brightness + 15.0), np.inf)
+    dark = np.where(allowed & (look.surround < 0.5 * settings.max_spread_levels), brightness, np.inf)
+    cell = max(width, height) / settings.cells
+    found = {*_best_of_cells(relative, cell), *_best_of_cells(dark, 2 * cell)}
+    return np.array(sorted(found), float).reshape(-1, 2)
+
+
+def _best_of_cells(score: NDArray[np.float32], cell: float) -> list[tuple[int, int]]:
+    """(x, y) of the least finite score in each cell."""
+    height, width = score.shape
+    rows, columns = (np.linspace(0, n, max(round(n / cell), 1) + 1).astype(int) for n in (height, width))
+    best = []
+    for top, bottom in zip(rows[:-1], rows[1:], strict=True):
+        for left, right in zip(columns[:-1], columns[1:], strict=True):
+            y, x = np.unravel_index(np.argmin(score[top:bottom, left:right]), (bottom - top, right - left))
+            if np.isfinite(score[top + y, left + x]):
+                best.append((int(left + x), int(top + y)))
+    return best
+
+
+# ── from frame to frame ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _seen_patches(
+    key: _Key,
+    frame: Frame,
+    look: _Look,
+    trajectory: Trajectory | None,
+    profile: CameraProfile,
+    settings: PatchSettings,
+) -> Array:
+    """Read the key's patches in another frame; empty where the frames cannot be registered."""
+    corners = key.corners_px.astype(float)
+    guess = predicted_points(corners, key.frame, frame, trajectory, profile)
+    field = _deviation(key, guess, look, settings)
+    if field is None:
+        return np.zeros((0, 8))
+    patches = predicted_points(key.patches_px, key.frame, frame, trajectory, profile)
+    height, width = look.normal.shape
+    return _read(key, patches + _smooth_basis(patches, width, height) @ field, frame, look, settings)
+
+
+def predicted_points(
+    points_px: Array, key: Frame, frame: Frame, trajectory: Trajectory | None, profile: CameraProfile
+) -> Array:
+    """Where points (n, 2) of one frame are seen in another by rotation alone, each at its own row's mid-exposure."""
+    lens = profile.intrinsics
+    if trajectory is None or lens is None:
+        return points_px
+    world = trajectory.orientation(_seen_s(points_px, key, profile)) @ lens.rays(points_px)[..., None]
+    seen = points_px
+    for _ in range(_FIXED_POINT_STEPS):
+        turned = np.swapaxes(trajectory.orientation(_seen_s(seen, frame, profile)), -1, -2) @ world
+        seen = lens.project(np.squeeze(turned, -1))
+    return seen
+
+
+@dataclass(frozen=True, slots=True)
+class Follower:
+    """A frame and its grey picture, to be registered with another."""
+
+    frame: Frame
+    gray: Picture
+
+
+def seen_elsewhere(
+    at: Follower, other: Follower, trajectory: Trajectory, profile: CameraProfile, points_px: Array
+) -> NDArray[np.float32] | None:
+    """Where points (..., 2) of one frame are seen in another, (..., 2), corrected by corners; None: not registered."""
+    settings = PatchSettings()
+    looks = [_look(cv2.cvtColor(one.gray, cv2.COLOR_GRAY2RGB), settings) for one in (at, other)]
+    key = _make_key(at.frame, looks[0], 0, settings)
+    guess = predicted_points(key.corners_px.astype(float), at.frame, other.frame, trajectory, profile)
+    field = _deviation(key, guess, looks[1], settings)
+    if field is None:
+        return None
+    height, width = at.gray.shape
+    seen = predicted_points(points_px.reshape(-1, 2), at.frame, other.frame, trajectory, profile)
+    seen = seen + _smooth_basis(seen, width, height) @ field
+    return seen.reshape(points_px.shape).astype(np.float32)
+
+
+def path_over_exposure(
+    points_px: Array, frame: Frame, trajectory: Trajectory, profile: CameraProfile, instants: int = 13
+) -> Array:
+    """Displacements (n, instants, 2) of points seen at mid-exposure, over the exposure of their own rows."""
+    lens = profile.intrinsics
+    assert lens is not None, "paths need a focal length"
+    middle = _seen_s(points_px, frame, profile)
+    exposure = float(profile.shutter.true_exposure_s(frame.exposure_s or 0.0))
+    world = trajectory.orientation(middle) @ lens.rays(points_px)[..., None]
+    time_s = middle[:, None] + np.linspace(-0.5, 0.5, instants) * exposure
+    turned = np.swapaxes(trajectory.orientation(time_s), -1, -2) @ world[:, None]
+    return lens.project(np.squeeze(turned, -1)) - points_px[:, None]
+
+
+def _seen_s(points_px: Array, frame: Frame, profile: CameraProfile) -> Array:
+    logged = frame.exposure_s or 0.0
+    start = profile.imu_time_s(profile.shutter.first_row_start_s(frame.time_s, logged))
+    fraction = profile.shutter.readout_fraction(points_px, profile.width, profile.height)
+    return np.asarray(start + fraction * profile.shutter.readout_time_s + 0.5 * profile.shutter.true_exposure_s(logged))
+
+
+def _deviation(key: _Key, guess: Array, look: _Look, settings: PatchSettings) -> Array | None:
+    """Smooth field (6, 2) of seen − predicted corners: quadratic in place, robust. None where too few agree."""
+    height, width = look.normal.shape
+    inside = ((guess > 0) & (guess < (width - 1, height - 1))).all(axis=-1)
+    if inside.sum() < settings.min_corners:
+        return None
+    start = np.ascontiguousarray(guess[inside, None], np.float32)
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        key.normal, look.normal, np.ascontiguousarray(key.corners_px[inside, None]), start.copy(),
+        winSize=_LK_WINDOW, maxLevel=_LK_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    found = status.ravel() == 1
+    guess, deviation = guess[inside][found], (moved - start)[found, 0].astype(float)
+    if len(guess) < settings.min_corners:
+        return None
+    scale = _scale(width, height)
+    basis = _smooth_basis(guess, width, height)
+    field = np.zeros((6, 2))
+    field[0] = np.median(deviation, axis=0)
+    for terms in (1, 3, 3, 6, 6, 6):
+        off = np.linalg.norm(deviation - basis @ field, axis=-1)
+        weight = np.sqrt(1 / (1 + (off / max(1.5 * np.median(off), 0.3 * scale)) ** 2))[:, None]
+        field[:terms] = np.linalg.lstsq(weight * basis[:, :terms], weight * deviation, rcond=None)[0]
+    off = np.linalg.norm(deviation - basis @ field, axis=-1)
+    near = off < 2 * settings.max_deviation_px * scale
+    if near.sum() < settings.min_corners or np.median(off) > settings.max_deviation_px * scale:
+        return None
+    return field
+
+
+def _smooth_basis(points_px: Array, width: int, height: int) -> Array:
+    x = (points_px[:, 0] - width / 2) / max(width, height)
+    y = (points_px[:, 1] - height / 2) / max(width, height)
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def _read(key: _Key, points_px: Array, frame: Frame, look: _Look, settings: PatchSettings) -> Array:
+    """Table (n, 8): place, frame, x, y, three means and the spread of the patches that lie well inside.
+
+    A patch with much more contrast than in its key frame shows something else too.
+    """
+    height, width = look.normal.shape
+    edge = settings.surround_px * _scale(width, height) / 2
+    inside = ((points_px > edge) & (points_px < (width - 1 - edge, height - 1 - edge))).all(axis=-1)
+    if not inside.any():
+        return np.zeros((0, 8))
+    points = points_px[inside]
+    at = points.astype(np.float32)[None]
+    mean = cv2.remap(look.mean, at, None, cv2.INTER_LINEAR)[0]
+    spread = cv2.remap(look.spread, at, None, cv2.INTER_LINEAR)[0]
+    place = key.first_place + np.flatnonzero(inside)
+    good = spread < 1.5 * key.spread[inside] + 2.0
+    table = np.column_stack([place, np.full(len(place), frame.index), points, mean, spread])
+    return np.asarray(table[good], float)
+
+
+# ── the record ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _observations(
+    table: Array,
+    frames: list[Frame],
+    profile: CameraProfile,
+    settings: PatchSettings,
+    intra_frames: Collection[int],
+) -> PhotometricObservations:
+    """One entry per channel; clipped ones and patches seen too rarely are left out."""
+    place, index = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)
+    channel = np.tile(np.arange(3), len(table))
+    patch = 3 * np.repeat(place, 3) + channel
+    grey, spread = table[:, 4:7].ravel(), np.repeat(table[:, 7], 3)
+    # Noise clipped at zero lifts black, and at 255 lowers white.
+    keep = (grey - 2.5 * spread > 1.0) & (grey > 6.0) & (grey + 2.5 * spread < 250.0)
+    often = np.bincount(patch[keep], minlength=int(patch.max(initial=0)) + 1) >= settings.least_seen
+    keep &= often[patch]
+    patch = np.unique(patch[keep] // 3, return_inverse=True)[1] * 3 + channel[keep]
+    row = np.repeat(np.arange(len(table)), 3)[keep]
+    order = np.lexsort((index[row], patch))
+    row = row[order]
+    product, product_std, known = _logged_products(frames)
+    slot = {frame.index: i for i, frame in enumerate(frames)}
+    which = np.array([slot[int(i)] for i in index], np.intp)[row] if len(table) else np.zeros(0, np.intp)
+    points = table[row, 2:4]
+    width, height = profile.width, profile.height
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    observations = PhotometricObservations(
+        patch=patch[order],
+        frame=index[row],
+        stamp_s=np.array([f.time_s for f in frames])[which],
+        row_fraction=profile.shutter.readout_fraction(points, width, height),
+        x_px=points[:, 0],
+        y_px=points[:, 1],
+        radius=np.linalg.norm(points - centre, axis=-1) / (0.5 * np.hypot(width, height)),
+        grey=grey[keep][order],
+        noise=np.ones(len(row)),
+        exposure_s=np.array([f.exposure_s or 0.0 for f in frames])[which],
+        log_product=product[which],
+        log_product_std=product_std[which],
+        intra=np.isin(index[row], list(intra_frames)),
+        product_known=known,
+        width=width,
+        height=height,
+    )
+    return measured_noise(observations)
+
+
+def _logged_products(frames: list[Frame]) -> tuple[Array, Array, bool]:
+    """Log of exposure × ISO against its median, what rounding ISO to a whole number leaves open, whether all have it."""
+    known = bool(frames) and all(f.exposure_s and f.iso for f in frames)
+    if not known:
+        return np.zeros(len(frames)), np.zeros(len(frames)), False
+    iso = np.array([f.iso for f in frames], float)
+    product = np.log(iso * np.array([f.exposure_s for f in frames], float))
+    rounded = np.sqrt(1 / 12) / iso * (iso == np.rint(iso))
+    return product - np.median(product), rounded, True

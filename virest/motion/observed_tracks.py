@@ -1,0 +1,122 @@
+"""From tracked pairs to what a geometric fit needs: pairs worth using, their noise, turns, windows and table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Capture
+from virest.motion.track_model import TrackTable, track_table
+from virest.motion.track_noise import step_noise_px
+from virest.motion.tracking import TrackPair
+from virest.motion.turns import PictureTurns, picture_turns
+
+Array = NDArray[np.float64]
+MIN_TRACKS = 15
+"""A pair with fewer tells too little."""
+WINDOW_S = 3.5
+"""Longest stretch over which the accelerometer's path is followed; its noise grows with the power 1.5."""
+IMU_PAUSE_PERIODS = 3.0
+MARGIN_S = 0.02
+GUESSED_FOCAL = 0.8
+"""Of the longer side: a phone's main camera; where nothing is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedTracks:
+    """Pairs that are worth something, and when their frames were stamped."""
+
+    pairs: tuple[TrackPair, ...]
+    stamp_s: Array
+    """(frames,) by movie index, camera clock from stamp_0."""
+    exposure_s: Array
+    """(frames,) as logged; 0 where unknown."""
+    exposure_known: bool
+    noise_px: Array
+    """(pairs,) standard deviation of a step per coordinate."""
+    lens: Intrinsics
+    """The profile's, or a guess."""
+
+    @property
+    def tracks(self) -> int:
+        """Number of tracked points."""
+        return sum(map(len, self.pairs))
+
+    def turns(self, profile: CameraProfile) -> PictureTurns:
+        """Rotation of every pair, at the middle of the readout and exposure, camera clock."""
+        shutter = profile.shutter
+        middle = shutter.first_row_start_s(self.stamp_s, self.exposure_s) + 0.5 * (
+            shutter.true_exposure_s(self.exposure_s) + shutter.readout_time_s
+        )
+        first, second = ([getattr(pair, name) for pair in self.pairs] for name in ("first", "second"))
+        return picture_turns(self.lens, self.pairs, middle[first], middle[second])
+
+    def chosen(self, use: NDArray[np.bool_]) -> ObservedTracks:
+        """Some of the pairs."""
+        kept = tuple(pair for pair, u in zip(self.pairs, use, strict=True) if u)
+        return replace(self, pairs=kept, noise_px=self.noise_px[use])
+
+    def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
+        """The pairs whose two pictures lie inside the inertial data, with no pause between them."""
+        shutter = profile.shutter
+        start = np.asarray(profile.imu_time_s(shutter.first_row_start_s(self.stamp_s, self.exposure_s)))
+        last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s) + MARGIN_S
+        begin = np.array([start[pair.first] - MARGIN_S for pair in self.pairs])
+        end = np.array([start[pair.second] + last[pair.second] for pair in self.pairs])
+        use = (begin > imu.time_s[0]) & (end < imu.time_s[-1])
+        steps = np.diff(imu.time_s)
+        for gap in np.flatnonzero(steps > max(MARGIN_S, IMU_PAUSE_PERIODS * float(np.median(steps)))):
+            use &= (end < imu.time_s[gap]) | (begin > imu.time_s[gap + 1])
+        return self.chosen(use)
+
+    def table(self, max_points: int) -> TrackTable:
+        """All points in one table, evenly thinned to about max_points."""
+        stride = max(-(-self.tracks // max_points), 1)
+        pairs = [_thinned(pair, k % stride, stride) for k, pair in enumerate(self.pairs)]
+        return track_table(pairs, self.stamp_s, self.exposure_s, self.noise_px, self._windows())
+
+    def _windows(self) -> list[list[int]]:
+        """Equal stretches of at most WINDOW_S; a pause of one also ends a window."""
+        middle = np.array([self.stamp_s[pair.second] for pair in self.pairs])
+        parts: list[list[int]] = []
+        for run in np.split(np.arange(len(middle)), np.flatnonzero(np.diff(middle) > 0.5 * WINDOW_S) + 1):
+            count = max(int(np.ceil((middle[run[-1]] - middle[run[0]]) / WINDOW_S)), 1)
+            edges = np.linspace(middle[run[0]], middle[run[-1]], count + 1)[1:-1]
+            parts += [list(part) for part in np.split(run, np.searchsorted(middle[run], edges)) if len(part)]
+        return parts
+
+
+def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> ObservedTracks:
+    """Keep the pairs with enough points and known stamps; the exposure of frames without one is the typical one."""
+    stamp_s = np.array([frame.time_s for frame in capture.frames], float)
+    exposure_s = np.array([np.nan if f.exposure_s is None else f.exposure_s for f in capture.frames], float)
+    known = bool(np.isfinite(exposure_s).mean() > 0.5)
+    exposure_s = np.where(np.isfinite(exposure_s), exposure_s, np.nanmedian(exposure_s) if known else 0.0)
+    kept = tuple(
+        pair for pair in pairs if len(pair) >= MIN_TRACKS and np.isfinite(stamp_s[[pair.first, pair.second]]).all()
+    )
+    lens = profile.intrinsics or guessed_lens(profile)
+    return ObservedTracks(kept, stamp_s, exposure_s, known, step_noise_px(kept), lens)
+
+
+def guessed_lens(profile: CameraProfile) -> Intrinsics:
+    """A phone's main camera, where nothing is known."""
+    focal = GUESSED_FOCAL * max(profile.width, profile.height)
+    return Intrinsics(
+        profile.width, profile.height, focal, focal, 0.5 * (profile.width - 1), 0.5 * (profile.height - 1)
+    )
+
+
+def _thinned(pair: TrackPair, start: int, stride: int) -> TrackPair:
+    return replace(
+        pair,
+        points_first_px=pair.points_first_px[start::stride],
+        points_second_px=pair.points_second_px[start::stride],
+        forward_backward_px=None,
+    )

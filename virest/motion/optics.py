@@ -1,0 +1,146 @@
+"""The lens as it moves: focal length and stabiliser at every instant.
+
+``focal_drift``: f(t) = f (1 + drift t) at every instant, t on the IMU's clock from stamp_0.  ``stabilisation``: the
+picture is shifted by f(t) · fraction · θ, with θ the camera's integrated rates about x and y through a continuous
+first-order high-pass from rest, θ' = ω − 2π cutoff θ.  The shift comes before the distortion: x += fraction θ_y,
+y −= fraction θ_x in units of the focal length; roll stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+SHIFT_STEP_S = 5e-4
+"""Grid of the stabiliser's path: at 50 rad/s² a straight line over it is off by 1.6e-6 rad."""
+SETTLED = 16.0
+"""After this many time constants 1 / (2π cutoff) the high-pass has forgotten its start but for 1e-7 of it."""
+_SMALL = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class MovingLens:
+    """A lens whose focal length drifts and which a stabiliser shifts."""
+
+    lens: Intrinsics
+    """At stamp_0, with the stabiliser at rest."""
+    focal_drift_per_s: float = 0.0
+    shift_time_s: Array | None = None
+    """(m,) rising, IMU clock from stamp_0; None: no stabiliser."""
+    shift: Array | None = None
+    """(m, 2) at those times, units of the focal length, added before distortion; straight lines between, ends held."""
+
+    def rays(self, points_px: Array, time_s: Any) -> Array:
+        """Rays (..., 3) with z = 1 through pixels (..., 2) seen at times (...): the inverse of :meth:`project`."""
+        if self.focal_drift_per_s:
+            points_px = self._about_centre(points_px, 1.0 / self._focal_scale(time_s))
+        rays = self.lens.rays(points_px)
+        if self.shift is None:
+            return rays
+        plane = rays[..., :2] - self.shift_at(time_s)
+        return np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
+
+    def project(self, rays: Array, time_s: Any) -> Array:
+        """Pixels (..., 2) at which rays (..., 3) in camera axes are seen at times (...)."""
+        if self.shift is not None:
+            plane = rays[..., :2] / rays[..., 2:] + self.shift_at(time_s)
+            rays = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
+        points_px = self.lens.project(rays)
+        if self.focal_drift_per_s:
+            points_px = self._about_centre(points_px, self._focal_scale(time_s))
+        return points_px
+
+    def shift_at(self, time_s: Any) -> Array:
+        """The stabiliser's shift (..., 2) at times (...), units of the focal length."""
+        if self.shift is None or self.shift_time_s is None:
+            return np.zeros((*np.shape(time_s), 2))
+        return np.stack([np.interp(time_s, self.shift_time_s, self.shift[:, i]) for i in (0, 1)], axis=-1)
+
+    def between(self, start_s: float, end_s: float) -> MovingLens:
+        """The same lens with the stabiliser's path cut to what covers [start_s, end_s]."""
+        if self.shift_time_s is None or self.shift is None:
+            return self
+        first = max(int(np.searchsorted(self.shift_time_s, start_s, side="right")) - 1, 0)
+        last = int(np.searchsorted(self.shift_time_s, end_s)) + 1
+        return replace(self, shift_time_s=self.shift_time_s[first:last], shift=self.shift[first:last])
+
+    def _focal_scale(self, time_s: Any) -> Array:
+        return 1.0 + self.focal_drift_per_s * np.asarray(time_s, float)[..., None]
+
+    def _about_centre(self, points_px: Array, scale: Array) -> Array:
+        centre = np.array([self.lens.cx_px, self.lens.cy_px])
+        return centre + (np.asarray(points_px, float) - centre) * scale
+
+
+def moving_lens(trajectory: Trajectory, profile: CameraProfile) -> MovingLens:
+    """The profile's lens along a motion; the stabiliser is at rest at the trajectory's first knot.
+
+    Let the trajectory begin :func:`settling_time_s` before the first time of interest, or where the log begins.
+    Raises ValueError without a focal length.
+    """
+    if profile.intrinsics is None:
+        raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
+    extensions = profile.extensions
+    if not extensions.stabilisation_fraction:
+        return MovingLens(profile.intrinsics, extensions.focal_drift_per_s)
+    time_s = _shift_grid(*trajectory.span_s)
+    shift = stabiliser_shift(
+        time_s, trajectory.rate_rad_s(time_s), extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
+    )
+    return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift)
+
+
+def _shift_grid(start_s: float, end_s: float) -> Array:
+    """Whole multiples of the step, and both ends: parts of a log share their grid, and so every digit."""
+    first, last = int(np.floor(start_s / SHIFT_STEP_S)) + 1, int(np.ceil(end_s / SHIFT_STEP_S))
+    return np.concatenate([[start_s], SHIFT_STEP_S * np.arange(first, last), [end_s]])
+
+
+def settling_time_s(profile: CameraProfile) -> float:
+    """How long before a picture the inertial data must begin, for the stabiliser's place not to depend on it."""
+    extensions = profile.extensions
+    if not extensions.stabilisation_fraction:
+        return 0.0
+    return SETTLED / (2 * np.pi * max(extensions.stabilisation_cutoff_hz, 1e-9))
+
+
+def stabiliser_shift(time_s: Array, rate_cam_rad_s: Array, fraction: float, cutoff_hz: float) -> Array:
+    """Shift (n, 2) in units of the focal length: x += fraction θ_y, y −= fraction θ_x, at rest at the first time.
+
+    θ' = ω − 2π cutoff θ, solved exactly for a rate (n, 3), camera axes, that is linear between the times (n,).
+    """
+    step_s = np.diff(time_s)
+    decayed = 2 * np.pi * cutoff_hz * step_s
+    mean, ramp = _exponential_means(decayed)
+    rate = rate_cam_rad_s[:, :2]
+    drive = step_s[:, None] * ((mean - ramp)[:, None] * rate[:-1] + ramp[:, None] * rate[1:])
+    theta = _running_response(np.exp(-decayed), drive)
+    return fraction * np.stack([theta[:, 1], -theta[:, 0]], axis=-1)
+
+
+def _exponential_means(x: Array) -> tuple[Array, Array]:
+    """∫₀¹ e^(−x (1 − u)) du and ∫₀¹ u e^(−x (1 − u)) du: what a constant and a rising rate leave after a step."""
+    safe = np.where(x > _SMALL, x, 1.0)
+    mean = np.where(x > _SMALL, -np.expm1(-safe) / safe, 1 - x / 2 + x * x / 6)
+    ramp = np.where(x > _SMALL, (1 + np.expm1(-safe) / safe) / safe, 0.5 - x / 6 + x * x / 24)
+    return mean, ramp
+
+
+def _running_response(decay: Array, drive: Array) -> Array:
+    """θ[0] = 0, θ[k + 1] = decay[k] θ[k] + drive[k], by doubling: log2(n) vectorised passes. Returns (n + 1, 2)."""
+    value = np.concatenate([np.zeros((1, drive.shape[1])), drive])
+    kept = np.concatenate([[0.0], decay])
+    reach = 1
+    while reach < len(kept):
+        value[reach:] = value[reach:] + kept[reach:, None] * value[:-reach]
+        kept[reach:] = kept[reach:] * kept[:-reach]
+        reach *= 2
+    return value

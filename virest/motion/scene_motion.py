@@ -1,0 +1,94 @@
+"""What a gyroscope leaves open of the camera's path and of the scene: unknowns that ride along in every fit.
+
+Two descriptions.  `InertialMotion`: the accelerometer tells the path but for velocity, gravity, its own bias and delay,
+and the scene is a plane in metres: a vector with priors for a Gauss-Newton fit.  `DirectedMotion`: no accelerometer; only
+the direction of travel is used, and points are judged across the parallax that it gives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+VELOCITY_STD_M_S = 1.0
+GRAVITY_STD_M_S2 = 0.6
+ACCEL_BIAS_STD_M_S2 = 0.15
+ACCEL_DELAY_STD_S = 0.004
+PLANE_STD_PER_M = 1.5
+
+@dataclass(frozen=True, slots=True)
+class InertialMotion:
+    """Path by the accelerometer; world axes of the trajectory, windows of a few seconds."""
+
+    velocity_m_s: Array
+    """(windows, 3) of the IMU at each window's middle."""
+    gravity_m_s2: Array
+    """(3,) pointing down, about 9.81 long."""
+    accel_bias_m_s2: Array
+    """(3,) IMU axes."""
+    accel_delay_s: float
+    """By which accelerations are older than their stamps say."""
+    plane_per_m: Array
+    """(windows, 3) m of the scene's plane m · X = 1, origin at the camera's centre at the window's middle."""
+
+    @property
+    def windows(self) -> int:
+        """Number of windows."""
+        return len(self.velocity_m_s)
+
+    def vector(self) -> Array:
+        """Gravity, bias, delay, then velocity and plane of each window: (7 + 6 windows,)."""
+        own = np.concatenate([self.velocity_m_s, self.plane_per_m], axis=-1)
+        return np.concatenate([self.gravity_m_s2, self.accel_bias_m_s2, [self.accel_delay_s], own.ravel()])
+
+    def with_vector(self, vector: Array) -> InertialMotion:
+        """The motion of such a vector."""
+        own = vector[7:].reshape(-1, 6)
+        return InertialMotion(own[:, :3], vector[:3], vector[3:6], float(vector[6]), own[:, 3:])
+
+    def prior_std(self) -> Array:
+        """How far each entry may lie from where the fit began."""
+        own = [VELOCITY_STD_M_S] * 3 + [PLANE_STD_PER_M] * 3
+        shared = [GRAVITY_STD_M_S2] * 3 + [ACCEL_BIAS_STD_M_S2] * 3 + [ACCEL_DELAY_STD_S]
+        return np.array(shared + own * self.windows)
+
+    def limits(self) -> Array:
+        """Largest change of each entry in one step."""
+        return np.array([0.5] * 3 + [0.3] * 3 + [0.004] + ([0.5] * 3 + [0.5] * 3) * self.windows)
+
+
+@dataclass(frozen=True, slots=True)
+class DirectedMotion:
+    """Path without an accelerometer: only which way the camera goes, in the trajectory's world axes.
+
+    Depths being unknown, parallax may move a point by any amount along its direction; what lies across is judged.
+    """
+
+    direction: Array
+    """(groups, 3) unit vectors; one for the whole capture (a vehicle), or one for each pair."""
+
+    def vector(self) -> Array:
+        """Nothing that a step could change: directions are found anew between descents."""
+        return np.zeros(0)
+
+    def with_vector(self, vector: Array) -> DirectedMotion:
+        """The same motion."""
+        return self
+
+    def prior_std(self) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def limits(self) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def group(self, pair: NDArray[np.intp]) -> NDArray[np.intp]:
+        """(n,) which direction each point's pair has."""
+        return np.zeros_like(pair) if len(self.direction) == 1 else pair
+
+
+Motion = InertialMotion | DirectedMotion
