@@ -1,9 +1,24 @@
-"""Kalibr's camera chain as a profile."""
+"""Kalibr's files, read and written."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import yaml
 
-from virest.camera.kalibr import is_kalibr, parse_camchain
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.kalibr import (
+    ImuNoise,
+    format_camchain,
+    format_imu,
+    is_kalibr,
+    measure_imu_noise,
+    parse_camchain,
+    parse_imu,
+)
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import Shutter
 from virest.capture.profile_source import read_any_profile
 from virest.errors import SettingsError
 
@@ -52,3 +67,161 @@ def test_our_own_profile_is_no_camchain():
     """A profile of ours is never taken for a camera chain."""
     assert is_kalibr(CHAIN)
     assert not is_kalibr({"virest_profile": 1})
+
+
+# ── written ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+LENS = Intrinsics(1280, 720, 911.0, 913.5, 640.25, 361.75, "radtan", (0.11, -0.23, 0.0013, -0.0024, 0.0))
+PROFILE = CameraProfile(
+    1280,
+    720,
+    intrinsics=LENS,
+    shutter=Shutter(0.0217, "top_to_bottom"),
+    r_cam_imu=((0.0, -1.0, 0.0), (-0.6, 0.0, 0.8), (-0.8, 0.0, -0.6)),
+    p_cam_imu_m=(0.011, -0.023, 0.0034),
+    time_offset_s=-0.0173,
+)
+
+
+def reread(text: str) -> CameraProfile:
+    """Parse what was written."""
+    return parse_camchain(yaml.safe_load(text))
+
+
+def comments(text: str) -> str:
+    """Everything that is a comment."""
+    return "\n".join(line for line in text.splitlines() if line.startswith("#"))
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        LENS,
+        replace(LENS, model="none", coefficients=()),
+        replace(LENS, model="fisheye", coefficients=(0.02, -0.013, 0.0057, -0.0011)),
+    ],
+    ids=["radtan", "none", "fisheye"],
+)
+def test_a_camchain_that_was_written_reads_back_the_same(lens):
+    """Lens, pose, offset and a readout from top to bottom survive the way to Kalibr and back."""
+    back = reread(format_camchain(replace(PROFILE, intrinsics=lens)))
+    assert back.intrinsics == lens
+    assert back.p_cam_imu_m == PROFILE.p_cam_imu_m
+    assert back.time_offset_s == PROFILE.time_offset_s
+    assert back.shutter.readout_time_s == pytest.approx(0.0217, rel=1e-12)
+    assert back.shutter.readout_direction == "top_to_bottom"
+    np.testing.assert_allclose(back.rotation_cam_imu, PROFILE.rotation_cam_imu, atol=1e-12)
+
+
+def test_the_line_delay_is_the_readout_of_one_row():
+    """21.7 ms over 720 rows, in nanoseconds."""
+    camera = yaml.safe_load(format_camchain(PROFILE))["cam0"]
+    assert camera["line_delay_nanoseconds"] == pytest.approx(30138.889, rel=1e-6)
+
+
+@pytest.mark.parametrize("direction", ["bottom_to_top", "left_to_right", "right_to_left"])
+def test_a_readout_that_kalibr_does_not_know_is_said_and_its_middle_kept(direction):
+    """Such a shutter becomes a global one that sees the picture when its middle row is read, with a comment."""
+    text = format_camchain(replace(PROFILE, shutter=Shutter(0.0217, direction)))
+    assert direction in comments(text)
+    assert "line_delay_nanoseconds" not in yaml.safe_load(text)["cam0"]
+    back = reread(text)
+    assert not back.readout_known
+    assert back.time_offset_s == pytest.approx(-0.0173 + 0.0217 / 2)
+
+
+def test_a_stamp_of_the_exposure_s_end_is_brought_to_its_start():
+    """Kalibr's chain is read as exposure_start: the shift takes one true exposure away, and the comment says more."""
+    shutter = replace(PROFILE.shutter, timestamp="exposure_end", exposure_scale=1.5)
+    text = format_camchain(replace(PROFILE, shutter=shutter), exposure_s=0.008)
+    assert reread(text).time_offset_s == pytest.approx(-0.0173 - 0.012)
+    assert "6 ms later" in comments(text)
+
+
+def test_what_is_lost_is_named_in_comments():
+    """Curve, clock rate, bias, a third radial coefficient and extensions have no place in a camera chain."""
+    rich = replace(
+        PROFILE,
+        intrinsics=replace(LENS, coefficients=(0.11, -0.23, 0.0013, -0.0024, 0.031)),
+        clock_skew=2e-4,
+        gyro_bias_rad_s=(0.01, -0.02, 0.003),
+        response=ResponseCurve("srgb"),
+        extensions=Extensions(focal_drift_per_s=0.01),
+    )
+    said = comments(format_camchain(rich))
+    for word in ("k3: 0.031", "clock_skew", "gyro_bias_rad_s", "srgb", "extensions"):
+        assert word in said
+    plain = comments(format_camchain(PROFILE))
+    assert not any(word in plain for word in ("clock_skew", "gyro_bias_rad_s", "exposure curve", "extensions"))
+
+
+def test_unknown_values_are_left_out_and_an_unknown_lens_is_refused():
+    """Neither an offset nor a readout is made up; a chain without focal length cannot be."""
+    back = reread(format_camchain(replace(PROFILE, time_offset_s=None, readout_known=False, shutter=Shutter())))
+    assert back.time_offset_s is None
+    assert not back.readout_known
+    with pytest.raises(SettingsError, match="focal length"):
+        format_camchain(replace(PROFILE, intrinsics=None))
+
+
+# ── imu.yaml ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+NOISE = ImuNoise(198.5, 1.7e-4, 2.3e-3, 3.1e-6, 7.7e-5, "/phone/imu")
+
+
+def test_imu_yaml_reads_back_what_was_written():
+    """Five numbers and the topic, with tiny ones that YAML 1.1 would read as text."""
+    assert parse_imu(yaml.safe_load(format_imu(NOISE))) == NOISE
+
+
+def test_kalibr_s_own_result_is_read_too():
+    """Kalibr writes the same keys below ``imu0``, beside keys that mean nothing here."""
+    block = {"T_i_b": [[1, 0, 0, 0]], "gyroscope_noise_density": "1e-4", "update_rate": 400, "rostopic": "/imu"}
+    read = parse_imu({"imu0": block})
+    assert (read.update_rate_hz, read.gyro_density, read.accel_density, read.topic) == (400.0, 1e-4, None, "/imu")
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({"gyroscope_noise_density": 1e-4}, "update_rate"),
+        ({"update_rate": 0}, "update_rate"),
+        ({"update_rate": 200, "accelerometer_noise_density": "loud"}, "accelerometer_noise_density"),
+        ({"update_rate": True}, "update_rate"),
+        ({"imu0": [1, 2]}, "imu0"),
+    ],
+)
+def test_a_faulty_imu_yaml_is_refused_by_its_key(content, says):
+    """Missing, zero, and not a number: the key is named."""
+    with pytest.raises(SettingsError, match=says):
+        parse_imu(content)
+
+
+def test_an_unknown_walk_gets_a_usual_value_and_says_so_an_unknown_density_stays_out():
+    """Kalibr needs the walks, which no short capture can tell; the density of a missing accelerometer is not made up."""
+    text = format_imu(ImuNoise(100.0, 1e-4, None))
+    content = yaml.safe_load(text)
+    assert content["gyroscope_random_walk"] > 0
+    assert "not measured" in text
+    assert "accelerometer_noise_density" not in content
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 400.0])
+def test_noise_is_measured_under_a_hand_s_motion(rng, rate_hz):
+    """White noise on turns of up to 2 rad/s at 3 Hz is found to a tenth, whatever the rate."""
+    time_s = np.arange(int(12 * rate_hz)) / rate_hz
+    swing = np.exp(-((time_s - 4) ** 2) / 8)[:, None] * np.sin(2 * np.pi * 3 * time_s[:, None] + [0.0, 1.0, 2.0])
+    gyro = 2 * swing + rng.normal(0, 0.003, swing.shape)
+    accel = 3 * swing + [0, 9.8, 0] + rng.normal(0, 0.04, swing.shape)
+    found = measure_imu_noise(time_s, gyro, accel)
+    assert found.update_rate_hz == pytest.approx(rate_hz)
+    assert found.gyro_density == pytest.approx(0.003 / np.sqrt(rate_hz), rel=0.1)
+    assert found.accel_density == pytest.approx(0.04 / np.sqrt(rate_hz), rel=0.1)
+
+
+def test_noise_of_what_is_not_there_is_unknown(rng):
+    """Too few samples give nothing; without accelerometer its density is unknown."""
+    time_s = np.arange(400) / 200
+    gyro = rng.normal(0, 0.01, (400, 3))
+    assert measure_imu_noise(time_s[:20], gyro[:20], gyro[:20]) is None
+    assert measure_imu_noise(time_s, gyro, np.full((400, 3), np.nan)).accel_density is None

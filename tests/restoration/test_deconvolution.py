@@ -205,3 +205,14 @@ def test_solvers_leave_their_input_alone(rng: np.random.Generator) -> None:
     hyper_laplacian(observed, apply, adjoint, start, weight, slope, 10.0, 1.0, (1.0, 4.0), 3)
     np.testing.assert_array_equal(observed, before[0])
     np.testing.assert_array_equal(start, before[1])
+
+
+def test_over_relaxed_steps_of_richardson_lucy_get_further(rng: np.random.Generator) -> None:
+    """As many steps, each 1.7 times as far, come nearer to the data, and the light stays positive."""
+    matrix, apply, adjoint = _matrix(rng)
+    sharp = rng.uniform(0.1, 2.0, (1, matrix.shape[1])).astype(np.float32)
+    observed, weight = apply(sharp), np.ones((1, matrix.shape[0]), np.float32)
+    start = np.ones_like(sharp)
+    plain, far = (richardson_lucy(observed, apply, adjoint, start, weight, 8, r) for r in (1.0, 1.7))
+    assert np.abs(apply(far) - observed).sum() < np.abs(apply(plain) - observed).sum()
+    assert far.min() > 0

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from virest.degradation.blur import tile_grid
 from virest.restoration.statistics import packed_frequency
-from virest.restoration.tiles import TileDeconvolution, doubled, gradient_power, inverse_filter, wiener_filter
+from virest.restoration.tiles import (
+    TileDeconvolution,
+    doubled,
+    gradient_power,
+    inverse_filter,
+    quick_grid,
+    wiener_filter,
+)
 
 SIZES = [16, 64, 96, 144]
 
@@ -115,3 +122,56 @@ def test_each_tile_is_restored_by_its_own_kernel() -> None:
 def test_the_inverse_is_held_where_nothing_passes() -> None:
     """The naive inverse stays finite where the kernel cancels, and is exact where it passes."""
     np.testing.assert_allclose(inverse_filter(np.array([0.0, 1e-6, 0.25], np.float32)), [1000, 1000, 4], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width", "margin"), [(480, 640, 16), (1280, 720, 23), (360, 640, 8), (90, 70, 41)])
+def test_quick_tiles_cover_the_picture_and_fill_their_transforms(height: int, width: int, margin: int) -> None:
+    """The grid reaches every pixel, with tiles near the side asked for and windows that sum to one."""
+    grid = quick_grid(height, width, 120, margin, 5)
+    total = np.zeros((grid.tops[-1] + grid.side, grid.lefts[-1] + grid.side))
+    for (top, left), window in zip(grid.corners(), grid.windows(), strict=True):
+        total[top : top + grid.side, left : left + grid.side] += window
+    np.testing.assert_allclose(total[:height, :width], 1, atol=1e-6)
+    assert 0.8 * 120 <= grid.side <= 1.15 * 120
+
+
+def _lamp_behind_a_blur() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Make a lamp of twelve times full light in a dim scene, as it is, as blurred by a stroke, and its kernel."""
+    sharp = (0.1 + 0.2 * texture(150, 210)).astype(np.float32)
+    sharp[70:76, 101:109] = 12.0
+    kernel = np.zeros((17, 17), np.float32)
+    cv2.line(kernel, (3, 5), (14, 11), 1.0)
+    kernel /= kernel.sum()
+    return sharp, cv2.filter2D(sharp, cv2.CV_32F, kernel), kernel
+
+
+def test_a_settled_tile_knows_a_clipped_lamp_from_its_streak() -> None:
+    """Where the streak was clipped, the lamp comes back and the dark beside it; other tiles are filtered as before."""
+    sharp, blurred, kernel = _lamp_behind_a_blur()
+    recorded = np.minimum(blurred, 1)
+    grid = tile_grid(*sharp.shape, 64, 16)
+    deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], len(grid.centres_px), 0), 16)
+    holes = (recorded >= 1).astype(np.float32)
+    numbers = deconvolution.touched(holes)
+    assert 0 < len(numbers) < len(grid.centres_px)
+    deconvolution.settle(numbers, np.repeat(kernel[None], len(numbers), 0), recorded, 1 - holes)
+    ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
+    restored = deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(recorded), ratio, ratio))
+    near = np.s_[55:91, 85:125]
+    before, after = (np.abs(np.minimum(p, 1) - np.minimum(sharp, 1))[near].mean() for p in (recorded, restored))
+    assert after < 0.5 * before
+    assert restored.min() > -0.05, "no dark ring beside the lamp"
+    far = np.s_[20:130, 10:40]
+    assert np.abs(restored - sharp)[far].mean() < np.abs(recorded - sharp)[far].mean()
+
+
+def test_tiles_that_see_no_hole_are_not_touched() -> None:
+    """A hole touches the tiles whose margins reach it, and an empty mask none."""
+    grid = tile_grid(100, 300, 64, 16)
+    deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16)
+    holes = np.zeros((100, 300), np.float32)
+    assert deconvolution.touched(holes) == []
+    holes[20, 70] = 1
+    corners = list(grid.corners())
+    expected = [n for n, (top, left) in enumerate(corners) if top - 16 <= 20 < top + 80 and left - 16 <= 70 < left + 80]
+    assert deconvolution.touched(holes) == expected

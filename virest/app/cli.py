@@ -24,6 +24,15 @@ from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHU
 log = logging.getLogger(__name__)
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
+CALIBRATED_EXTRAS = (
+    "focal",
+    "distortion",
+    "principal-point",
+    "gyro-scale",
+    "clock-skew",
+    "exposure-scale",
+    "frame-lag",
+)
 CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
 USAGE = 2
 INTERRUPTED = 130
@@ -347,6 +356,50 @@ def simulate(
     return 0
 
 
+@app.command()
+def calibrate(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
+    config: Config = None,
+    extra: Annotated[
+        list[str] | None,
+        typer.Option("--with", metavar="NAME,...", help=f"Fit these too: {', '.join(CALIBRATED_EXTRAS)}."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The calibrated profile goes here.")] = Path(
+        "camera.yaml"
+    ),
+    kalibr: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write Kalibr's camchain-imucam.yaml and imu.yaml in here too.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Fit time offset, readout, IMU-camera rotation and gyroscope bias to an ordinary capture.
+
+        \b
+        $ virest calibrate shaken --with focal
+    SESSION
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    _one_thread_each()
+    from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
+
+    names = _parse_extras(extra or [])
+    output = CalibrationOutput(out, kalibr, overwrite)
+    output.require()
+    plan = plan_calibration(capture, config, names)
+    with console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
+        facts, text = run_calibration(plan, output, bar.update if bar else None)
+    if json:
+        from virest.app.outputs import json_line
+
+        text = json_line(facts)
+    console.emit(text)
+    return 0
+
+
 @app.command("calibrate-curve")
 def calibrate_curve(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture.")],
@@ -390,6 +443,16 @@ def calibrate_curve(
 
 
 # ── help for the commands ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _parse_extras(options: list[str]) -> tuple[str, ...]:
+    """Names of ``--with``, each once; every option may hold several, separated by commas."""
+    from virest.app.calibrate import unknown_extra
+
+    names = tuple(dict.fromkeys(name.strip() for option in options for name in option.split(",") if name.strip()))
+    for complaint in filter(None, map(unknown_extra, names)):
+        raise typer.BadParameter(f"--with {complaint}")
+    return names
 
 
 def _capture_paths(captures: list[str]) -> list[str]:

@@ -1,6 +1,6 @@
 """`virest calibrate`: clock, readout, axes, bias and lens of a phone from an ordinary capture, without a target.
 
-Coarse: turns of the pictures against the gyroscope's, at every offset within a second and for any axes.  Then one robust
+Coarse: turns of the pictures against the gyroscope's, at every offset within a second, for any axes.  Then one robust
 fit over tracked points, each at its own row's time, first on few points to find the axis and sense of the readout and
 what the camera's translation needs, then on many with everything that was asked for.
 """
@@ -13,16 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
 from virest.errors import CalibrationError
 from virest.motion import profile_terms as terms_of
-from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely
+from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
 from virest.motion.observed_tracks import ObservedTracks, observe_tracks
-from virest.motion.scene_motion import FreeMotion, InertialMotion, Motion, free_motion
-from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
+from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
+from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
 from virest.motion.track_model import TrackTable, ground
 from virest.motion.tracking import TrackPair
 
@@ -42,11 +44,12 @@ EXPLAINED_SCALE = 1.15
 """Whitened differences of this size need no translation."""
 TRANSLATION_GAIN = 0.97
 """A translation stays if it brings the differences below this part."""
-FREE_GAIN = 0.8
-"""A free path replaces the accelerometer's only below this part of what that leaves."""
+ONE_DIRECTION = 1.15
+"""One direction of travel for the whole capture stays if it leaves less than this many times what one a pair leaves."""
 DIRECTION_COST = 12.0
 """Readouts along rows and along columns are told apart from this difference in cost, in units of its own noise."""
 OUTLIER_WEIGHT = 0.1
+ASTRAY_PASSES = 3
 MANY_OUTLIERS = 0.1
 STABILISER_SIGMA, STABILISER_FRACTION, STABILISER_GAIN = 6.0, 0.1, 0.9
 LARGE_CORRELATION = 0.9
@@ -74,19 +77,21 @@ MAX_STD = {
     "exposure_time": 0.25,
 }
 """Values known no better than this are not determined and stay where they were."""
+TYPICAL_NOISE_PX, LEAST_NOISE_PX = 0.15, 0.06
 FLOOR_STD = {
     "time_offset": 2.5e-5,
-    "readout_time": 4e-5,
-    "imu_rotation": 3e-4,
+    "imu_rotation": 2.5e-4,
     "gyro_bias": 2e-4,
-    "focal_length": 8e-4,
+    "focal_length": 7e-4,
     "radial_distortion": 7e-4,
     "principal_point": 0.15,
-    "gyro_scale": 8e-4,
+    "gyro_scale": 7e-4,
     "clock_skew": 1e-5,
     "exposure_time": 0.03,
 }
-"""Tracking's own bias under changing blur and the codec's: 0.1 % of the motion, some 20 µs late."""
+READOUT_FLOOR = 0.0035
+"""Biases of tracking under changing blur and of the codec, which no statistics of one capture show, at a typical noise
+of 0.15 px; they grow with it.  The readout's is a part of itself: predicted blocks shear less than rows do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +117,7 @@ class GeometryCalibration:
     correlations: tuple[tuple[str, str, float], ...]
     """Pairs of values whose errors go together by more than 0.9."""
     translation: str
-    """``none``, ``inertial`` (the accelerometer's path before a plane) or ``free`` (a path without accelerometer)."""
+    """``none``, ``inertial`` (the accelerometer's path before a plane) or ``direction`` (points judged across it)."""
     residual_px: float
     """Robust standard deviation per coordinate of tracked minus predicted points."""
     noise_px: float
@@ -156,9 +161,9 @@ def calibrate_geometry(
     """
     say = progress or (lambda _: None)
     observed = observe_tracks(capture, pairs, profile)
-    coarse = _require_coarse(observed, capture.imu, profile)
+    coarse, skew = _require_coarse(observed, capture.imu, profile, "clock-skew" in extra)
     unknown_focal = profile.intrinsics is None
-    start = _started(profile, observed, coarse)
+    start = replace(_started(profile, observed, coarse), clock_skew=skew)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(f"{len(observed.pairs)} pairs of frames lie inside the inertial data")
@@ -170,16 +175,31 @@ def calibrate_geometry(
     wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS]
     names = list(dict.fromkeys([*extra, *(["focal"] if unknown_focal else [])]))
     wanted += [OPTIONAL[name] for name in names if name in OPTIONAL]
-    table = observed.table(MANY_POINTS)
-    fit = fit_tracks(capture.imu, table, rough.profile, wanted, _grown(rough, capture.imu, table))
+    left_out = 0.0
+    for _ in range(ASTRAY_PASSES):
+        table = observed.table(MANY_POINTS)
+        fit = fit_tracks(capture.imu, table, rough.profile, wanted, _for_table(rough.scene, table))
+        observed, astray = observed.without_astray(table.first_px, fit.distance)
+        left_out += (1 - left_out) * astray
+        if not astray:
+            break
     say("joint")
-    return _conclude(capture, profile, start, observed, coarse, rough, fit)
+    return _conclude(profile, start, observed, coarse, rough, fit, left_out)
+
+
+def _for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
+    """The motion for a table whose pairs may be others."""
+    if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
+        return many_directions(table)
+    return scene
 
 
 # ── coarse ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _require_coarse(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> CoarseAlignment:
+def _require_coarse(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, free_skew: bool
+) -> tuple[CoarseAlignment, float]:
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(
             f"{len(observed.pairs)} pairs of frames have enough points to follow, {MIN_PAIRS} are needed",
@@ -187,7 +207,10 @@ def _require_coarse(observed: ObservedTracks, imu: ImuSamples, profile: CameraPr
         )
     if len(imu) < 8:
         raise CalibrationError(f"{len(imu)} gyroscope samples", hint="check gyro_accel.csv")
-    coarse = align_coarsely(observed.turns(profile), imu, profile)
+    turns, skew = observed.turns(profile), profile.clock_skew
+    coarse = align_coarsely(turns, imu, profile)
+    if free_skew and (found := align_with_skew(turns, imu, profile)) is not None:
+        coarse, skew = found
     if coarse is None:
         raise CalibrationError(
             "the inertial data cover the frames at no offset within a second", hint="check the clocks by virest inspect"
@@ -201,7 +224,7 @@ def _require_coarse(observed: ObservedTracks, imu: ImuSamples, profile: CameraPr
     least = min(MIN_EXPLAINED + MIN_EXPLAINED_BY_PAIR / len(observed.pairs), MAX_MIN_EXPLAINED)
     if coarse.explained < least:
         raise CalibrationError(
-            f"the pictures do not follow the gyroscope: at best it explains {max(coarse.explained, 0):.0%} of their turns",
+            f"the pictures do not follow the gyroscope: it explains {max(coarse.explained, 0):.0%} of their turns",
             hint="stabilised in the camera, or not of this recording?",
         )
     if coarse.at_end:
@@ -211,10 +234,10 @@ def _require_coarse(observed: ObservedTracks, imu: ImuSamples, profile: CameraPr
         )
     if 1 - coarse.runner_up < MIN_DISTINCT * (1 - coarse.explained):
         raise CalibrationError(
-            f"offsets of {coarse.time_offset_s:+.3f} and {coarse.runner_up_s:+.3f} s explain the pictures about equally",
+            f"offsets of {coarse.time_offset_s:+.3f} and {coarse.runner_up_s:+.3f} s fit the pictures about equally",
             hint="move less regularly",
         )
-    return coarse
+    return coarse, skew
 
 
 def _started(profile: CameraProfile, observed: ObservedTracks, coarse: CoarseAlignment) -> CameraProfile:
@@ -263,42 +286,35 @@ def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
 
 
 def _fit_with_translation(imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term]) -> TrackFit:
-    """The simplest translation that explains the points: none, the accelerometer's, or a free one."""
+    """The simplest translation that explains the points: none, the accelerometer's, or a direction of travel."""
     plain = fit_tracks(imu, table, start, wanted)
-    best = plain
     if plain.scale < EXPLAINED_SCALE:
         return plain
     known = ground(imu, start, translation=True)
     if known.displacement is not None:
         scene = start_scene(imu, known, table, START_INVERSE_DEPTH_PER_M)
         inertial = fit_tracks(imu, table, start, wanted, scene)
-        best = inertial if inertial.scale < TRANSLATION_GAIN * plain.scale else plain
-    if best.scale < EXPLAINED_SCALE:
-        return best
-    span = np.asarray(start.imu_time_s(np.array([table.first_stamp_s.min(), table.second_stamp_s.max()])))
-    free = fit_tracks(imu, table, start, wanted, free_motion(float(span[0]), float(span[1])))
-    log.debug("translation: none %.3f, accelerometer %.3f, free %.3f", plain.scale, best.scale, free.scale)
-    needed = FREE_GAIN if best is not plain else TRANSLATION_GAIN
-    return free if free.scale < needed * best.scale else best
-
-
-def _grown(rough: _Rough, imu: ImuSamples, table: TrackTable) -> Motion | None:
-    return rough.scene
+        return inertial if inertial.scale < TRANSLATION_GAIN * plain.scale else plain
+    many = fit_tracks(imu, table, start, wanted, many_directions(table))
+    one = fit_tracks(imu, table, start, wanted, one_direction())
+    log.debug("translation: none %.3f, one direction %.3f, one for each pair %.3f", plain.scale, one.scale, many.scale)
+    return one if one.scale < ONE_DIRECTION * many.scale else many
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _conclude(
-    capture: Capture,
     given: CameraProfile,
     start: CameraProfile,
     observed: ObservedTracks,
     coarse: CoarseAlignment,
     rough: _Rough,
     fit: TrackFit,
+    astray: float,
 ) -> GeometryCalibration:
-    variances = _variances(fit)
+    noise = float(np.median(observed.noise_px))
+    variances = _variances(fit, noise)
     determined = {term.name: bool(np.all(np.sqrt(variances[term.name]) <= MAX_STD[term.name])) for term in fit.terms}
     profile = right_way_round(_held_back(fit, given, start, determined))
     if not rough.direction_known and not determined["readout_time"]:
@@ -307,9 +323,8 @@ def _conclude(
     direction_known = rough.direction_known and determined["readout_time"]
     values = (*values[:2], _direction_value(given, profile, direction_known), *values[2:])
     profile = _with_estimates(profile, values)
-    noise = float(np.median(observed.noise_px))
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
-    notes = _notes(capture, coarse, fit, moving, observed, determined)
+    notes = _notes(coarse, fit, moving, astray, observed, determined)
     return GeometryCalibration(
         profile, values, _correlations(fit, variances), _translation(fit), _robust_px(fit), noise,
         _robust_px(rough.before), coarse.explained, moving, len(observed.pairs), observed.tracks, notes, fit,
@@ -336,9 +351,11 @@ def right_way_round(profile: CameraProfile) -> CameraProfile:
     )
 
 
-def _variances(fit: TrackFit) -> dict[str, Array]:
+def _variances(fit: TrackFit, noise_px: float) -> dict[str, Array]:
     """Variance of each term's values, with tracking's own bias; the offset is that of the first row read."""
-    found = {term.name: fit.std(term.name) ** 2 + FLOOR_STD[term.name] ** 2 for term in fit.terms}
+    floor = {**FLOOR_STD, "readout_time": READOUT_FLOOR * abs(fit.profile.shutter.readout_time_s)}
+    grown = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX
+    found = {term.name: fit.std(term.name) ** 2 + (grown * floor[term.name]) ** 2 for term in fit.terms}
     if "readout_time" in found:
         cross = fit.covariance[fit.slices["time_offset"], fit.slices["readout_time"]][0]
         first_row = found["time_offset"] + 0.25 * found["readout_time"] - cross
@@ -368,7 +385,7 @@ def _held_back(fit: TrackFit, given: CameraProfile, start: CameraProfile, determ
     return profile
 
 
-def _lens_held_back(profile: CameraProfile, given: CameraProfile, determined: dict[str, bool]):  # type: ignore[no-untyped-def]
+def _lens_held_back(profile: CameraProfile, given: CameraProfile, determined: dict[str, bool]) -> Intrinsics | None:
     lens, before = profile.intrinsics, given.intrinsics
     if before is None or lens is None:
         return before
@@ -434,8 +451,6 @@ def _value(
 
 
 def _rotation_vector(matrix: Array) -> list[float]:
-    from scipy.spatial.transform import Rotation
-
     return [float(v) for v in Rotation.from_matrix(matrix).as_rotvec()]
 
 
@@ -457,7 +472,7 @@ def _with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -
 def _translation(fit: TrackFit) -> str:
     if fit.scene is None:
         return "none"
-    return "inertial" if isinstance(fit.scene, InertialMotion) else "free"
+    return "inertial" if isinstance(fit.scene, InertialMotion) else "direction"
 
 
 def _robust_px(fit: TrackFit) -> float:
@@ -479,18 +494,20 @@ def _correlations(fit: TrackFit, variances: dict[str, Array]) -> tuple[tuple[str
 
 
 def _notes(
-    capture: Capture,
     coarse: CoarseAlignment,
     fit: TrackFit,
     moving: float,
+    astray: float,
     observed: ObservedTracks,
     determined: dict[str, bool],
 ) -> tuple[str, ...]:
     notes = []
     if coarse.axes_changed:
         notes.append("the profile's T_cam_imu does not fit: other axes were taken from the turns")
-    if isinstance(fit.scene, FreeMotion):
-        notes.append("the camera travels and no accelerometer tells how: its path was fitted freely")
+    if isinstance(fit.scene, DirectedMotion):
+        notes.append("the camera travels and no accelerometer tells how: points were judged across their parallax")
+    if astray:
+        notes.append(f"{astray:.0%} of the points lie in parts of the picture that go their own way, and were left out")
     if moving > MANY_OUTLIERS:
         notes.append(f"{moving:.0%} of the tracks do not go with the camera (moving objects, or a scene out of plane)")
     if not observed.exposure_known:

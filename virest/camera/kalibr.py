@@ -1,27 +1,64 @@
-"""Kalibr's ``camchain-imucam.yaml`` as a camera profile.
+"""Kalibr's ``camchain-imucam.yaml`` and ``imu.yaml``, read and written.
 
 Kalibr's conventions are ours where it speaks: ``x_cam = T_cam_imu x_imu`` and ``t_imu = t_cam + timeshift_cam_imu``.
-What it does not know (readout, curve) stays unknown; ``line_delay_nanoseconds`` of its rolling-shutter calibration
-gives the readout.
+What it does not know (curve, sideways readout, bias, clock rate) stays unknown when read, and becomes a comment when
+written; ``line_delay_nanoseconds`` of its rolling-shutter calibration is the readout time of one row, top to bottom.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-from virest.camera.profile import CameraProfile, parse_profile
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from virest.camera.intrinsics import COEFFICIENT_NAMES
+from virest.camera.profile import CameraProfile, Extensions, parse_profile
 from virest.errors import SettingsError
 
+Array = NDArray[np.float64]
 _DISTORTIONS = {
     "radtan": ("radtan", ("k1", "k2", "p1", "p2")),
     "equidistant": ("fisheye", ("k1", "k2", "k3", "k4")),
     "none": ("none", ()),
 }
+DEFAULT_TOPIC = "/imu0"
+USUAL_GYRO_WALK, USUAL_ACCEL_WALK = 2.2e-6, 8.6e-5
+"""Random walks of a phone's inertial sensor (BMI160, Schubert et al., IROS 2018), rad/s²/√Hz and m/s³/√Hz."""
+NOISE_WINDOW = 32
+"""Samples of a window whose liveliness is judged at once."""
+STILLEST_PART = 0.25
+MIN_NOISE_SAMPLES = 2 * NOISE_WINDOW
+THIRD_DIFFERENCE_GAIN = 20.0
+"""Variance of white noise's third difference: 1 + 9 + 9 + 1."""
+NORMAL_MEDIAN = 0.6745
+WALK_COMMENT = "not measured, which takes hours at rest: a usual value of phones"
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """What ``imu.yaml`` holds: continuous-time noise of an inertial sensor. None: unknown."""
+
+    update_rate_hz: float
+    gyro_density: float | None
+    """rad/s/√Hz."""
+    accel_density: float | None
+    """m/s²/√Hz."""
+    gyro_walk: float | None = None
+    """rad/s²/√Hz."""
+    accel_walk: float | None = None
+    """m/s³/√Hz."""
+    topic: str = DEFAULT_TOPIC
 
 
 def is_kalibr(content: dict[str, Any]) -> bool:
     """Whether a YAML mapping is a Kalibr camera chain: it has ``cam0`` and no ``virest_profile``."""
     return "cam0" in content and "virest_profile" not in content
+
+
+# ── read ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def parse_camchain(content: dict[str, Any], name: str = "camchain") -> CameraProfile:
@@ -59,6 +96,27 @@ def parse_camchain(content: dict[str, Any], name: str = "camchain") -> CameraPro
     )
 
 
+def parse_imu(content: dict[str, Any], name: str = "imu.yaml") -> ImuNoise:
+    """Read the noise of ``imu.yaml``, as Kalibr takes it (flat) or writes it (below ``imu0``).
+
+    Raises SettingsError with the key that is missing or not usable.
+    """
+    block = content.get("imu0", content)
+    if not isinstance(block, dict):
+        raise SettingsError(f"{name}: imu0 has no keys", hint="is it a Kalibr imu.yaml?")
+    rate_hz = _positive(block, "update_rate", name)
+    if rate_hz is None:
+        raise SettingsError(f"{name}: update_rate is missing", hint="is it a Kalibr imu.yaml?")
+    return ImuNoise(
+        rate_hz,
+        _positive(block, "gyroscope_noise_density", name),
+        _positive(block, "accelerometer_noise_density", name),
+        _positive(block, "gyroscope_random_walk", name),
+        _positive(block, "accelerometer_random_walk", name),
+        str(block.get("rostopic", DEFAULT_TOPIC)),
+    )
+
+
 def _distortion(camera: dict[str, Any], name: str) -> dict[str, Any]:
     kind = camera.get("distortion_model", "none")
     if kind not in _DISTORTIONS:
@@ -74,3 +132,169 @@ def _numbers(camera: dict[str, Any], key: str, count: int, name: str) -> list[fl
     if not usable:
         raise SettingsError(f"{name}: cam0.{key} must be {count} numbers", hint="is it a Kalibr camchain?")
     return [float(v) for v in values]  # type: ignore[union-attr]
+
+
+def _positive(block: dict[str, Any], key: str, name: str) -> float | None:
+    value = block.get(key)
+    if value is None:
+        return None
+    try:
+        # YAML 1.1 reads 1e-3 as text
+        number = float(value)
+    except (TypeError, ValueError):
+        number = 0.0
+    if isinstance(value, bool) or not 0 < number < float("inf"):
+        raise SettingsError(f"{name}: {key} must be a positive number, got {str(value)[:40]!r}")
+    return number
+
+
+# ── write ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def format_camchain(profile: CameraProfile, exposure_s: float | None = None) -> str:
+    """Write a profile as a camera chain of one camera; what Kalibr cannot hold is said in comments.
+
+    exposure_s: typical logged exposure, for stamps that do not mean its start.  Of a readout that is not top to bottom
+    Kalibr knows nothing: the time shift then is that of the picture's middle row, as for a global shutter.  Raises
+    SettingsError where the focal length is unknown.
+    """
+    lens = profile.intrinsics
+    if lens is None:
+        raise SettingsError("Kalibr's camchain needs a focal length", hint="calibrate with --with focal")
+    model, names = next((kalibr, own) for kalibr, (ours, own) in _DISTORTIONS.items() if ours == lens.model)
+    coefficients = dict(zip(COEFFICIENT_NAMES[lens.model], lens.coefficients, strict=True))
+    camera: dict[str, Any] = {
+        "T_cam_imu": _pose(profile),
+        "cam_overlaps": [],
+        "camera_model": "pinhole",
+        "distortion_coeffs": [coefficients[name] for name in names],
+        "distortion_model": model,
+        "intrinsics": [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px],
+        "resolution": [profile.width, profile.height],
+        "rostopic": "/cam0/image_raw",
+    }
+    if _has_line_delay(profile):
+        camera["line_delay_nanoseconds"] = 1e9 * profile.shutter.readout_time_s / profile.height
+    if profile.time_offset_s is not None:
+        camera["timeshift_cam_imu"] = profile.time_offset_s + _shift_for_kalibr_s(profile, exposure_s)
+    comments = [
+        "Kalibr camera chain, written by virest calibrate",
+        *_not_held(profile, coefficients, names, exposure_s),
+    ]
+    return _commented(comments) + yaml.safe_dump({"cam0": camera}, default_flow_style=None, width=110)
+
+
+def format_imu(noise: ImuNoise) -> str:
+    """Write noise as Kalibr's ``imu.yaml``, which needs every value: a usual random walk stands in for an unknown one.
+
+    An unknown density is left out with a comment, for Kalibr to ask for it.
+    """
+    entries: list[tuple[str, float | None, str]] = [
+        ("accelerometer_noise_density", noise.accel_density, "m/s^2/sqrt(Hz)"),
+        ("accelerometer_random_walk", noise.accel_walk or USUAL_ACCEL_WALK, _walk("m/s^3/sqrt(Hz)", noise.accel_walk)),
+        ("gyroscope_noise_density", noise.gyro_density, "rad/s/sqrt(Hz)"),
+        ("gyroscope_random_walk", noise.gyro_walk or USUAL_GYRO_WALK, _walk("rad/s^2/sqrt(Hz)", noise.gyro_walk)),
+        ("update_rate", noise.update_rate_hz, "Hz"),
+    ]
+    lines = [
+        "# Kalibr inertial sensor, written by virest calibrate. The densities are those of the stillest quarter of the",
+        "# capture, above a hand's motion: a lower bound where the phone filters its data.",
+    ]
+    for key, value, remark in entries:
+        lines.append(f"# {key}: unknown" if value is None else f"{key}: {_digits(value)}  # {remark}")
+    return "\n".join([*lines, yaml.safe_dump({"rostopic": noise.topic}).strip()]) + "\n"
+
+
+def _walk(unit: str, value: float | None) -> str:
+    return unit if value else f"{unit}; {WALK_COMMENT}"
+
+
+def _digits(value: float) -> str:
+    return str(yaml.safe_dump(float(f"{value:.6g}"))).splitlines()[0]
+
+
+def _pose(profile: CameraProfile) -> list[list[float]]:
+    rows = [[*row, shift] for row, shift in zip(profile.r_cam_imu, profile.p_cam_imu_m, strict=True)]
+    return [*rows, [0.0, 0.0, 0.0, 1.0]]
+
+
+def _has_line_delay(profile: CameraProfile) -> bool:
+    return profile.readout_known and profile.shutter.readout_direction == "top_to_bottom"
+
+
+def _shift_for_kalibr_s(profile: CameraProfile, exposure_s: float | None) -> float:
+    """Seconds from what our stamp means to the instant that a camera chain's stamp means when we read it back."""
+    shutter = profile.shutter
+    to_start_s = float(shutter.first_row_start_s(np.zeros(1), np.array([exposure_s or 0.0]))[0])
+    return to_start_s if _has_line_delay(profile) else to_start_s + 0.5 * shutter.readout_time_s
+
+
+def _not_held(
+    profile: CameraProfile, coefficients: dict[str, float], names: tuple[str, ...], exposure_s: float | None
+) -> list[str]:
+    """Sentences on what is lost."""
+    shutter = profile.shutter
+    said = []
+    if not profile.readout_known:
+        said.append("the readout time is unknown: no line_delay_nanoseconds")
+    elif not _has_line_delay(profile):
+        said.append(
+            f"the rows are read {shutter.readout_direction} in {1e3 * shutter.readout_time_s:.4g} ms, which Kalibr "
+            "cannot hold: timeshift_cam_imu is that of the picture's middle, as for a global shutter"
+        )
+    if profile.time_offset_s is None:
+        said.append("the time offset is unknown: no timeshift_cam_imu")
+    elif exposure_s is not None:
+        middle_ms = 5e2 * float(shutter.true_exposure_s(np.array([exposure_s]))[0])
+        said.append(f"timeshift_cam_imu leads to the start of the exposure; its middle is {middle_ms:.4g} ms later")
+    elif shutter.timestamp != "exposure_start":
+        said.append(f"stamps mean {shutter.timestamp}, and the exposure is unknown: timeshift_cam_imu is as for them")
+    said += [f"{key}: {value:.6g} is left out" for key, value in coefficients.items() if value and key not in names]
+    lost = {
+        "clock_skew": (profile.clock_skew, 0.0),
+        "gyro_bias_rad_s": (list(profile.gyro_bias_rad_s), [0.0] * 3),
+        "gyro_scale": (list(profile.gyro_scale), [1.0] * 3),
+        "exposure_scale": (shutter.exposure_scale, 1.0),
+    }
+    said += [f"Kalibr has no {key}: {value}" for key, (value, plain) in lost.items() if value != plain]
+    if profile.response is not None:
+        said.append(f"Kalibr has no exposure curve: {profile.response.kind}")
+    if profile.extensions != Extensions():
+        said.append("Kalibr has none of the profile's extensions")
+    return said
+
+
+def _commented(lines: list[str]) -> str:
+    return "".join(f"# {' '.join(line.split())}\n" for line in lines)
+
+
+# ── measure ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def measure_imu_noise(time_s: Array, gyro_rad_s: Array, accel_m_s2: Array) -> ImuNoise | None:
+    """Measure the noise of samples (n,), (n, 3), (n, 3) that were taken in motion; None where there are too few.
+
+    Model: white noise on a hand's smooth motion.  Third differences of white noise have 20 times its variance and
+    suppress what is slow; windows are chosen by their motion, not by their noise, so the choice does not bias it.
+    NaN in the accelerometer: its density is unknown.
+    """
+    if len(time_s) < MIN_NOISE_SAMPLES:
+        return None
+    rate_hz = 1.0 / float(np.median(np.diff(time_s)))
+    return ImuNoise(rate_hz, _density(gyro_rad_s, rate_hz), _density(accel_m_s2, rate_hz))
+
+
+def _density(samples: Array, rate_hz: float) -> float | None:
+    """Noise density per √Hz, the mean power of the three axes."""
+    samples = samples[np.isfinite(samples).all(axis=1)]
+    count = len(samples) // NOISE_WINDOW
+    if count < 2:
+        return None
+    windows = samples[: count * NOISE_WINDOW].reshape(count, NOISE_WINDOW, -1)
+    smooth = windows.reshape(count, 4, NOISE_WINDOW // 4, -1).mean(axis=2)
+    liveliness = np.square(np.diff(smooth, axis=1)).sum(axis=(1, 2))
+    still = windows[np.argsort(liveliness)[: max(round(STILLEST_PART * count), 1)]]
+    third = np.diff(still, n=3, axis=1)
+    deviation = np.median(np.abs(third), axis=(0, 1)) / NORMAL_MEDIAN / np.sqrt(THIRD_DIFFERENCE_GAIN)
+    density = float(np.sqrt(np.mean(deviation**2) / rate_hz))
+    return density if density > 0 else None

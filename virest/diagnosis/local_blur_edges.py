@@ -103,7 +103,7 @@ def observe_picture(picture: Picture, frame: Frame, curve: ResponseCurve, settin
     light = _profiles(curve.linear_table()[picture], points, normals)
     fit = measure_widths(light, settings.max_misfit)
     step_levels, brightest, brightness = _levels_of(grey, fit.reach_px)
-    clipped = brightest > float(np.flatnonzero(~curve.clipped_table(1.5)).max(initial=254))
+    clipped = brightest > float(np.flatnonzero(~curve.clipped_table(1.5)).max(initial=0))
     keep = (fit.width_px > 0) & (step_levels > settings.min_step_levels) & ~clipped
     moved = points + fit.centre_px[:, None] * normals
     full = np.ones(int(keep.sum()))

@@ -212,8 +212,9 @@ class _Problem:
         """Residuals, their derivatives (n, p), and robust weights over variance, each kind by its own scale."""
         residual = self.residual(theta)
         columns = [
-            (self.residual(theta + step) - residual) / step.sum() for step in np.diag(self.steps)
-        ]  # a shift of several parameters at once never occurs, so the sum is the one step
+            (self.residual(theta + size * one) - residual) / size
+            for size, one in zip(self.steps, np.eye(len(theta)), strict=True)
+        ]
         weight = np.zeros(len(residual))
         edge = self.observations.is_edge[self.use]
         for kind in (edge, ~edge):

@@ -123,7 +123,7 @@ def _nodes(width: int, height: int) -> tuple[Array, Array]:
     """Places (n, 2), and what turns values there into coefficients of :func:`_monomials`."""
     part = (np.arange(_NODES) + 0.5) / _NODES
     points = np.stack(np.meshgrid(part * width, part * height), -1).reshape(-1, 2)
-    return points, np.linalg.pinv(_monomials(points, width, height))
+    return points, np.asarray(np.linalg.pinv(_monomials(points, width, height)), float)
 
 
 def _monomials(points: Array, width: int, height: int) -> Array:

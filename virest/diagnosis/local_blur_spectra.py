@@ -168,9 +168,8 @@ def _followed_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
         np.arange(reach, width - reach + 1, SPACING_PX), np.arange(reach, height - reach + 1, SPACING_PX)
     )
     start = np.stack([x, y], -1).reshape(-1, 1, 2).astype(np.float32)
-    settings = {"winSize": (31, 31), "maxLevel": 4}
-    ahead, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, **settings)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, ahead, None, **settings)
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, winSize=(31, 31), maxLevel=4)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, ahead, None, winSize=(31, 31), maxLevel=4)
     moved = np.rint(ahead[:, 0])
     good = (
         (found.ravel() == 1)

@@ -2,8 +2,8 @@
 
 Model of one observation of a patch with unknown light L, in grey levels of 255:
 ``grey = E(L · product · vignetting(r) · flicker(t) · gain)``, E the profile's curve with its gamma and black level,
-``product`` the logged exposure × ISO.  L is a nuisance: each evaluation profiles it out, patch by patch, in grey levels,
-where the noise is even.  In light a steeper curve would shrink the residuals and so explain anything.
+``product`` the logged exposure × ISO.  L is a nuisance: each evaluation profiles it out, patch by patch, in grey
+levels, where the noise is even.  In light, a steeper curve would shrink the residuals and so explain anything.
 
 A video encoder of few bits does not pass small changes of brightness on at once: in a patch that is flat and moves it
 repeats its last picture and corrects a part of the difference.  Decoded grey: ``y[k] = x[k] + memory (y[k−1] − x[k])``,
@@ -14,6 +14,7 @@ second appears a third weaker and 0.2 rad late.  The memory belongs to the movie
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +89,8 @@ class PhotometricObservations:
     def subset(self, use: Mask) -> PhotometricObservations:
         """Only the chosen observations."""
         fields = {name: getattr(self, name) for name in self.__slots__}
-        return replace(self, **{name: v[use] for name, v in fields.items() if isinstance(v, np.ndarray)})
+        chosen: dict[str, Any] = {name: v[use] for name, v in fields.items() if isinstance(v, np.ndarray)}
+        return replace(self, **chosen)
 
     def with_memory(self, memory: float) -> PhotometricObservations:
         """The same with another memory of the encoder."""
@@ -126,7 +128,7 @@ class Prediction:
 
 
 def log_light_factor(observations: PhotometricObservations, profile: CameraProfile) -> Array:
-    """Logarithm of all that multiplies a patch's light, (n,): product, vignetting, flicker, gain (contract, section 4)."""
+    """Logarithm of all that multiplies a patch's light, (n,): product, vignetting, flicker, gain."""
     ext = profile.extensions
     total = observations.log_product.copy()
     if ext.vignetting_corner_loss:
@@ -213,7 +215,8 @@ def normalised_rms(observations: PhotometricObservations, profile: CameraProfile
 
 
 def _patch_sum(patch: Indices, values: Array) -> Array:
-    return np.maximum(np.bincount(patch, values), 1e-12) if np.all(values >= 0) else np.bincount(patch, values)
+    total = np.asarray(np.bincount(patch, values), np.float64)
+    return np.maximum(total, 1e-12) if np.all(values >= 0) else total
 
 
 def _tables(curve: ResponseCurve) -> tuple[Array, Array]:

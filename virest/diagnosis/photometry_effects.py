@@ -1,8 +1,7 @@
-"""The photometric effects of the contract's section 4: where each value goes in a profile, and where a fit may start."""
+"""The photometric effects (contract, section 4): where each value goes in a profile, where a fit may start."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -12,7 +11,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import Array, PhotometricObservations, predict
 
-_SCAN_OBSERVATIONS = 12_000
+_SCAN_OBSERVATIONS = 7_000
+"""Enough to find a frequency; larger temporaries are fetched from the system anew each time, ten times slower."""
 _SCAN_STEP_CYCLES = 0.3
 """Scan step times the capture's length."""
 _LEAST_SINC = 0.03
@@ -213,7 +213,7 @@ class FlickerScan:
 
     frequency_hz: Array
     power: Array
-    """Fall of the weighted sum of squares; under noise alone twice a chi-squared of half... of two degrees of freedom."""
+    """Fall of the weighted sum of squares; under noise alone a chi-squared of two degrees of freedom."""
     amplitude: Array
     """Of the light, corrected for what the exposure averages away; 0 where it averages away everything."""
     phase_rad: Array
@@ -233,22 +233,22 @@ class FlickerScan:
 def scan_flicker(
     observations: PhotometricObservations, profile: CameraProfile, search_hz: tuple[float, float]
 ) -> FlickerScan:
-    """Fit a sine of each frequency to the residuals in log light, the patches' light following (linear least squares)."""
+    """Fit a sine of each frequency to the residuals in log light by least squares, the patches' light following."""
     weight = 1 / observations.noise**2
     prediction = predict(observations, profile)
     limit = 4 * observations.noise + 2.0
     relative = np.clip(prediction.residual, -limit, limit) / prediction.slope
     stiffness = weight * prediction.slope**2
     thin = max(1, int(np.ceil(len(observations) / _SCAN_OBSERVATIONS)))
-    keep = observations.patch % thin == 0 if thin > 1 else np.ones(len(observations), bool)
+    keep = observations.place % thin == 0 if thin > 1 else np.ones(len(observations), bool)
     exposure = np.asarray(profile.shutter.true_exposure_s(observations.exposure_s), float)
     time_s = (observations.row_time_s(profile) + 0.5 * exposure)[keep]
     span = max(float(np.ptp(time_s)), 0.1)
     frequency = np.arange(search_hz[0], search_hz[1], _SCAN_STEP_CYCLES / span)
-    fit, power = _sines(observations.patch[keep], relative[keep], stiffness[keep], time_s, frequency)
+    coefficients, power = _sines(observations.patch[keep], relative[keep], stiffness[keep], time_s, frequency)
     left = np.sinc(frequency * np.median(exposure))
     whole = np.where(np.abs(left) > _LEAST_SINC, left, np.inf)
-    complex_amplitude = (fit[:, 0] + 1j * fit[:, 1]) / whole
+    complex_amplitude = (coefficients[:, 0] + 1j * coefficients[:, 1]) / whole
     return FlickerScan(frequency, power * thin, np.abs(complex_amplitude), np.angle(complex_amplitude))
 
 

@@ -8,7 +8,7 @@ those of one place its texture.  Covariances count both (Cameron, Gelbach & Mill
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice, product
 
 import numpy as np
@@ -43,8 +43,9 @@ LAG_DOUBT = 0.2
 BLOCKS_S = 0.3
 """About the length of a block of frames: longer than a hand's sway keeps its direction, and than the encoder's memory
 of a picture that moves."""
-RESOLUTION = {"vignetting": 0.01, "flicker": 0.004, "response_curve": 0.01, "black_level": 0.002, "gain_drift": 0.003}
-"""Smaller values are not told from what encoders and slightly textured patches do, whatever the statistics say."""
+RESOLUTION = {"vignetting": 0.006, "flicker": 0.004, "response_curve": 0.01, "black_level": 0.002, "gain_drift": 0.003}
+"""Part of every standard deviation: smaller values are not told from what encoders and slightly textured patches do,
+whatever the statistics say."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +158,7 @@ def judge(
         after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
         noise.append(before[-1][1])
     quadratic = [float(np.sqrt(np.mean(np.square(v)))) if v else 0.0 for v in ([b[0] for b in before], after, noise)]
-    return HeldOut(*quadratic, split="place" if by_place else "time")
+    return HeldOut(quadratic[0], quadratic[1], quadratic[2], "place" if by_place else "time")
 
 
 def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:
@@ -168,20 +169,19 @@ def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, 
 def significance(fit: PhotometricFit, effect_name: str, observations: PhotometricObservations) -> tuple[float, float]:
     """(how many standard deviations from no effect, p value), RESOLUTION and the search for a frequency counted in."""
     values, covariance = fit.of(effect_name)
-    floor = RESOLUTION[effect_name] ** 2
     if effect_name == "flicker":
-        z2 = values[0] ** 2 / (covariance[0, 0] + floor)
+        z2 = values[0] ** 2 / covariance[0, 0]
         span_s = float(np.ptp(observations.stamp_s))
         trials = max(380.0 * span_s, 1.0)
         p = float(-np.expm1(trials * np.log1p(-min(np.exp(-0.5 * z2), 1 - 1e-12))))
     elif effect_name == "gain_drift":
         rounding = _per_frame(observations, observations.log_product_std)
-        spread = np.diag(covariance) + floor + rounding**2
+        spread = np.diag(covariance) + rounding**2
         z2 = float(np.sum((values - np.median(values)) ** 2 / spread))
         p = float(stats.chi2.sf(z2, max(len(values) - 1, 1)))
     else:
         off = values[0] - (1.0 if effect_name == "response_curve" else 0.0)
-        z2 = off**2 / (covariance[0, 0] + floor)
+        z2 = off**2 / covariance[0, 0]
         p = float(stats.chi2.sf(z2, 1))
     return float(stats.norm.isf(max(p, 1e-300) / 2)), p
 
@@ -336,17 +336,26 @@ def _covariance(
     residual, weight = _settled(observations, profile, effects, values)
     jacobian = _jacobian(observations, profile, effects, values, weight)
     normal = (jacobian * weight[:, None]).T @ jacobian + np.diag(_prior(effects))
-    inverse = np.linalg.inv(normal)
+    inverse = np.asarray(np.linalg.inv(normal), np.float64)
     if any(effect.per_frame for effect in effects):
         inverse = _without_common_part(inverse)
     score = jacobian * (weight * residual)[:, None]
     spread = _clustered(score, observations.place)
     if not any(effect.per_frame for effect in effects):
         spread = spread + _clustered(score, time_blocks(observations)) - score.T @ score
-    white = inverse * max(float(np.sum(weight * residual**2) / np.sum(weight)), 1.0)
+    white: Array = inverse * max(float(np.sum(weight * residual**2) / np.sum(weight)), 1.0)
     doubt = MEMORY_DOUBT * _memory(values) * _pull_of_memory(normal)
     lag = LAG_DOUBT * _changes(effects, values)
-    return _at_least(inverse @ spread @ inverse, white) + np.outer(doubt, doubt) + np.diag(lag**2)
+    model = np.outer(doubt, doubt) + np.diag(lag**2 + _resolution(effects) ** 2)
+    return _at_least(inverse @ spread @ inverse, white) + model
+
+
+def _resolution(effects: Sequence[PhotometricEffect]) -> Array:
+    """RESOLUTION of each value and of the memory; of a flicker only the amplitude has one."""
+    parts = [np.full(len(effect.parameters), RESOLUTION[effect.name]) for effect in effects]
+    for effect, part in zip(effects, parts, strict=True):
+        part[1:] *= effect.per_frame
+    return np.concatenate([*parts, [0.0]])
 
 
 def _changes(effects: Sequence[PhotometricEffect], values: Array) -> Array:
@@ -368,7 +377,7 @@ def _without_common_part(inverse: Array) -> Array:
 
 def _pull_of_memory(normal: Array) -> Array:
     """How the other values change with the memory, to first order, (k,); 0 for the memory itself."""
-    pull = np.zeros(len(normal))
+    pull: Array = np.zeros(len(normal))
     if len(normal) > 1:
         pull[:-1] = -np.linalg.solve(normal[:-1, :-1], normal[:-1, -1])
     return pull
@@ -377,9 +386,9 @@ def _pull_of_memory(normal: Array) -> Array:
 def _clustered(score: Array, cluster: Indices) -> Array:
     """Sum over clusters of the outer product of their summed scores, corrected for a small number of clusters."""
     dense = np.unique(cluster, return_inverse=True)[1]
-    sums = np.stack([np.bincount(dense, column) for column in score.T], axis=-1)
+    sums = np.stack([np.bincount(dense, column) for column in score.T], axis=-1).astype(np.float64)
     count = len(sums)
-    return sums.T @ sums * (count / max(count - 1, 1))
+    return np.asarray(sums.T @ sums * (count / max(count - 1, 1)), np.float64)
 
 
 def _at_least(covariance: Array, floor: Array) -> Array:
@@ -388,4 +397,4 @@ def _at_least(covariance: Array, floor: Array) -> Array:
     if np.any(have <= 0):
         return floor
     grow = np.sqrt(np.maximum(need / have, 1.0))
-    return covariance * np.outer(grow, grow)
+    return np.asarray(covariance * np.outer(grow, grow), np.float64)

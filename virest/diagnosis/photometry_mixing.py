@@ -1,9 +1,10 @@
 """The curve from blur at constant exposure: a hand's blur mixes light before the curve, and so shows the curve.
 
 Of two frames of one place, A nearly sharp and B blurred, with paths k_A and k_B from the gyroscope, both
-``k_B ∗ E′(A)`` and ``k_A ∗ E′(B)`` are the same light blurred by both paths, if E is the curve.  Under a wrong curve the
-bright side of every blurred edge grows or shrinks, whichever way the edge faces; a wrong registration, a wrong length
-of the path and a change of brightness do something else.  They are free in every tile, and only what is left counts.
+``k_B ∗ E′(A)`` and ``k_A ∗ E′(B)`` are the same light blurred by both paths, if E is the curve.  Under a wrong curve
+the bright side of every blurred edge grows or shrinks, whichever way the edge faces; a wrong registration, a wrong
+length of the path and a change of brightness do something else.  They are free in every tile, and only what is left
+counts.  A path in a wrong direction is not: correct the geometry first.
 
 What a gamma and a black level do this way is nearly the same: each is estimated as if the other were nominal, and they
 are rivals.  Only exposures × ISO that change as logged tell them apart (photometry_fit).
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -113,7 +115,10 @@ def observe_mixing(
 
 
 def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_name: str) -> MixingEstimate | None:
-    """Gamma or black level, the other as in the profile; None with fewer than 3 pairs. The std is from leaving pairs out."""
+    """Gamma or black level, the other as in the profile, std by leaving pairs out; None with fewer than 3 pairs.
+
+    A black level below 0 is no black level: its p value is 1.
+    """
     pairs = np.unique(evidence.pair)
     if len(pairs) < 3:
         return None
@@ -128,7 +133,8 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
     if effect_name == "response_curve":
         value = curve.extra_gamma * float(np.exp(change))
         return MixingEstimate(value, std * value, p_value, len(pairs))
-    return MixingEstimate(curve.black_level + change, std, p_value, len(pairs))
+    value = curve.black_level + change
+    return MixingEstimate(value, std, p_value if value > 0 else 1.0, len(pairs))
 
 
 def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOut | None:
@@ -146,7 +152,8 @@ def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOut | None:
             before.append(alone)
             after.append(alone - change)
             noise.append(float(np.sqrt(np.sum(scatter**2))) / float(np.sum(stiffness)))
-    return HeldOut(*(float(np.sqrt(np.mean(np.square(v)))) for v in (before, after, noise)), split="pairs")
+    rms = [float(np.sqrt(np.mean(np.square(v)))) for v in (before, after, noise)]
+    return HeldOut(rms[0], rms[1], rms[2], "pairs")
 
 
 def _root(evidence: MixingEvidence, effect_name: str) -> float:
@@ -271,11 +278,7 @@ def _nodes(width: int, height: int) -> Array:
 
 def _tiles(width: int, height: int, side: int) -> list[tuple[slice, slice]]:
     columns, rows = (np.linspace(0, n, max(n // side, 1) + 1).astype(int) for n in (width, height))
-    return [
-        (slice(int(a), int(b)), slice(int(c), int(d)))
-        for a, b in zip(rows[:-1], rows[1:], strict=True)
-        for c, d in zip(columns[:-1], columns[1:], strict=True)
-    ]
+    return [(slice(int(a), int(b)), slice(int(c), int(d))) for a, b in pairwise(rows) for c, d in pairwise(columns)]
 
 
 def _usable(sharp: Gray, blurred: Gray, place: Plane) -> Mask:
@@ -295,9 +298,7 @@ def _usable(sharp: Gray, blurred: Gray, place: Plane) -> Mask:
 
 def _kernel(path_px: Array) -> Plane:
     """Weights by which a pixel gathers light from its surroundings along a path (m, 2): at minus the displacement."""
-    fine = np.concatenate(
-        [np.linspace(a, b, 6, endpoint=False) for a, b in zip(path_px[:-1], path_px[1:], strict=True)]
-    )
+    fine = np.concatenate([np.linspace(a, b, 6, endpoint=False) for a, b in pairwise(path_px)])
     reach = int(np.abs(fine).max() + 2)
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     at = reach - fine

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -74,7 +75,8 @@ def observe_photometry(
 
     trajectory: the camera's orientation; None: nothing is predicted, corners are followed from where they were.
     profile: for the geometry only.  intra_frames: movie indices that the decoder can start from (Capture.keyframes);
-    they are coded on their own, and patches are best chosen there.  A picture that repeats its predecessor is passed over.
+    they are coded on their own, and patches are best chosen there.  A picture that repeats its predecessor is passed
+    over.
     """
     settings = settings or PatchSettings()
     keys: list[_Key] = []
@@ -147,7 +149,6 @@ def _spread(gray: NDArray[np.float32], squared: NDArray[np.float32], box: tuple[
 
 
 def _make_key(frame: Frame, look: _Look, first_place: int, settings: PatchSettings) -> _Key:
-    height, width = look.normal.shape
     corners = find_corners(look.normal, TrackingSettings(grid=(7, 7), points_per_cell=3))
     patches = _flat_patches(look, settings)
     column, row = patches[:, 0].astype(int), patches[:, 1].astype(int)
@@ -155,7 +156,7 @@ def _make_key(frame: Frame, look: _Look, first_place: int, settings: PatchSettin
 
 
 def _flat_patches(look: _Look, settings: PatchSettings) -> Array:
-    """Middles (n, 2) of the flattest patch of each cell, against its brightness, and of each cell's darkest flat one."""
+    """Middles (n, 2) of the flattest patch of each cell, for its brightness, and of the darkest flat ones."""
     height, width = look.normal.shape
     brightness = look.mean.mean(axis=-1)
     edge = int(settings.surround_px * _scale(width, height) / 2) + 1
@@ -173,8 +174,8 @@ def _best_of_cells(score: NDArray[np.float32], cell: float) -> list[tuple[int, i
     height, width = score.shape
     rows, columns = (np.linspace(0, n, max(round(n / cell), 1) + 1).astype(int) for n in (height, width))
     best = []
-    for top, bottom in zip(rows[:-1], rows[1:], strict=True):
-        for left, right in zip(columns[:-1], columns[1:], strict=True):
+    for top, bottom in pairwise(rows):
+        for left, right in pairwise(columns):
             y, x = np.unravel_index(np.argmin(score[top:bottom, left:right]), (bottom - top, right - left))
             if np.isfinite(score[top + y, left + x]):
                 best.append((int(left + x), int(top + y)))
@@ -371,7 +372,7 @@ def _observations(
 
 
 def _logged_products(frames: list[Frame]) -> tuple[Array, Array, bool]:
-    """Log of exposure × ISO against its median, what rounding ISO to a whole number leaves open, whether all have it."""
+    """Log of exposure × ISO against its median, what rounding the ISO leaves open, whether all frames have both."""
     known = bool(frames) and all(f.exposure_s and f.iso for f in frames)
     if not known:
         return np.zeros(len(frames)), np.zeros(len(frames)), False

@@ -1,8 +1,8 @@
 """Pictures and gyroscope brought roughly together: time offset and axes, from turns alone.
 
 At each offset the best rotation between the pictures' turns and the gyroscope's (Kabsch 1976) is found in closed form,
-so a sensor mounted any way round is no obstacle.  Where the motion does not determine a rotation (turns about one axis),
-the profile's own and the 24 axis maps are compared instead.
+so a sensor mounted any way round is no obstacle.  Where the motion determines no rotation (turns
+about one axis), the profile's own and the 24 axis maps are compared instead.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ KEEP_PROFILE = 1.15
 MAX_PROFILE_LEFT = 0.3
 """And unless they leave more than this part unexplained."""
 SAME_VALLEY_S = 0.06
+SKEWS = (-0.0045, -0.003, -0.0015, 0.0015, 0.003, 0.0045)
+SKEW_GAIN = 0.8
+"""Another clock rate is taken if it leaves less than this part of what the profile's leaves unexplained."""
 SOFT = 3.0
 """Pairs further off than this many typical deviations are held back."""
 
@@ -85,6 +88,22 @@ def align_coarsely(
         float(offsets[best]), chosen, float(explained[best]), runner_up, float(offsets[other]), not keep, motion,
         best in (0, len(offsets) - 1),
     )  # fmt: skip
+
+
+def align_with_skew(
+    turns: PictureTurns, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
+) -> tuple[CoarseAlignment, float] | None:
+    """Align coarsely at several clock skews about the profile's; the profile's stays unless another fits much better."""
+    best = align_coarsely(turns, imu, profile, search_s)
+    skew = profile.clock_skew
+    for change in SKEWS:
+        other = align_coarsely(turns, imu, replace(profile, clock_skew=profile.clock_skew + change), search_s)
+        if other is None:
+            continue
+        needed = SKEW_GAIN if skew == profile.clock_skew else 1.0
+        if best is None or 1 - other.explained < needed * (1 - best.explained):
+            best, skew = other, profile.clock_skew + change
+    return None if best is None else (best, skew)
 
 
 def axis_maps() -> Array:

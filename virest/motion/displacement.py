@@ -23,7 +23,7 @@ MIN_FINITE = 0.98
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """Path of the camera's centre by the accelerometer alone, world axes of the trajectory; at rest at the first row."""
+    """Path of the camera's centre by the accelerometer alone, the trajectory's axes; from rest at the first row."""
 
     trajectory: Trajectory
     path: CubicHermiteSpline
@@ -72,7 +72,6 @@ def integrate_accelerometer(imu: ImuSamples, profile: CameraProfile, trajectory:
     world_imu = trajectory.rotation_world_cam @ profile.rotation_cam_imu
     world_force = np.einsum("nij,nj->ni", world_imu, force(inside))
     slope = np.einsum("nij,nj->ni", world_imu, force(inside, 1))
-    arm = np.array(profile.p_cam_imu_m)
     path, per_bias, per_delay = (
         _integrated_twice(imu.time_s, row) for row in (world_force, world_imu.reshape(-1, 9), slope)
     )

@@ -24,6 +24,7 @@ WINDOW_S = 3.5
 """Longest stretch over which the accelerometer's path is followed; its noise grows with the power 1.5."""
 IMU_PAUSE_PERIODS = 3.0
 MARGIN_S = 0.02
+CELLS, LEAST_IN_CELL, ASTRAY, MOST_ASTRAY = 8, 10, 2.5, 0.5
 GUESSED_FOCAL = 0.8
 """Of the longer side: a phone's main camera; where nothing is known."""
 
@@ -75,6 +76,32 @@ class ObservedTracks:
             use &= (end < imu.time_s[gap]) | (begin > imu.time_s[gap + 1])
         return self.chosen(use)
 
+    def without_astray(self, first_px: Array, distance: Array) -> tuple[ObservedTracks, float]:
+        """Leave out the parts of the picture that go their own way, and say how many of the points that takes.
+
+        first_px (n, 2), distance (n,): points of a fit and how far each lies from it, in standard deviations.  A cell
+        goes its own way if its median distance is ASTRAY times the typical cell's: a dashboard, a passer-by.
+        """
+        cell = self._cells(first_px)
+        counts = np.bincount(cell, minlength=CELLS**2)
+        medians = np.full(CELLS**2, np.nan)
+        for number in np.flatnonzero(counts >= LEAST_IN_CELL):
+            medians[number] = np.median(distance[cell == number])
+        astray = (
+            np.nan_to_num(medians, nan=0.0) > ASTRAY * np.nanmedian(medians) if np.isfinite(medians).any() else None
+        )
+        if astray is None or not astray.any() or counts[astray].sum() > MOST_ASTRAY * counts.sum():
+            return self, 0.0
+        kept = [_selected(pair, ~astray[self._cells(pair.points_first_px)]) for pair in self.pairs]
+        use = np.array([len(pair) >= MIN_TRACKS for pair in kept])
+        return replace(self, pairs=tuple(kept)).chosen(use), float(counts[astray].sum() / counts.sum())
+
+    def _cells(self, points_px: Array) -> NDArray[np.intp]:
+        """Number of the cell that each point lies in."""
+        part = points_px * (CELLS / np.array([self.lens.width, self.lens.height]))
+        x, y = np.clip(part.astype(np.intp), 0, CELLS - 1).T
+        return np.asarray(y * CELLS + x)
+
     def table(self, max_points: int) -> TrackTable:
         """All points in one table, evenly thinned to about max_points."""
         stride = max(-(-self.tracks // max_points), 1)
@@ -110,6 +137,15 @@ def guessed_lens(profile: CameraProfile) -> Intrinsics:
     focal = GUESSED_FOCAL * max(profile.width, profile.height)
     return Intrinsics(
         profile.width, profile.height, focal, focal, 0.5 * (profile.width - 1), 0.5 * (profile.height - 1)
+    )
+
+
+def _selected(pair: TrackPair, use: NDArray[np.bool_]) -> TrackPair:
+    return replace(
+        pair,
+        points_first_px=pair.points_first_px[use],
+        points_second_px=pair.points_second_px[use],
+        forward_backward_px=None,
     )
 
 

@@ -1,8 +1,8 @@
 """What a gyroscope leaves open of the camera's path and of the scene: unknowns that ride along in every fit.
 
 Two descriptions.  `InertialMotion`: the accelerometer tells the path but for velocity, gravity, its own bias and delay,
-and the scene is a plane in metres: a vector with priors for a Gauss-Newton fit.  `DirectedMotion`: no accelerometer; only
-the direction of travel is used, and points are judged across the parallax that it gives.
+and the scene is a plane in metres: a vector with priors for a Gauss-Newton fit.  `DirectedMotion`: no accelerometer;
+only the direction of travel is used, and points are judged across the parallax that it gives.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ GRAVITY_STD_M_S2 = 0.6
 ACCEL_BIAS_STD_M_S2 = 0.15
 ACCEL_DELAY_STD_S = 0.004
 PLANE_STD_PER_M = 1.5
+
 
 @dataclass(frozen=True, slots=True)
 class InertialMotion:

@@ -19,6 +19,7 @@ from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.track_model import Ground, Prediction, TrackTable, ground, predict, with_profile
+from virest.motion.travel_direction import find_directions, without_directions
 
 Array = NDArray[np.float64]
 CAUCHY = 2.4
@@ -30,9 +31,9 @@ CONVERGED = 0.02
 GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4
 MAX_DAMPING = 1e3
+SMALLEST_SCALE = 0.03
 ANY_DEPTH = 1e6
 """Spread of inverse depths that leaves a point free to lie anywhere along its parallax."""
-DIRECTION_PASSES, FIRST_PASSES = 5, 12
 SPREAD_PASSES, SPREAD_TOLERANCE = 3, 0.2
 """The spread of depths is measured anew after each descent until it changes by less than this part."""
 
@@ -76,6 +77,8 @@ class TrackFit:
     """(n, 2) tracked minus predicted."""
     weight: Array
     """(n,) Cauchy weights, 0 to 1."""
+    distance: Array
+    """(n,) whitened length of each difference, in standard deviations."""
     cost: float
     """Σ of the robust loss over the points, whitened: comparable between fits of one table."""
     ground: Ground
@@ -127,9 +130,7 @@ def fit_tracks(
         raise ImuError("no accelerometer to tell the camera's path", hint="fit a free motion")
     directed = isinstance(scene, DirectedMotion)
     state = _State(known, scene, np.zeros(sum(map(len, terms))), ANY_DEPTH if directed else 0.0)
-    for _ in range(DIRECTION_PASSES if directed else SPREAD_PASSES if inertial else 1):
-        if directed:
-            state = replace(state, scene=find_directions(state.known, table, state.scene))
+    for _ in range(SPREAD_PASSES if inertial else 1):
         state, system = _descend(imu, table, terms, scene, state, max_iterations)
         if inertial and abs(system.depth_spread - state.depth_spread) <= SPREAD_TOLERANCE * system.depth_spread:
             break
@@ -158,7 +159,7 @@ def _descend(
                 break
             continue
         small = bool(np.all(np.abs(step) < CONVERGED * np.sqrt(np.diag(system.inverse()))))
-        state, system, damping = moved, after, damping / 10 if damping > 1e-4 else 0.0
+        state, system, damping = replace(moved, scene=after.scene), after, damping / 10 if damping > 1e-4 else 0.0
         if small:
             break
     return state, system
@@ -179,6 +180,7 @@ class _State:
 class _System:
     """Weighted rows at one point, and their normal equations with the priors."""
 
+    scene: Motion | None
     prediction: Prediction
     difference: Array
     squared: Array
@@ -210,6 +212,10 @@ class _System:
 def _linearise(
     imu: ImuSamples, table: TrackTable, terms: tuple[Term, ...], start: Motion | None, state: _State
 ) -> _System:
+    flow = None
+    if isinstance(state.scene, DirectedMotion):
+        scene, flow = _directed(table, state, state.scene)
+        state = replace(state, scene=scene)
     prediction = predict(state.known, table, state.scene, slopes=state.scene is not None)
     difference = table.second_px - prediction.second_px
     slope = [_term_slopes(imu, table, terms, state, prediction)]
@@ -226,12 +232,18 @@ def _linearise(
     rows, left, spread = _whitened(np.concatenate(slope, axis=-1), difference, prediction, table, state.depth_spread)
     squared = (left**2).sum(axis=-1)
     one_way = state.depth_spread == ANY_DEPTH
-    scale = max(float(np.median(np.sqrt(squared))) / (NORMAL_MEDIAN if one_way else RAYLEIGH_MEDIAN), 0.2)
+    scale = max(float(np.median(np.sqrt(squared))) / (NORMAL_MEDIAN if one_way else RAYLEIGH_MEDIAN), SMALLEST_SCALE)
     weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+    if isinstance(state.scene, DirectedMotion) and flow is not None:
+        noise = table.noise_px[table.pair]
+        group = state.scene.group(table.pair)
+        rows, left = without_directions(
+            rows, left, weight, difference / noise[:, None], flow / noise[:, None, None], state.scene.direction, group
+        )
     flat = rows.reshape(-1, rows.shape[-1])
     weighted = flat * np.repeat(weight / scale**2, 2)[:, None]
     return _System(
-        prediction, difference, squared, weight, scale, spread, rows, left,
+        state.scene, prediction, difference, squared, weight, scale, spread, rows, left,
         weighted.T @ flat, weighted.T @ left.ravel(), np.array(prior), np.array(pulled), np.array(limit),
     )  # fmt: skip
 
@@ -307,7 +319,7 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
         place += len(term)
     return TrackFit(
         state.known.profile, state.scene, terms, state.change, covariance, inverse, system.scale,
-        system.depth_spread, system.difference, system.weight, _cost(system, 1.0), state.known,
+        system.depth_spread, system.difference, system.weight, np.sqrt(system.squared), _cost(system, 1.0), state.known,
         system.prediction.second_s, slices,
     )  # fmt: skip
 
@@ -345,47 +357,23 @@ def _inverse(matrix: Array) -> Array:
 
 def one_direction() -> DirectedMotion:
     """A vehicle: one direction for the whole capture, to be found."""
-    return DirectedMotion(np.array([[0.0, 0.0, 1.0]]))
+    return DirectedMotion(np.zeros((1, 3)))
 
 
 def many_directions(table: TrackTable) -> DirectedMotion:
     """A direction for each pair, to be found."""
-    return DirectedMotion(np.tile([0.0, 0.0, 1.0], (table.n_pairs, 1)))
+    return DirectedMotion(np.zeros((table.n_pairs, 3)))
 
 
-def find_directions(known: Ground, table: TrackTable, motion: Motion | None) -> DirectedMotion:
-    """Find the directions whose parallax the differences from rotation alone follow best.
-
-    Across the flow F d of a direction d, a difference r measures d · (r × F) / |F d|: linear in d but for the length,
-    which each pass takes from the one before; Cauchy weights at the noise across (the epipolar distance of a small turn).
-    """
-    assert isinstance(motion, DirectedMotion)
-    group = motion.group(table.pair)
-    groups = len(motion.direction)
-    at = predict(known, table, None)
-    difference = (table.second_px - at.second_px) / table.noise_px[table.pair][:, None]
-    flow = np.stack(
-        [
-            np.asarray(predict(known, table, DirectedMotion(np.tile(axis, (groups, 1)))).along_px)
-            for axis in np.eye(3)
-        ],
-        axis=-1,
+def _directed(table: TrackTable, state: _State, motion: DirectedMotion) -> tuple[DirectedMotion, Array]:
+    """Directions found anew from the differences, and the flow (n, 2, 3) of a unit step along each world axis."""
+    known, groups = state.known, len(motion.direction)
+    axes = (DirectedMotion(np.tile(axis, (groups, 1))) for axis in np.eye(3))
+    flow = np.stack([np.asarray(predict(known, table, axis).along_px) for axis in axes], axis=-1)
+    difference = table.second_px - predict(known, table, None).second_px
+    noise = table.noise_px[table.pair]
+    start = motion.direction if motion.direction.any() else None
+    found = find_directions(
+        flow / noise[:, None, None], difference / noise[:, None], motion.group(table.pair), groups, start
     )
-    across = difference[:, :1] * flow[:, 1] - difference[:, 1:] * flow[:, 0]
-    size = np.maximum(np.linalg.norm(difference, axis=-1), np.quantile(np.abs(difference), 0.2) + 1e-9)
-    direction = _least(across / np.maximum(size * np.linalg.norm(flow, axis=(1, 2)), 1e-12)[:, None], group, groups)
-    for _ in range(FIRST_PASSES):
-        length = np.linalg.norm(np.einsum("nij,nj->ni", flow, direction[group]), axis=-1)
-        unit = across / np.maximum(length, 1e-12)[:, None]
-        distance = np.abs(np.einsum("ni,ni->n", unit, direction[group]))
-        scale = max(float(np.median(distance)) / NORMAL_MEDIAN, 1e-3)
-        weight = 1.0 / (1.0 + (distance / (CAUCHY * scale)) ** 2)
-        direction = _least(unit * np.sqrt(weight)[:, None], group, groups)
-    return DirectedMotion(direction)
-
-
-def _least(rows: Array, group: NDArray[np.intp], groups: int) -> Array:
-    """Unit vectors (groups, 3) with the least Σ (row · d)²."""
-    square = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), 9)
-    total = np.stack([np.bincount(group, column, groups) for column in square.T], axis=-1)
-    return np.asarray(np.linalg.eigh(total.reshape(groups, 3, 3))[1][..., 0])
+    return DirectedMotion(found), flow

@@ -275,4 +275,3 @@ def mean_orientation(trajectory: Trajectory, middle_s: Array, exposure_s: Array)
 def turned(rotation: Array, rays: Array) -> Array:
     """Apply rotations (n, 3, 3) to rays (n, 3)."""
     return np.einsum("nij,nj->ni", rotation, rays)
-

@@ -396,7 +396,7 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
     """Hyper-Laplacian over the whole operator; censored pixels have no weight, but where all is clipped, as a bound."""
     operator = _whole_operator(blurred)
     statistics = blurred.statistics
-    first = _by_tile_hyper_laplacian(blurred, replace(settings, iterations=4))
+    first = _by_tile_hyper_laplacian(blurred, replace(settings, iterations=5))
     reach = _path_reach(blurred) if any(c is not None for c in blurred.clipped) else None
     sharp = []
     for channel, (light, start) in enumerate(zip(blurred.light, first, strict=True)):

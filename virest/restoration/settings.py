@@ -45,5 +45,7 @@ class RestorationSettings:
 PRESETS: dict[str, RestorationSettings] = {
     "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144),
     "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5, tile_px=104),
-    "best": RestorationSettings("best", "hyper-laplacian-global", iterations=6, inner_iterations=6, strength=0.6),
+    "best": RestorationSettings(
+        "best", "hyper-laplacian-global", iterations=6, inner_iterations=6, tile_px=104, strength=0.6
+    ),
 }

@@ -1,0 +1,304 @@
+"""``virest calibrate`` as its users meet it: tables, JSON, files and exit codes."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from virest.app import calibrate as command
+from virest.app.calibrate import CalibrationOutput, describe, plan_calibration, run_calibration, unknown_extra
+from virest.app.cli import CALIBRATED_EXTRAS
+from virest.app.simulate import simulate_command
+from virest.camera.profile import CameraProfile, format_profile, read_profile, write_profile
+from virest.capture.folder import read_capture
+from virest.capture.profile_source import read_any_profile
+from virest.errors import CalibrationError, OutputError
+
+Virest = Callable[..., "subprocess.CompletedProcess[str]"]
+OFFSET_S, READOUT_S, ROTATION, BIAS = 0.031, 0.0236, (0.012, -0.017, 0.021), (0.018, -0.011, 0.006)
+HIDDEN = [
+    f"time_offset={OFFSET_S}",
+    f"readout_time={READOUT_S}",
+    "imu_rotation={},{},{}".format(*ROTATION),
+    "gyro_bias={},{},{}".format(*BIAS),
+]
+TRUTH = {"time_offset_s": OFFSET_S, "readout_time_s": READOUT_S, "rotation_rad": ROTATION, "gyro_bias_rad_s": BIAS}
+UNITS = {"time_offset_s": 2e-3, "readout_time_s": 2e-3, "rotation_rad": 6e-3, "gyro_bias_rad_s": 6e-3}
+"""No error may be larger, however large its standard deviation."""
+
+
+@pytest.fixture(scope="session")
+def _shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("calibrated") / "shaken"
+    simulate_command(folder, width=320, height=240, frames=60, exposure_ms=6, rate_rad_s=1.3, readout_ms=18,
+                     effects=HIDDEN, crf=18, seed=41)  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def shaken(_shaken: Path, tmp_path: Path) -> Path:
+    """Two seconds of a shaken camera with offset, readout, axes and bias hidden; the test may damage it."""
+    return Path(shutil.copytree(_shaken, tmp_path / "shaken", ignore=shutil.ignore_patterns("truth")))
+
+
+@pytest.fixture(scope="session")
+def done(_shaken: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], str]:
+    """One calibration of it that several tests look at: (folder written to, JSON mapping, text)."""
+    folder = tmp_path_factory.mktemp("results")
+    output = CalibrationOutput(folder / "camera.yaml", folder / "kalibr")
+    return folder, *run_calibration(plan_calibration(_shaken), output)
+
+
+def start_profile(capture: Path, **changes: Any) -> CameraProfile:
+    """Read the capture's own profile with some keys of its YAML changed, ``section__key``."""
+    content = yaml.safe_load((capture / "camera.yaml").read_text())
+    for name, value in changes.items():
+        section, key = name.split("__")
+        content[section][key] = value
+    (capture / "camera.yaml").write_text(yaml.safe_dump(content))
+    return read_profile(capture / "camera.yaml")
+
+
+def value_of(facts: dict[str, Any], name: str) -> dict[str, Any]:
+    """One entry of ``values``."""
+    return next(value for value in facts["values"] if value["name"] == name)
+
+
+def assert_recovered(facts: dict[str, Any]) -> None:
+    """Every hidden value lies within four standard deviations, and absolutely near."""
+    for name, truth in TRUTH.items():
+        found = value_of(facts, name)
+        error = np.abs(np.array(found["value"]) - truth)
+        assert found["determined"], name
+        assert (error < 4 * np.array(found["std"])).all(), (name, found)
+        assert (error < UNITS[name]).all(), (name, found)
+
+
+def assert_refused(result: "subprocess.CompletedProcess[str]", code: int, *says: str) -> None:
+    """One line for the error, the right exit code, and nothing on standard output."""
+    errors = [line for line in result.stderr.splitlines() if line.startswith("virest: error: ")]
+    assert result.returncode == code, result.stderr
+    assert len(errors) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    for text in says:
+        assert text in errors[0]
+
+
+def test_what_was_hidden_is_found(done: tuple[Path, dict[str, Any], str]) -> None:
+    """Offset, readout, axes and bias come back within their standard deviations, and the residual is tracking's own."""
+    _, facts, _ = done
+    assert_recovered(facts)
+    assert value_of(facts, "readout_direction")["value"] == "top_to_bottom"
+    assert facts["verdict"] == "calibrated"
+    assert facts["residual_px"] < 1.5 * facts["noise_px"] < facts["before_px"]
+
+
+def test_the_program_prints_one_json_object_and_writes_the_profile(virest: Virest, shaken: Path) -> None:
+    """``--json`` is one object with every key; the profile of the object is the file's; nothing else is written."""
+    result = virest("calibrate", "shaken", "--json", "--out", "found.yaml", cwd=shaken.parent)
+    assert result.returncode == 0, result.stderr
+    facts = json.loads(result.stdout)
+    assert_recovered(facts)
+    assert {"capture", "values", "not_determined", "correlations", "translation", "residual_px", "before_px",
+            "noise_px", "moving_fraction", "notes", "verdict", "profile", "written", "imu"} <= set(facts)  # fmt: skip
+    assert facts["written"] == ["found.yaml"]
+    assert sorted(p.name for p in shaken.parent.iterdir()) == ["found.yaml", "shaken"]
+    profile = read_profile(shaken.parent / "found.yaml")
+    assert facts["profile"]["imu"]["time_offset_s"] == pytest.approx(profile.time_offset_s, rel=1e-9)
+    assert set(profile.estimates) >= {*TRUTH, "readout_direction"}
+
+
+def test_the_written_profile_reads_back_with_its_estimates(done: tuple[Path, dict[str, Any], str]) -> None:
+    """A number, a list and a word of ``estimates`` survive the file, and writing the profile again changes nothing."""
+    folder, facts, _ = done
+    profile = read_profile(folder / "camera.yaml")
+    assert profile.estimates["readout_direction"].value == "top_to_bottom"
+    for name in TRUTH:
+        found, written = value_of(facts, name), profile.estimates[name]
+        assert (written.value, written.std) == (found["value"], found["std"])
+        assert written.source
+    write_profile(profile, folder / "again.yaml")
+    assert read_profile(folder / "again.yaml") == profile
+    assert format_profile(profile) in (folder / "camera.yaml").read_text(encoding="utf-8")
+
+
+def test_people_read_a_table(done: tuple[Path, dict[str, Any], str]) -> None:
+    """Each value has a row, each component of a list too; then residuals, translation and the files."""
+    folder, facts, text = done
+    lines = text.splitlines()
+    assert lines[0] == "shaken: calibrated"
+    rows = {line.split()[0]: line.split() for line in lines[2:]}
+    assert rows["time_offset_s"][4] == "yes"
+    assert float(rows["gyro_bias_rad_s[1]"][2]) == pytest.approx(
+        facts["profile"]["imu"]["gyro_bias_rad_s"][1], abs=1e-3
+    )
+    assert any(line.startswith("residual ") and " -> " in line for line in lines)
+    assert any(line.startswith("camera's translation: ") for line in lines)
+    assert lines[-1] == f"wrote {folder / 'kalibr' / 'imu.yaml'}"
+
+
+def test_what_is_not_determined_is_said_and_stays(done: tuple[Path, dict[str, Any], str]) -> None:
+    """A value that is not determined has no calibrated number in the table; correlations are named."""
+    _, facts, _ = done
+    open_value = {"name": "fx_px", "start": 500.0, "value": 500.0, "std": 44.0, "determined": False, "note": ""}
+    pair = {"first": "fx_px", "second": "gyro_scale", "correlation": -0.97}
+    text = describe({**facts, "values": [open_value], "not_determined": ["fx_px"], "correlations": [pair]})
+    assert next(line for line in text.splitlines() if line.startswith("fx_px")).split() == [
+        "fx_px",
+        "500",
+        "–",
+        "44",
+        "no",
+    ]
+    assert "left as it was: fx_px" in text
+    assert "fx_px and gyro_scale go together: correlation -0.97" in text
+
+
+def test_kalibr_gets_its_files(done: tuple[Path, dict[str, Any], str]) -> None:
+    """The camera chain reads back as the same lens, axes, offset and readout; imu.yaml holds the capture's noise."""
+    folder, _, _ = done
+    ours, chain = read_profile(folder / "camera.yaml"), read_any_profile(folder / "kalibr" / "camchain-imucam.yaml")
+    assert chain.intrinsics == ours.intrinsics
+    assert chain.shutter.readout_time_s == pytest.approx(ours.shutter.readout_time_s)
+    assert chain.time_offset_s == ours.time_offset_s
+    np.testing.assert_allclose(chain.rotation_cam_imu, ours.rotation_cam_imu, atol=1e-12)
+    noise = yaml.safe_load((folder / "kalibr" / "imu.yaml").read_text())
+    assert noise["update_rate"] == pytest.approx(200, rel=1e-3)
+    assert noise["gyroscope_noise_density"] == pytest.approx(0.0015 / np.sqrt(200), rel=0.25)
+    assert noise["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(200), rel=0.25)
+
+
+def test_an_offset_that_is_null_is_found(shaken: Path, tmp_path: Path) -> None:
+    """A profile that knows neither offset nor readout gets both."""
+    start_profile(shaken, imu__time_offset_s=None, shutter__readout_time_s=None)
+    facts, text = run_calibration(plan_calibration(shaken), CalibrationOutput(tmp_path / "c.yaml"))
+    assert value_of(facts, "time_offset_s")["start"] is None
+    assert "unknown" in text
+    assert abs(facts["profile"]["imu"]["time_offset_s"] - OFFSET_S) < UNITS["time_offset_s"]
+    assert abs(facts["profile"]["shutter"]["readout_time_s"] - READOUT_S) < UNITS["readout_time_s"]
+
+
+def test_config_comes_before_the_capture_s_own_profile(shaken: Path, tmp_path: Path) -> None:
+    """Values start where ``--config`` says, here at 300 ms and another focal length that is asked for."""
+    content = yaml.safe_load((shaken / "camera.yaml").read_text())
+    true_px = content["intrinsics"]["fx_px"]
+    content["imu"]["time_offset_s"], content["intrinsics"]["fx_px"], content["intrinsics"]["fy_px"] = 0.3, 270.0, 270.0
+    (tmp_path / "other.yaml").write_text(yaml.safe_dump(content))
+    plan = plan_calibration(shaken, tmp_path / "other.yaml", ("focal",))
+    facts, _ = run_calibration(plan, CalibrationOutput(tmp_path / "c.yaml"))
+    assert facts["profile_source"].endswith("other.yaml")
+    assert value_of(facts, "time_offset_s")["start"] == 0.3
+    focal = value_of(facts, "fx_px")
+    assert abs(focal["value"] - true_px) < max(4 * focal["std"], 0.005 * true_px)
+    assert_recovered(facts)
+
+
+def test_what_another_sensor_s_imu_yaml_says_is_compared(
+    done: tuple[Path, dict[str, Any], str], shaken: Path, tmp_path: Path
+) -> None:
+    """Beside a camera chain, imu.yaml of another rate and a tenth of the noise is noticed."""
+    folder, _, _ = done
+    for name in ("camchain-imucam.yaml", "imu.yaml"):
+        text = (folder / "kalibr" / name).read_text()
+        (tmp_path / name).write_text(text.replace("update_rate: 200", "update_rate: 125"))
+    plan = plan_calibration(shaken, tmp_path / "camchain-imucam.yaml")
+    facts, _ = run_calibration(plan, CalibrationOutput(tmp_path / "c.yaml"))
+    assert [note for note in facts["notes"] if "125 Hz" in note and "200 Hz" in note]
+
+
+def test_long_captures_are_looked_at_in_runs(shaken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the limit, runs of consecutive frames spread over the capture are tracked, and that is enough."""
+    monkeypatch.setattr(command, "MAX_FRAMES", 40)
+    monkeypatch.setattr(command, "MIN_RUN_FRAMES", 10)
+    monkeypatch.setattr(command, "RUN_S", 0.33)
+    plan = plan_calibration(shaken)
+    runs = np.split(np.array(plan.frames), np.flatnonzero(np.diff(plan.frames) > 1) + 1)
+    assert len(plan.frames) == 40
+    assert min(map(len, runs)) >= 10
+    assert plan.frames[0] < 15
+    assert plan.frames[-1] > 44
+    calls: list[int] = []
+    facts, _ = run_calibration(plan, CalibrationOutput(tmp_path / "c.yaml"), calls.append)
+    assert sum(calls) <= plan.steps
+    assert sum(calls) >= len(plan.frames)
+    assert facts["pairs"] < 40
+    assert_recovered(facts)
+
+
+def test_names_of_with_are_those_that_the_library_takes() -> None:
+    """The help, the command and the library name the same; a slip is answered with its nearest neighbour."""
+    assert set(command.EXTRA_NAMES) == set(CALIBRATED_EXTRAS)
+    assert unknown_extra("clock-skew") is None
+    assert "'focal'" in str(unknown_extra("focl"))
+    assert "'principal-point'" in str(unknown_extra("principal_point"))
+
+
+def test_refusals_are_one_line_with_their_code(virest: Virest, shaken: Path) -> None:
+    """Usage 2, profile 3, capture 4, output 8: one line, nothing on standard output, nothing written."""
+    folder = shaken.parent
+    (folder / "bad.yaml").write_text("virest_profile: 1\nimage: {width: 320, hight: 240}\n")
+    (folder / "empty").mkdir()
+    (folder / "taken.yaml").write_text("mine\n")
+    before = sorted(p.name for p in folder.iterdir())
+    cases: list[tuple[tuple[str, ...], int, str]] = [
+        (("shaken", "--with", "focal,clock-scew"), 2, "'clock-skew'"),
+        (("shaken", "--config", "bad.yaml"), 3, "height"),
+        (("empty",), 4, "movie.mp4"),
+        (("shaken", "--out", "taken.yaml"), 8, "exists already"),
+        (("shaken", "--out", "no/where.yaml"), 8, "does not exist"),
+    ]
+    for arguments, code, says in cases:
+        assert_refused(virest("calibrate", *arguments, cwd=folder), code, says)
+    assert (folder / "taken.yaml").read_text() == "mine\n"
+    assert sorted(p.name for p in folder.iterdir()) == before
+
+
+def test_a_capture_that_determines_nothing_ends_with_6_and_leaves_no_file(virest: Virest, tmp_path: Path) -> None:
+    """A camera on a tripod: one line that says what to do, and no profile."""
+    simulate_command(tmp_path / "still", width=320, height=240, frames=20, rate_rad_s=0.0, seed=4)
+    result = virest("calibrate", "still", "--json", cwd=tmp_path)
+    assert_refused(result, 6, "shake the phone")
+    assert [p.name for p in tmp_path.iterdir()] == ["still"]
+
+
+def test_an_existing_profile_is_replaced_only_on_demand(shaken: Path, tmp_path: Path) -> None:
+    """Without overwrite the old file stays as it is; with it the new one stands there whole."""
+    taken = tmp_path / "camera.yaml"
+    taken.write_text("mine\n")
+    plan = plan_calibration(shaken)
+    with pytest.raises(OutputError, match="exists already"):
+        run_calibration(plan, CalibrationOutput(taken))
+    assert taken.read_text() == "mine\n"
+    run_calibration(plan, CalibrationOutput(taken, overwrite=True))
+    assert read_profile(taken).estimates
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_nothing_is_written_when_the_fit_fails(shaken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error of the library leaves neither profile nor Kalibr's folder."""
+
+    def refuse(*_: Any) -> None:
+        raise CalibrationError("the pictures do not follow the gyroscope")
+
+    monkeypatch.setattr(command, "calibrate_geometry", refuse)
+    with pytest.raises(CalibrationError):
+        run_calibration(plan_calibration(shaken), CalibrationOutput(tmp_path / "c.yaml", tmp_path / "kalibr"))
+    assert [p.name for p in tmp_path.iterdir()] == ["shaken"]
+
+
+def test_start_up_frames_are_left_out_of_the_fit(shaken: Path) -> None:
+    """Frames whose pictures are later than their stamps are looked at only where the lag itself is fitted."""
+    capture = read_capture(shaken)
+    profile = read_profile(shaken / "camera.yaml")
+    late = [replace(f, skip_reason="later", skip_codes=("start-up",)) if f.index < 7 else f for f in capture.frames]
+    begun = replace(capture, frames=tuple(late))
+    assert command.choose_frames(begun, profile)[0] == 7
+    assert command.choose_frames(begun, profile, with_startup=True)[0] == 0

@@ -1,0 +1,127 @@
+"""Local blur: widths of edges and ratios of spectra find exposure time and defocus, and keep quiet otherwise."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from virest.app.simulate import simulate_command
+from virest.camera.profile import CameraProfile, read_profile
+from virest.camera.response import ResponseCurve
+from virest.capture.folder import read_capture
+from virest.capture.records import Frame
+from virest.capture.video import probe_movie, read_gray
+from virest.diagnosis.local_blur import BlurObservations, frames_to_read, observe_blur, residuals
+from virest.diagnosis.local_blur_edges import EdgeSettings, fit_steps, measure_widths, observe_picture
+from virest.diagnosis.local_blur_fit import Defocus, ExposureTime, fit, held_out
+from virest.diagnosis.local_blur_model import fitted_width
+from virest.motion.integration import integrate_gyro
+from virest.motion.trajectory import Trajectory
+
+Observed = tuple[BlurObservations, CameraProfile, Trajectory]
+BOTH = (ExposureTime(), Defocus())
+
+
+def observed(folder: Path, seed: int, *effects: str) -> Observed:
+    """A short simulated capture, its nominal profile, and what its pictures show."""
+    simulate_command(
+        folder, width=448, height=336, frames=42, exposure_ms=[13.0, 8.0, 10.0], rate_rad_s=1.3, seed=seed,
+        bitrate_bits_per_px=0.5, effects=effects,
+    )  # fmt: skip
+    capture = read_capture(folder, look_at_pictures=False)
+    profile = read_profile(folder / "camera.yaml")
+    trajectory = integrate_gyro(capture.imu, profile)
+    pictures = read_gray(capture.movie, probe_movie(capture.movie), frames_to_read(capture, pairs=11))
+    return observe_blur(pictures, capture, profile, trajectory), profile, trajectory
+
+
+@pytest.fixture(scope="module")
+def nominal(tmp_path_factory: pytest.TempPathFactory) -> Observed:
+    """A capture with nothing hidden."""
+    return observed(tmp_path_factory.mktemp("null") / "trip", 51)
+
+
+@pytest.fixture(scope="module")
+def altered(tmp_path_factory: pytest.TempPathFactory) -> Observed:
+    """A capture exposed 1.5 times as long as logged, and out of focus by 1.3 px."""
+    return observed(tmp_path_factory.mktemp("both") / "trip", 52, "exposure_time=1.5", "defocus=1.3")
+
+
+def test_the_width_of_a_blurred_step_is_found(rng: np.random.Generator) -> None:
+    """A step spread by 0.8 to 3 px, off centre, upon any level, comes back within a hundredth."""
+    u = np.arange(-14, 14.01, 0.5)
+    width, centre = rng.uniform(0.8, 3.0, 40), rng.uniform(-0.6, 0.6, 40)
+    steps = 0.3 + 0.2 * erf((u - centre[:, None]) / (np.sqrt(2) * width[:, None]))
+    found_centre, found, _, _ = fit_steps(steps, 14.0)
+    np.testing.assert_allclose(found, width, rtol=0.01)
+    np.testing.assert_allclose(found_centre, centre, atol=0.01)
+
+
+def test_lines_and_waves_are_no_steps() -> None:
+    """A thin line and a sine have slopes as strong as a step's, and no width."""
+    u = np.arange(-19, 19.01, 0.5)
+    line = np.exp(-0.5 * (u / 1.5) ** 2)
+    wave = np.sin(2 * np.pi * u / 9)
+    step = erf(u / (np.sqrt(2) * 1.7))
+    found = measure_widths(np.stack([line, wave, step]), 0.02).width_px
+    assert found[0] == found[1] == 0
+    assert found[2] == pytest.approx(1.7, rel=0.01)
+
+
+def test_widths_add_in_squares_up_to_the_shape_of_a_path() -> None:
+    """No motion: the Gaussian's width; a long path is a ramp, which a Gaussian fits about 1.14 times as wide."""
+    u, path = np.arange(-12, 12.01, 0.5), np.sqrt(12) * 3.0 * (np.arange(400) / 399 - 0.5)
+    ramp = erf((u[:, None] - path) / (np.sqrt(2) * 0.5)).mean(axis=1)
+    assert fitted_width(np.array([0.0]), 1.2, 0.5)[0] == pytest.approx(1.3, rel=1e-3)
+    assert fitted_width(np.array([3.0]), 0.0, 0.5)[0] == pytest.approx(fit_steps(ramp[None], 12.0)[1][0], rel=0.03)
+
+
+def test_a_nominal_capture_stays_nominal(nominal: Observed) -> None:
+    """Neither effect is significant, though both are determined."""
+    found = fit(*nominal, BOTH)
+    scale, sigma = found.values[0][0], found.values[1][0]
+    assert found.determined == (True, True)
+    assert abs(scale - 1.0) < 3 * found.std[0]
+    assert found.std[0] < 0.15
+    assert sigma < 3 * found.std[1]
+
+
+def test_exposure_and_defocus_are_found_together(altered: Observed) -> None:
+    """Both come back within three deviations and a tenth, and help on time blocks that did not fit them."""
+    found = fit(*altered, BOTH)
+    for value, truth, std in zip(np.concatenate(found.values), (1.5, 1.3), found.std, strict=True):
+        assert abs(value - truth) < 3 * std
+        assert value == pytest.approx(truth, rel=0.12)
+    assert found.profile.shutter.exposure_scale == found.values[0][0]
+    assert found.profile.extensions.defocus_sigma_px == found.values[1][0]
+    before, after = held_out(*altered, BOTH)
+    assert after < 0.95 * before
+
+
+def test_the_profile_alone_carries_the_effects(altered: Observed) -> None:
+    """The residuals of the true profile are smaller than the nominal one's, with nothing fitted."""
+    observations, profile, trajectory = altered
+    true = Defocus().apply(ExposureTime().apply(profile, np.array([1.5])), np.array([1.3]))
+    plain, right = (residuals(observations, p, trajectory) for p in (profile, true))
+    edge = observations.is_edge
+    assert len(plain) == len(observations) == len(observations.covariates(profile, trajectory)["row"])
+    assert np.median(np.abs(right[edge])) < 0.4 * np.median(np.abs(plain[edge]))
+    assert np.median(np.abs(right[~edge])) < np.median(np.abs(plain[~edge]))
+
+
+def test_a_scene_of_smooth_things_is_not_called_defocused(rng: np.random.Generator, altered: Observed) -> None:
+    """Smooth texture has next to no isolated steps: defocus is not determined, whatever its slopes' widths."""
+    texture = cv2.GaussianBlur(rng.normal(size=(336, 448)), (0, 0), 3.0)
+    picture = np.clip(120 + 45 * texture / texture.std(), 1, 250).astype(np.uint8)
+    frame = Frame(0, 0, 0.0, 0.01)
+    edges = observe_picture(picture, frame, ResponseCurve("srgb"), EdgeSettings())
+    observations, profile, trajectory = altered
+    smooth = replace(observations, edges=edges, candidates=edges.candidates, isolated=len(edges))
+    assert edges.candidates > 100
+    found = fit(smooth, profile, trajectory, [Defocus()])
+    assert found.determined == (False,)
+    assert np.isnan(found.values[0]).all()
+    assert np.isinf(found.std).all()

@@ -1,0 +1,363 @@
+"""``virest calibrate CAPTURE``: clock, readout, axes, bias and more of a phone, from an ordinary capture."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from virest.app.console import table
+from virest.app.outputs import output_error, write_whole
+from virest.calibration.geometry import OPTIONAL, CalibratedValue, GeometryCalibration, calibrate_geometry
+from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
+from virest.camera.profile import CameraProfile, format_profile, load_yaml_mapping, profile_mapping
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.join import median_period_s
+from virest.capture.records import Capture, Frame
+from virest.capture.video import probe_movie, read_gray
+from virest.errors import CalibrationError, OutputError
+from virest.motion.alignment import choose_pairs
+from virest.motion.tracking import track_pairs
+
+FRAME_LAG = "frame-lag"
+EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
+"""What ``--with`` takes."""
+MAX_FRAMES = 400
+"""Every frame of captures up to this length, 13 s at 30 frames a second; runs of that many in all of longer ones."""
+RUN_S, MIN_RUN_FRAMES, MAX_RUN_FRAMES = 1.5, 20, 80
+"""A run lets the accelerometer tell the camera's path, and eight of them and more spread over the capture."""
+FIT_STEPS = 3
+UNEXPLAINED = 1.5
+"""A residual of this many times the noise of tracking is worth a note."""
+RATE_TOLERANCE, NOISE_FACTOR = 0.1, 3.0
+"""How far a capture's inertial data may be from imu.yaml before that is worth a note."""
+CAMCHAIN_NAME, IMU_NAME = "camchain-imucam.yaml", "imu.yaml"
+DIGITS = 6
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationPlan:
+    """A capture that was read, and what of it is looked at."""
+
+    capture: Capture
+    profile: CameraProfile
+    source: str
+    """Where the profile comes from."""
+    imu_file: ImuNoise | None
+    """Noise from the imu.yaml beside a Kalibr camera chain."""
+    extra: tuple[str, ...]
+    frames: tuple[int, ...]
+    """Movie indices that are tracked."""
+    every_frame: bool
+
+    @property
+    def steps(self) -> int:
+        """How often ``progress`` is called."""
+        return len(self.frames) + FIT_STEPS
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOutput:
+    """Where the results go."""
+
+    profile: Path
+    kalibr: Path | None = None
+    """Folder for camchain-imucam.yaml and imu.yaml."""
+    overwrite: bool = False
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Everything that will be written."""
+        return (self.profile, *((self.kalibr / CAMCHAIN_NAME, self.kalibr / IMU_NAME) if self.kalibr else ()))
+
+    def require(self) -> None:
+        """Raise OutputError, before any work, for what could not be written at its end."""
+        for path in (self.profile, *([self.kalibr] if self.kalibr else [])):
+            if not path.absolute().parent.is_dir():
+                raise OutputError(f"{path}: its folder does not exist", hint="create it first")
+        if self.kalibr and self.kalibr.exists() and not self.kalibr.is_dir():
+            raise OutputError(f"{self.kalibr}: is no folder", hint="name a folder for Kalibr's files")
+        for path in self.files:
+            if path.is_dir():
+                raise OutputError(f"{path}: is a folder", hint="name a file")
+            if path.exists() and not self.overwrite:
+                raise OutputError(f"{path}: exists already", hint="name another by --out, or pass --overwrite")
+
+
+def unknown_extra(name: str) -> str | None:
+    """Why ``--with`` does not take this name, with its nearest neighbour; None: it does."""
+    if name in EXTRA_NAMES:
+        return None
+    near = difflib.get_close_matches(name.replace("_", "-").lower(), EXTRA_NAMES, n=1, cutoff=0.5)
+    meant = f"did you mean '{near[0]}'?" if near else f"one of {', '.join(EXTRA_NAMES)}"
+    return f"'{name}' cannot be calibrated, {meant}"
+
+
+# ── which frames ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str] = ()) -> CalibrationPlan:
+    """Read the capture and its profile, and choose the frames. Raises CaptureError and SettingsError."""
+    capture = read_capture(path)
+    profile, source = resolve_profile(capture, config)
+    frames = choose_frames(capture, profile, FRAME_LAG in extra and FRAME_LAG in OPTIONAL)
+    every = len(frames) == len(capture.frames)
+    return CalibrationPlan(capture, profile, source, _imu_file(source), tuple(extra), tuple(frames), every)
+
+
+def choose_frames(capture: Capture, profile: CameraProfile, with_startup: bool = False) -> list[int]:
+    """Movie indices to track, rising: every usable frame, or lively runs of them; the start-up's where asked for."""
+    chosen = choose_pairs(
+        capture.frames, capture.imu, MAX_FRAMES, _run_frames(capture.usable), profile.time_offset_s or 0.0
+    )
+    if with_startup:
+        chosen += [frame.index for frame in capture.frames if frame.only_startup]
+    return sorted(set(chosen))
+
+
+def _run_frames(frames: Sequence[Frame]) -> int:
+    period_s = median_period_s(np.array([frame.time_s for frame in frames])) if len(frames) > 1 else None
+    return int(np.clip(round(RUN_S / period_s), MIN_RUN_FRAMES, MAX_RUN_FRAMES)) if period_s else MIN_RUN_FRAMES
+
+
+def _imu_file(source: str) -> ImuNoise | None:
+    """The imu.yaml that lies beside a Kalibr camera chain."""
+    path = Path(source)
+    beside = path.with_name(IMU_NAME)
+    if not path.is_file() or not beside.is_file() or not is_kalibr(load_yaml_mapping(path)):
+        return None
+    return parse_imu(load_yaml_mapping(beside), IMU_NAME)
+
+
+# ── the command ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def run_calibration(
+    plan: CalibrationPlan, output: CalibrationOutput, progress: Callable[[int], Any] | None = None
+) -> tuple[Json, str]:
+    """Track, fit and write; returns the mapping for ``--json`` and the table for people.
+
+    progress is called with 1 for each of the plan's steps.  Raises CalibrationError, OutputError; nothing is written
+    then.
+    """
+    output.require()
+    step = progress or (lambda _: None)
+    movie = plan.capture.movie
+    pictures: Iterator[Any] = read_gray(movie, probe_movie(movie), plan.frames)
+    pairs = track_pairs(pictures, progress=lambda _index: step(1))
+    found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1))
+    _require_offset(found)
+    noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)
+    facts = as_json(plan, found, noise)
+    text = describe(facts)
+    _write(output, facts, found, noise, plan.capture)
+    facts["written"] = [str(path) for path in output.files]
+    return facts, "\n".join([text, *(f"wrote {path}" for path in output.files)])
+
+
+def _require_offset(found: GeometryCalibration) -> None:
+    """Nothing else can be believed of a capture whose clock is unknown."""
+    offset = next((value for value in found.values if value.name == "time_offset_s"), None)
+    if offset is not None and not offset.determined:
+        std = f" (± {1e3 * float(np.max(offset.std)):.1f} ms)" if offset.std is not None else ""
+        raise CalibrationError(
+            f"the motion does not determine the time offset{std}",
+            hint="film a few seconds more, and turn the phone about all three axes",
+        )
+
+
+def _write(
+    output: CalibrationOutput, facts: Json, found: GeometryCalibration, noise: ImuNoise | None, capture: Capture
+) -> None:
+    contents = [_profile_text(facts, found.profile)]
+    if output.kalibr:
+        if noise is None:
+            raise CalibrationError("too few inertial samples to measure their noise", hint="leave --kalibr out")
+        contents += [format_camchain(found.profile, capture.metadata.exposure_s), format_imu(noise)]
+        _make_folder(output.kalibr)
+    for path, content in zip(output.files, contents, strict=True):
+        write_whole(path, content.encode())
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def _profile_text(facts: Json, profile: CameraProfile) -> str:
+    head = [
+        f"Camera profile by virest calibrate, from {facts['capture']}: {facts['verdict']}",
+        f"residual {facts['residual_px']:.3f} px, of which tracking makes {facts['noise_px']:.3f} px",
+        *(f"note: {note}" for note in facts["notes"]),
+    ]
+    return "".join(f"# {_one_line(line)}\n" for line in head) + format_profile(profile)
+
+
+# ── results for machines ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise | None) -> Json:
+    """Everything that was found, as one mapping."""
+    values = [_value_facts(value) for value in (*found.values, *_not_fitted(plan, found))]
+    undetermined = [value["name"] for value in values if not value["determined"]]
+    return {
+        "capture": plan.capture.name,
+        "folder": str(plan.capture.folder),
+        "profile_source": plan.source,
+        "with": list(plan.extra),
+        "frames": len(plan.frames),
+        "pairs": found.pairs,
+        "tracks": found.tracks,
+        "values": values,
+        "not_determined": undetermined,
+        "correlations": [{"first": a, "second": b, "correlation": c} for a, b, c in found.correlations],
+        "translation": found.translation,
+        "explained": found.explained,
+        "moving_fraction": found.moving_fraction,
+        "before_px": found.before_px,
+        "residual_px": found.residual_px,
+        "noise_px": found.noise_px,
+        "imu": _imu_facts(noise),
+        "notes": [*found.notes, *_own_notes(plan, found, noise)],
+        "verdict": _verdict(undetermined),
+        "profile": profile_mapping(found.profile),
+    }
+
+
+def _verdict(undetermined: list[str]) -> str:
+    if not undetermined:
+        return "calibrated"
+    return f"calibrated but for {', '.join(undetermined)}, which this motion does not determine"
+
+
+def _value_facts(value: CalibratedValue) -> Json:
+    return {
+        "name": value.name,
+        "start": value.start,
+        "value": value.value,
+        "std": value.std,
+        "determined": value.determined,
+        "note": value.note,
+    }
+
+
+def _not_fitted(plan: CalibrationPlan, found: GeometryCalibration) -> list[CalibratedValue]:
+    """What was asked for and is not among the values: not determined, never silently left out."""
+    if FRAME_LAG not in plan.extra or any("lag" in value.name for value in found.values):
+        return []
+    start = plan.profile.extensions.frame_lag_s
+    return [CalibratedValue("lag_s", start, start, None, False, "not fitted: start-up frames were left out")]
+
+
+def _imu_facts(noise: ImuNoise | None) -> Json | None:
+    if noise is None:
+        return None
+    return {
+        "update_rate_hz": noise.update_rate_hz,
+        "gyro_noise_density_rad_s_sqrt_hz": noise.gyro_density,
+        "accel_noise_density_m_s2_sqrt_hz": noise.accel_density,
+    }
+
+
+def _own_notes(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise | None) -> list[str]:
+    notes = []
+    if found.residual_px > UNEXPLAINED * found.noise_px:
+        notes.append(
+            f"the residual is {found.residual_px / found.noise_px:.1f} times what tracking makes: something remains "
+            "unexplained, and the standard deviations count it as noise"
+        )
+    if plan.imu_file and noise:
+        notes += _imu_disagreements(plan.imu_file, noise)
+    return notes
+
+
+def _imu_disagreements(file: ImuNoise, measured: ImuNoise) -> list[str]:
+    """Where a capture's inertial data are not those that imu.yaml describes."""
+    notes = []
+    if abs(measured.update_rate_hz / file.update_rate_hz - 1) > RATE_TOLERANCE:
+        notes.append(
+            f"{IMU_NAME} says {file.update_rate_hz:g} Hz, this capture has {measured.update_rate_hz:.4g} Hz: another "
+            "phone or mode?"
+        )
+    pairs = (
+        ("gyroscope", file.gyro_density, measured.gyro_density),
+        ("accelerometer", file.accel_density, measured.accel_density),
+    )
+    for name, told, seen in pairs:
+        if told and seen and seen > NOISE_FACTOR * told:
+            notes.append(f"{name}: noise density {seen:.2g} here, {told:.2g} in {IMU_NAME}")
+    return notes
+
+
+# ── results for people ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def describe(facts: Json) -> str:
+    """A table of the values, then what is to be known about them."""
+    rows = [row for value in facts["values"] for row in _rows(value)]
+    share = 100 * facts["moving_fraction"]
+    lines = [
+        f"{facts['capture']}: {facts['verdict']}",
+        table(["value", "start", "calibrated", "±", "determined", "note"], rows),
+        f"residual {facts['before_px']:.3f} -> {facts['residual_px']:.3f} px, "
+        f"of which tracking makes {facts['noise_px']:.3f} px",
+        f"{facts['tracks']} tracks in {facts['pairs']} pairs of frames, {share:.1f} % of them moving on their own; "
+        f"the gyroscope explains {facts['explained']:.1%} of the turns",
+        f"camera's translation: {_TRANSLATIONS.get(facts['translation'], facts['translation'])}",
+    ]
+    lines += [
+        f"errors of {pair['first']} and {pair['second']} go together: correlation {pair['correlation']:+.2f}"
+        for pair in facts["correlations"]
+    ]
+    if facts["not_determined"]:
+        lines.append(f"left as it was: {', '.join(facts['not_determined'])}")
+    return "\n".join(lines + [f"note: {_one_line(note)}" for note in facts["notes"]])
+
+
+_TRANSLATIONS = {
+    "none": "none seen",
+    "inertial": "by the accelerometer, before a plane",
+    "directed": "one direction a pair of frames, any depths",
+    "free": "a smooth path of its own, before a plane; the accelerometer does not tell it",
+}
+
+
+def _rows(value: Json) -> list[list[str]]:
+    """One row for a number or a word, one for each component of a list."""
+    count = len(value["value"]) if isinstance(value["value"], list) else 0
+    if not count:
+        return [_row(value, value["name"], value["start"], value["value"], value["std"])]
+    starts = value["start"] if isinstance(value["start"], list) else [value["start"]] * count
+    stds = value["std"] if isinstance(value["std"], list) else [value["std"]] * count
+    named = [f"{value['name']}[{k}]" for k in range(count)]
+    return [_row(value, *parts) for parts in zip(named, starts, value["value"], stds, strict=True)]
+
+
+def _row(value: Json, name: str, start: Any, found: Any, std: Any) -> list[str]:
+    shown = _cell(found, std) if value["determined"] else "–"
+    spread = "" if std is None else f"{std:.2g}"
+    return [name, _cell(start, std), shown, spread, "yes" if value["determined"] else "no", _one_line(value["note"])]
+
+
+def _cell(value: Any, std: float | None) -> str:
+    """A number to the digit that its standard deviation leaves, a word, or ``unknown``."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, str):
+        return value
+    if not std or not math.isfinite(std):
+        return f"{value:.{DIGITS}g}"
+    return f"{round(value, 12) + 0.0:.{int(np.clip(1 - math.floor(math.log10(std)), 0, 9))}f}"
+
+
+def _one_line(text: str) -> str:
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

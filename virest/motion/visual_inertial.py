@@ -1,0 +1,412 @@
+"""Where the camera went, in metres: tracked points, gyroscope and accelerometer together (eqs 4-6, after VINS-Mono 2018).
+
+A capture is cut into stretches, each with its own gravity, accelerometer bias and delay; a stretch into windows of a few
+seconds, each with its own velocity and plane.  Within a window the velocity at any instant follows by integrating the
+accelerometer.  Scale comes from accelerations only: whether the motion determines it is judged window by window, and
+a window that fails gives its reason instead of a velocity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Frame
+from virest.motion.observed_tracks import WINDOW_S, ObservedTracks
+from virest.motion.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT, TIME_OFFSET
+from virest.motion.scene_motion import InertialMotion
+from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
+from virest.motion.track_model import TrackTable, centre, ground
+
+Array = NDArray[np.float64]
+STRETCH_S = 14.0
+"""Windows that share gravity and the accelerometer's bias; in this time a gyroscope drifts by a few mrad."""
+RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
+"""Frames to be tracked: runs of consecutive ones, spread over each window."""
+POINTS_PER_WINDOW = 1600
+MIN_PAIRS = 8
+MIN_POINTS = 200
+START_INVERSE_DEPTH_PER_M = 0.5
+MAX_RELATIVE_STD = 0.1
+"""Of the scale, and of the velocity over its rms within a window; beyond it rotation alone restores better or as well."""
+MIN_PARALLAX = 1.15
+"""Rotation alone must leave this many times what is left with translation."""
+MAX_LEFT = 0.3
+"""Part of the parallax's power that the accelerometer's path may leave unexplained."""
+MAX_SPREAD = 0.6
+"""Spread of inverse depths about the plane, as part of its inverse depth."""
+GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
+CAUCHY, RAYLEIGH_MEDIAN = 2.4, 1.1774
+OFFSET_PRIOR_S, ROTATION_PRIOR_RAD, READOUT_PRIOR_S = 0.03, 0.03, 0.03
+"""How far a profile that states a value may be wrong: these are fitted along so that they do not pass for parallax."""
+NEAR_WINDOW_S = 1.5
+"""Frames this far beyond a window's tracked points still take its velocity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A few seconds, judged."""
+
+    start_s: float
+    """First tracked frame's stamp, camera clock."""
+    end_s: float
+    scale_std: float
+    """Relative standard deviation of the metric scale: that of the plane's inverse depth along the optical axis."""
+    velocity_std: float
+    """rms standard deviation of the velocity over its rms."""
+    parallax: float
+    """What rotation alone leaves over what is left with translation."""
+    residual: float
+    """Robust standard deviation of what is left, in units of the tracking noise."""
+    reason: str
+    """Why the window's velocity is not to be used; empty: it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Windows fitted together."""
+
+    fit: TrackFit
+    table: TrackTable
+    windows: tuple[Window, ...]
+
+    @property
+    def scene(self) -> InertialMotion:
+        """The fitted path and planes."""
+        assert isinstance(self.fit.scene, InertialMotion)
+        return self.fit.scene
+
+    @property
+    def scene_covariance(self) -> Array:
+        """Of the scene's vector."""
+        terms = len(self.fit.change)
+        return self.fit.covariance[terms:, terms:]
+
+    def origin_s(self, window: int) -> float:
+        """Middle of a window, IMU clock."""
+        return float(self.fit.profile.imu_time_s(self.table.origin_s[window]))
+
+    def velocity(self, window: int, time_s: Array) -> tuple[Array, Array]:
+        """Velocity (n, 3) of the camera's centre in world axes and its covariance (n, 3, 3), IMU clock (n,)."""
+        moves, scene, origin = self.fit.ground.displacement, self.scene, np.array([self.origin_s(window)])
+        assert moves is not None
+        since = (time_s - origin)[:, None]
+        per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin, 1)).reshape(-1, 3, 3)
+        per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin, 1)
+        velocity = (
+            scene.velocity_m_s[window] + moves.path(time_s, 1) - moves.path(origin, 1) + since * scene.gravity_m_s2
+        )
+        velocity = velocity - per_bias @ scene.accel_bias_m_s2 + per_delay * scene.accel_delay_s
+        velocity = velocity + self._arm_velocity(time_s)
+        each = np.broadcast_to(np.eye(3), (len(time_s), 3, 3))
+        slope = np.concatenate([each * since[..., None], -per_bias, per_delay[..., None], each], axis=-1)
+        chosen = [*range(7), *range(7 + 6 * window, 10 + 6 * window)]
+        return velocity, slope @ self.scene_covariance[np.ix_(chosen, chosen)] @ np.swapaxes(slope, -1, -2)
+
+    def _arm_velocity(self, time_s: Array) -> Array:
+        """What the IMU's distance from the camera adds: −R (ω × p_cam_imu)."""
+        known = self.fit.ground
+        assert known.displacement is not None
+        turning = np.cross(known.trajectory.rate_rad_s(time_s), known.displacement.arm_cam_m)
+        return -np.einsum("nij,nj->ni", known.trajectory.orientation(time_s), turning)
+
+    def place(self, window: int, time_s: Array) -> Array:
+        """Camera's centre (n, 3) from its place at the window's middle, world axes."""
+        moves = self.fit.ground.displacement
+        assert moves is not None
+        velocity = np.broadcast_to(self.scene.velocity_m_s[window], (len(time_s), 3))
+        return centre(moves, self.scene, velocity, time_s, np.full(len(time_s), self.origin_s(window)))[0]
+
+    def plane(self, window: int, time_s: float) -> Array:
+        """The window's plane (3,) in camera axes at a time: the inverse depth of a ray r with z = 1 is plane · r."""
+        plane = self.scene.plane_per_m[window]
+        distance = max(1 - float(plane @ self.place(window, np.array([time_s]))[0]), 0.05)
+        return np.asarray(self.fit.ground.trajectory.orientation(time_s).T @ plane / distance)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraVelocity:
+    """The camera at one instant."""
+
+    stretch: Stretch
+    window: int
+    time_s: float
+    """IMU clock of the fit."""
+    velocity_m_s: Array
+    """(3,) of the centre, camera axes at the instant."""
+    std_m_s: Array
+    """(3,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class VisualInertialAlignment:
+    """Velocity, gravity, scale and accelerometer bias along a capture, as far as its motion determines them."""
+
+    stretches: tuple[Stretch, ...]
+    reason: str
+    """Why nothing could be fitted at all; empty otherwise."""
+
+    @property
+    def windows(self) -> tuple[Window, ...]:
+        """All windows in order of time."""
+        return tuple(window for stretch in self.stretches for window in stretch.windows)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether any window's velocity may be used."""
+        return any(not window.reason for window in self.windows)
+
+    @property
+    def refused(self) -> str:
+        """Why not all windows may be used, the commonest reason first; empty if all may."""
+        if self.reason:
+            return self.reason
+        reasons = [window.reason for window in self.windows if window.reason]
+        return max(reasons, key=reasons.count) if reasons else ""
+
+    def find(self, camera_time_s: float) -> tuple[Stretch, int] | str:
+        """The window that an instant (camera clock) belongs to, or why there is none."""
+        at = [(s, k, _distance(w, camera_time_s), w) for s in self.stretches for k, w in enumerate(s.windows)]
+        near = [entry for entry in at if entry[2] <= NEAR_WINDOW_S]
+        if not near:
+            return self.reason or "no tracked points about this frame"
+        good = [entry for entry in near if not entry[3].reason]
+        if not good or min(entry[2] for entry in good) > min(entry[2] for entry in near) + 0.5 * NEAR_WINDOW_S:
+            return min(near, key=lambda entry: entry[2])[3].reason
+        stretch, window, _, _ = min(good, key=lambda entry: entry[2])
+        return stretch, window
+
+    def at(self, camera_time_s: float) -> CameraVelocity | str:
+        """Velocity at an instant on the camera's clock, in camera axes; or why it is not known."""
+        found = self.find(camera_time_s)
+        if isinstance(found, str):
+            return found
+        stretch, window = found
+        time_s = float(stretch.fit.profile.imu_time_s(camera_time_s))
+        velocity, covariance = stretch.velocity(window, np.array([time_s]))
+        back = stretch.fit.ground.trajectory.orientation(time_s).T
+        std = np.sqrt(np.diag(back @ covariance[0] @ back.T))
+        return CameraVelocity(stretch, window, time_s, back @ velocity[0], std)
+
+    def clock(self) -> tuple[float, float] | None:
+        """Time offset and its standard deviation over the trusted stretches; None: there are none."""
+        found = [s for s in self.stretches if any(not w.reason for w in s.windows)]
+        if not found:
+            return None
+        offset = np.array([s.fit.profile.time_offset_s or 0.0 for s in found])
+        std = np.array([s.fit.std(TIME_OFFSET.name)[0] for s in found])
+        return _mean(offset, np.maximum(std, 1e-6))
+
+    def gyro_bias(self) -> tuple[Array, Array] | None:
+        """Gyroscope bias (3,) and its standard deviations over the trusted stretches."""
+        found = [s for s in self.stretches if any(not w.reason for w in s.windows)]
+        if not found:
+            return None
+        values = np.array([s.fit.profile.gyro_bias_rad_s for s in found])
+        stds = np.maximum([s.fit.std(GYRO_BIAS.name) for s in found], 1e-7)
+        pairs = [_mean(values[:, k], stds[:, k]) for k in range(3)]
+        return np.array([value for value, _ in pairs]), np.array([std for _, std in pairs])
+
+
+def _distance(window: Window, time_s: float) -> float:
+    return max(window.start_s - time_s, time_s - window.end_s, 0.0)
+
+
+def _mean(value: Array, std: Array) -> tuple[float, float]:
+    """Weighted mean and its standard deviation, widened where the values disagree."""
+    weight = std**-2.0
+    mean = float((weight * value).sum() / weight.sum())
+    disagreement = float((((value - mean) / std) ** 2).sum()) / max(len(value) - 1, 1)
+    return mean, float(np.sqrt(max(disagreement, 1.0) / weight.sum()))
+
+
+# ── which frames ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def choose_runs(frames: Sequence[Frame]) -> list[int]:
+    """Movie indices to decode and track: runs of consecutive usable frames, spread over windows of the capture."""
+    usable = [frame for frame in frames if frame.skip_reason is None]
+    if not usable:
+        return []
+    time_s = np.array([frame.time_s for frame in usable])
+    parts = max(int(np.ceil((time_s[-1] - time_s[0]) / WINDOW_S)), 1) * RUNS_PER_WINDOW
+    edges = np.linspace(time_s[0], time_s[-1], parts + 1)[1:-1]
+    chosen: set[int] = set()
+    for part in np.split(np.arange(len(usable)), np.searchsorted(time_s, edges)):
+        chosen.update(_run(usable, part))
+    return sorted(chosen)
+
+
+def _run(usable: Sequence[Frame], part: NDArray[np.intp]) -> list[int]:
+    """The unbroken run nearest to the middle of a part, or the whole of a short one."""
+    if len(part) <= RUN_FRAMES:
+        return [usable[int(k)].index for k in part]
+    starts = part[: len(part) - RUN_FRAMES + 1]
+    order = np.argsort(np.abs(starts - starts.mean()), kind="stable")
+    for start in starts[order]:
+        run = [usable[int(k)].index for k in range(int(start), int(start) + RUN_FRAMES)]
+        if run[-1] - run[0] == RUN_FRAMES - 1:
+            return run
+    return []
+
+
+# ── the fit ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def align(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, depth_m: float | None = None
+) -> VisualInertialAlignment:
+    """Fit velocity, gravity, accelerometer bias and planes to tracked points, and judge what the motion determines.
+
+    Clock, IMU rotation and gyroscope bias are fitted along, within what a careful profile may be off; unknown ones
+    (time_offset_s None) freely.  depth_m: of the scene where the profile states it; the scale then needs no
+    acceleration.  Never raises for poor data: windows carry their reasons.
+    """
+    if profile.intrinsics is None:
+        return VisualInertialAlignment((), "the focal length is unknown")
+    observed = observed.covered(imu, profile)
+    if len(observed.pairs) < MIN_PAIRS:
+        return VisualInertialAlignment((), f"{len(observed.pairs)} pairs of frames with enough points to follow")
+    if ground(imu, profile, translation=True).displacement is None:
+        return VisualInertialAlignment((), "no accelerometer to tell the camera's path")
+    stretches = []
+    for part in _parts(observed):
+        stretch = _fit_stretch(part, imu, profile, depth_m)
+        if stretch is not None:
+            stretches.append(stretch)
+    return VisualInertialAlignment(tuple(stretches), "" if stretches else "too few points to follow")
+
+
+def _parts(observed: ObservedTracks) -> list[ObservedTracks]:
+    """Stretches of about STRETCH_S, in whole windows."""
+    middle = np.array([observed.stamp_s[pair.second] for pair in observed.pairs])
+    count = max(int(np.ceil((middle[-1] - middle[0]) / STRETCH_S)), 1)
+    edges = np.linspace(middle[0], middle[-1], count + 1)[1:-1]
+    number = np.searchsorted(edges, middle, side="right")
+    return [observed.chosen(number == k) for k in range(count)]
+
+
+def nuisance_terms(profile: CameraProfile) -> tuple[Term, ...]:
+    """What is fitted beside the scene: everything that could pass for parallax."""
+    known = profile.time_offset_s is not None and "time_offset_s" not in profile.estimates
+    offset = replace(TIME_OFFSET, prior_std=(OFFSET_PRIOR_S,)) if known else TIME_OFFSET
+    terms = [offset, GYRO_BIAS, replace(IMU_ROTATION, prior_std=(ROTATION_PRIOR_RAD,) * 3)]
+    if not profile.readout_known:
+        terms.append(replace(READOUT, prior_std=(READOUT_PRIOR_S,)))
+    focal = profile.estimates.get("fx_px")
+    if focal is not None and focal.std and profile.intrinsics is not None:
+        terms.append(replace(FOCAL, prior_std=(float(focal.std) / profile.intrinsics.fx_px,)))
+    return tuple(terms)
+
+
+def _fit_stretch(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, depth_m: float | None
+) -> Stretch | None:
+    if len(observed.pairs) < MIN_PAIRS:
+        return None
+    span_s = observed.stamp_s[observed.pairs[-1].second] - observed.stamp_s[observed.pairs[0].first]
+    table = observed.table(POINTS_PER_WINDOW * max(int(np.ceil(span_s / WINDOW_S)), 1))
+    if len(table) < MIN_POINTS:
+        return None
+    terms = nuisance_terms(profile)
+    still = fit_tracks(imu, table, profile, terms)
+    known = ground(imu, profile, translation=True)
+    inverse_depth = START_INVERSE_DEPTH_PER_M if depth_m is None else 1 / depth_m
+    scene = start_scene(imu, known, table, inverse_depth)
+    fit = fit_tracks(imu, table, profile, terms, scene, known=known)
+    if depth_m is not None:
+        fit = _at_depth(fit, imu, table, profile, terms, depth_m)
+    stretch = Stretch(fit, table, ())
+    windows = tuple(_judged(stretch, still, k, depth_m) for k in range(table.n_windows))
+    return replace(stretch, windows=windows)
+
+
+class _HeldPlane(InertialMotion):
+    """Planes at a stated depth: only as free as the statement is vague."""
+
+    __slots__ = ()
+
+    def with_vector(self, vector: Array) -> _HeldPlane:
+        moved = InertialMotion.with_vector(self, vector)
+        return _HeldPlane(
+            moved.velocity_m_s, moved.gravity_m_s2, moved.accel_bias_m_s2, moved.accel_delay_s, moved.plane_per_m
+        )
+
+    def prior_std(self) -> Array:
+        std = InertialMotion.prior_std(self)
+        own = std[7:].reshape(-1, 6)
+        own[:, :3] = 10.0
+        own[:, 3:] = STATED_DEPTH_STD * np.linalg.norm(self.plane_per_m, axis=-1)[:, None]
+        return std
+
+
+STATED_DEPTH_STD = 0.02
+
+
+def _at_depth(
+    fit: TrackFit, imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: tuple[Term, ...], depth_m: float
+) -> TrackFit:
+    """Fit again with each window's plane at the stated depth along the optical axis, tilted as the pictures say."""
+    scene = fit.scene
+    assert isinstance(scene, InertialMotion)
+    origin = np.asarray(profile.imu_time_s(table.origin_s))
+    axis = fit.ground.trajectory.orientation(origin)[:, :, 2]
+    ratio = (1 / depth_m) / np.maximum((scene.plane_per_m * axis).sum(axis=-1), 0.02)[:, None]
+    held = _HeldPlane(
+        scene.velocity_m_s / ratio,
+        scene.gravity_m_s2,
+        scene.accel_bias_m_s2,
+        scene.accel_delay_s,
+        scene.plane_per_m * ratio,
+    )
+    return fit_tracks(imu, table, profile, terms, held)
+
+
+# ── judgement ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | None) -> Window:
+    fit, table = stretch.fit, stretch.table
+    mine = table.window == window
+    start_s, end_s = float(table.first_stamp_s[mine].min()), float(table.second_stamp_s[mine].max())
+    times = np.asarray(fit.profile.imu_time_s(np.linspace(start_s, end_s, 32)))
+    velocity, covariance = stretch.velocity(window, times)
+    spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean())
+    speed = max(float(np.sqrt((velocity**2).sum(axis=-1).mean())), 1e-6)
+    axis = fit.ground.trajectory.orientation(stretch.origin_s(window))[:, 2]
+    part = slice(10 + 6 * window, 13 + 6 * window)
+    inverse = max(float(stretch.scene.plane_per_m[window] @ axis), 1e-6)
+    scale_std = float(np.sqrt(axis @ stretch.scene_covariance[part, part] @ axis)) / inverse
+    left, before = _left(fit, mine), _left(still, mine)
+    found = Window(start_s, end_s, scale_std, float(spread) / speed, before / max(left, 1e-6), left, "")
+    gravity = float(np.linalg.norm(stretch.scene.gravity_m_s2))
+    return replace(found, reason=_reason(found, gravity, fit.depth_spread_per_m / inverse, before))
+
+
+def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
+    """Robust standard deviation per coordinate of a window's whitened differences, from their Cauchy weights."""
+    squared = np.maximum(1 / np.maximum(fit.weight[mine], 1e-9) - 1, 0.0) * (CAUCHY * fit.scale) ** 2
+    return float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN
+
+
+def _reason(found: Window, gravity_m_s2: float, spread: float, before: float) -> str:
+    if found.parallax < MIN_PARALLAX:
+        return f"no parallax to speak of: rotation alone leaves {found.parallax:.2f} times what translation does"
+    unexplained = max(found.residual**2 - 1, 0.0) / max(before**2 - 1, 1e-6)
+    if unexplained > MAX_LEFT or abs(gravity_m_s2 - GRAVITY_M_S2) > GRAVITY_TOLERANCE_M_S2:
+        return (
+            f"the accelerometer does not fit the pictures: {unexplained:.0%} of the parallax unexplained, "
+            f"gravity {gravity_m_s2:.2f} m/s²"
+        )
+    if spread > MAX_SPREAD:
+        return f"no common plane: inverse depths spread by {spread:.0%}"
+    if found.scale_std > MAX_RELATIVE_STD:
+        return f"scale undetermined: ± {found.scale_std:.0%}"
+    if found.velocity_std > MAX_RELATIVE_STD:
+        return f"velocity undetermined: ± {found.velocity_std:.0%}"
+    return ""
