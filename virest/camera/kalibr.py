@@ -31,8 +31,9 @@ NOISE_WINDOW = 32
 """Samples of a window whose liveliness is judged at once."""
 STILLEST_PART = 0.25
 MIN_NOISE_SAMPLES = 2 * NOISE_WINDOW
-THIRD_DIFFERENCE_GAIN = 20.0
-"""Variance of white noise's third difference: 1 + 9 + 9 + 1."""
+DIFFERENCE_ORDER, DIFFERENCE_GAIN = 5, 252.0
+"""Variance of white noise's fifth difference: 1 + 25 + 100 + 100 + 25 + 1. A tremor of 12 Hz at 200 Hz passes with a
+two-thousandth of its amplitude; a lower order lets through as much of it as there is noise."""
 NORMAL_MEDIAN = 0.6745
 WALK_COMMENT = "not measured, which takes hours at rest: a usual value of phones"
 
@@ -274,8 +275,7 @@ def _commented(lines: list[str]) -> str:
 def measure_imu_noise(time_s: Array, gyro_rad_s: Array, accel_m_s2: Array) -> ImuNoise | None:
     """Measure the noise of samples (n,), (n, 3), (n, 3) that were taken in motion; None where there are too few.
 
-    Model: white noise on a hand's smooth motion.  Third differences of white noise have 20 times its variance and
-    suppress what is slow; windows are chosen by their motion, not by their noise, so the choice does not bias it.
+    Model: white noise on a hand's smooth motion.  High differences multiply the noise and suppress what is slow; windows are chosen by their motion, not by their noise, so the choice does not bias it.
     NaN in the accelerometer: its density is unknown.
     """
     if len(time_s) < MIN_NOISE_SAMPLES:
@@ -294,7 +294,7 @@ def _density(samples: Array, rate_hz: float) -> float | None:
     smooth = windows.reshape(count, 4, NOISE_WINDOW // 4, -1).mean(axis=2)
     liveliness = np.square(np.diff(smooth, axis=1)).sum(axis=(1, 2))
     still = windows[np.argsort(liveliness)[: max(round(STILLEST_PART * count), 1)]]
-    third = np.diff(still, n=3, axis=1)
-    deviation = np.median(np.abs(third), axis=(0, 1)) / NORMAL_MEDIAN / np.sqrt(THIRD_DIFFERENCE_GAIN)
+    jumps = np.diff(still, n=DIFFERENCE_ORDER, axis=1)
+    deviation = np.median(np.abs(jumps), axis=(0, 1)) / NORMAL_MEDIAN / np.sqrt(DIFFERENCE_GAIN)
     density = float(np.sqrt(np.mean(deviation**2) / rate_hz))
     return density if density > 0 else None

@@ -31,7 +31,7 @@ CAUCHY = 2.4
 REWEIGHTINGS = 6
 FEWEST_SPREAD = 0.02
 """A plane fitted to a whole window is trusted no better than to this part of its inverse depth at one frame."""
-RAYLEIGH_MEDIAN = 1.1774
+NORMAL_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +168,9 @@ def _robust_plane(rays: Array, inverse: Array, std: Array, start: Array, prior_s
     rows, left = rays / std[:, None], inverse / std
     for _ in range(REWEIGHTINGS):
         squared = (left - rows @ plane) ** 2
-        scale = max(float(np.sqrt(np.median(squared))) / 0.6745, 1.0)
+        scale = max(float(np.sqrt(np.median(squared))) / NORMAL_MEDIAN, 1.0)
         weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
         weighted = rows * (weight / scale**2)[:, None]
         covariance = np.linalg.inv(weighted.T @ rows + information)
         plane = covariance @ (weighted.T @ left + information @ start)
-    return plane, covariance, int((weight > 0.25).sum())
+    return np.asarray(plane), np.asarray(covariance), int((weight > 0.25).sum())

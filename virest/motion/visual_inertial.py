@@ -1,7 +1,7 @@
-"""Where the camera went, in metres: tracked points, gyroscope and accelerometer together (eqs 4-6, after VINS-Mono 2018).
+"""Where the camera went, in metres: tracked points, gyroscope and accelerometer together (eqs 4-6; after VINS-Mono).
 
-A capture is cut into stretches, each with its own gravity, accelerometer bias and delay; a stretch into windows of a few
-seconds, each with its own velocity and plane.  Within a window the velocity at any instant follows by integrating the
+A capture is cut into stretches, each with its own gravity, accelerometer bias and delay; a stretch into windows of a
+few seconds, each with its own velocity and plane.  Within a window the velocity at any instant follows from the
 accelerometer.  Scale comes from accelerations only: whether the motion determines it is judged window by window, and
 a window that fails gives its reason instead of a velocity.
 """
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
+from virest.motion.depth import FrameDepth, TriangulatedPoints, frame_depth, triangulate
 from virest.motion.observed_tracks import WINDOW_S, ObservedTracks
 from virest.motion.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT, TIME_OFFSET
 from virest.motion.scene_motion import InertialMotion
@@ -28,15 +29,15 @@ STRETCH_S = 14.0
 """Windows that share gravity and the accelerometer's bias; in this time a gyroscope drifts by a few mrad."""
 RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
 """Frames to be tracked: runs of consecutive ones, spread over each window."""
-POINTS_PER_WINDOW = 1600
+POINTS_PER_WINDOW = 800
 MIN_PAIRS = 8
 MIN_POINTS = 200
 START_INVERSE_DEPTH_PER_M = 0.5
 MAX_RELATIVE_STD = 0.1
-"""Of the scale, and of the velocity over its rms within a window; beyond it rotation alone restores better or as well."""
+"""Of the scale, and of the velocity over its rms within a window; beyond it rotation alone does as well."""
 MIN_PARALLAX = 1.15
 """Rotation alone must leave this many times what is left with translation."""
-MAX_LEFT = 0.3
+MAX_LEFT = 0.15
 """Part of the parallax's power that the accelerometer's path may leave unexplained."""
 MAX_SPREAD = 0.6
 """Spread of inverse depths about the plane, as part of its inverse depth."""
@@ -44,6 +45,10 @@ GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
 CAUCHY, RAYLEIGH_MEDIAN = 2.4, 1.1774
 OFFSET_PRIOR_S, ROTATION_PRIOR_RAD, READOUT_PRIOR_S = 0.03, 0.03, 0.03
 """How far a profile that states a value may be wrong: these are fitted along so that they do not pass for parallax."""
+STATED_DEPTH_STD = 0.02
+"""How far a profile's depth may be off, part of it."""
+TRACKING_BIAS_PX = 0.04
+"""Tracking's own bias under blur and codec: a steady error of a step, which is an error of the velocity."""
 NEAR_WINDOW_S = 1.5
 """Frames this far beyond a window's tracked points still take its velocity."""
 
@@ -74,6 +79,9 @@ class Stretch:
     fit: TrackFit
     table: TrackTable
     windows: tuple[Window, ...]
+    points: TriangulatedPoints
+    velocity_floor_m_s: Array
+    """(windows,) what tracking's own bias makes of the velocity."""
 
     @property
     def scene(self) -> InertialMotion:
@@ -106,7 +114,8 @@ class Stretch:
         each = np.broadcast_to(np.eye(3), (len(time_s), 3, 3))
         slope = np.concatenate([each * since[..., None], -per_bias, per_delay[..., None], each], axis=-1)
         chosen = [*range(7), *range(7 + 6 * window, 10 + 6 * window)]
-        return velocity, slope @ self.scene_covariance[np.ix_(chosen, chosen)] @ np.swapaxes(slope, -1, -2)
+        covariance = slope @ self.scene_covariance[np.ix_(chosen, chosen)] @ np.swapaxes(slope, -1, -2)
+        return velocity, covariance + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
 
     def _arm_velocity(self, time_s: Array) -> Array:
         """What the IMU's distance from the camera adds: −R (ω × p_cam_imu)."""
@@ -130,17 +139,16 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True)
-class CameraVelocity:
-    """The camera at one instant."""
+class FrameMotion:
+    """The camera's centre over one frame, and what it looked at; camera axes at the frame's reference time."""
 
-    stretch: Stretch
-    window: int
-    time_s: float
-    """IMU clock of the fit."""
     velocity_m_s: Array
-    """(3,) of the centre, camera axes at the instant."""
+    """(3,) at the reference time."""
     std_m_s: Array
-    """(3,)."""
+    """(3,) standard deviations of the velocity."""
+    acceleration_m_s2: Array
+    """(3,) mean over the frame, without gravity."""
+    depth: FrameDepth
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,17 +189,30 @@ class VisualInertialAlignment:
         stretch, window, _, _ = min(good, key=lambda entry: entry[2])
         return stretch, window
 
-    def at(self, camera_time_s: float) -> CameraVelocity | str:
-        """Velocity at an instant on the camera's clock, in camera axes; or why it is not known."""
-        found = self.find(camera_time_s)
+    def frame(self, reference_s: float, start_s: float, end_s: float) -> FrameMotion | str:
+        """Motion over a frame that is taken from start_s to end_s, camera clock; or why it is not known."""
+        found = self.find(0.5 * (start_s + end_s))
         if isinstance(found, str):
             return found
         stretch, window = found
-        time_s = float(stretch.fit.profile.imu_time_s(camera_time_s))
-        velocity, covariance = stretch.velocity(window, np.array([time_s]))
-        back = stretch.fit.ground.trajectory.orientation(time_s).T
-        std = np.sqrt(np.diag(back @ covariance[0] @ back.T))
-        return CameraVelocity(stretch, window, time_s, back @ velocity[0], std)
+        known = stretch.fit.ground
+        time_s = np.asarray(known.profile.imu_time_s(np.array([reference_s, start_s, max(end_s, start_s + 1e-3)])))
+        velocity, covariance = stretch.velocity(window, time_s)
+        rotation = known.trajectory.orientation(time_s[0])
+        std = np.sqrt(np.diag(rotation.T @ covariance[0] @ rotation))
+        acceleration = (velocity[2] - velocity[1]) / (time_s[2] - time_s[1])
+        depth = frame_depth(
+            stretch.points,
+            window,
+            float(time_s[0]),
+            rotation,
+            stretch.place(window, time_s[:1])[0],
+            known.lens,
+            stretch.plane(window, float(time_s[0])),
+            stretch.fit.depth_spread_per_m,
+            stretch.windows[window].scale_std,
+        )
+        return FrameMotion(velocity[0] @ rotation, std, acceleration @ rotation, depth)
 
     def clock(self) -> tuple[float, float] | None:
         """Time offset and its standard deviation over the trusted stretches; None: there are none."""
@@ -299,8 +320,8 @@ def nuisance_terms(profile: CameraProfile) -> tuple[Term, ...]:
     if not profile.readout_known:
         terms.append(replace(READOUT, prior_std=(READOUT_PRIOR_S,)))
     focal = profile.estimates.get("fx_px")
-    if focal is not None and focal.std and profile.intrinsics is not None:
-        terms.append(replace(FOCAL, prior_std=(float(focal.std) / profile.intrinsics.fx_px,)))
+    if focal is not None and isinstance(focal.std, float) and focal.std and profile.intrinsics is not None:
+        terms.append(replace(FOCAL, prior_std=(focal.std / profile.intrinsics.fx_px,)))
     return tuple(terms)
 
 
@@ -321,9 +342,20 @@ def _fit_stretch(
     fit = fit_tracks(imu, table, profile, terms, scene, known=known)
     if depth_m is not None:
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
-    stretch = Stretch(fit, table, ())
+    assert isinstance(fit.scene, InertialMotion)
+    points = triangulate(fit.ground, fit.scene, table)
+    stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table))
     windows = tuple(_judged(stretch, still, k, depth_m) for k in range(table.n_windows))
     return replace(stretch, windows=windows)
+
+
+def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
+    """A steady error of TRACKING_BIAS_PX a step, at each window's depth."""
+    assert isinstance(fit.scene, InertialMotion)
+    assert fit.profile.intrinsics is not None
+    step_s = float(np.median(table.second_stamp_s - table.first_stamp_s))
+    depth_m = 1 / np.maximum(np.linalg.norm(fit.scene.plane_per_m, axis=-1), 1e-3)
+    return np.asarray(TRACKING_BIAS_PX / fit.profile.intrinsics.fx_px * depth_m / max(step_s, 1e-3))
 
 
 class _HeldPlane(InertialMotion):
@@ -343,9 +375,6 @@ class _HeldPlane(InertialMotion):
         own[:, :3] = 10.0
         own[:, 3:] = STATED_DEPTH_STD * np.linalg.norm(self.plane_per_m, axis=-1)[:, None]
         return std
-
-
-STATED_DEPTH_STD = 0.02
 
 
 def _at_depth(

@@ -12,11 +12,20 @@ from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s, outside_reason
-from virest.degradation.row_motion import FrameTranslation, row_motion
-from virest.motion.alignment import OffsetEstimate, check_agreement, choose_pairs, estimate_time_offset
+from virest.degradation.row_motion import FrameTranslation, frame_times_s, row_motion
+from virest.motion.alignment import (
+    AGREEMENT_SLACK_S,
+    OffsetEstimate,
+    check_agreement,
+    choose_pairs,
+    estimate_time_offset,
+)
+from virest.motion.coarse_alignment import align_coarsely
 from virest.motion.integration import integrate_gyro
+from virest.motion.observed_tracks import observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
+from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.frame import (
     RestoredFrame,
     copied_frame,
@@ -32,6 +41,11 @@ MAX_OFFSET_STD_S = 0.003
 paths, would be off by 0.1 rad/s."""
 MAX_FOCAL_SPREAD = 0.05
 """An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
+MIN_COARSE_EXPLAINED = 0.5
+"""Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
+OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
+"""A stated offset this far from the pictures' is warned of; a bias below three of this may be tracking's own."""
+NOT_ESTIMATED = "translation and depth not estimated: rotation only"
 FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
 
 
@@ -143,16 +157,129 @@ def plan_restoration(
     )
     if not any(f.skip_reason is None for f in frames):
         return plan
-    tracked = track_pairs(read_gray(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0)))
-    pairs = _through_resting_lens(tracked, capture, profile)
+    chosen = set(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0))
+    runs = choose_runs(frames) if _wants_translation(profile, capture) else []
+    all_pairs = track_pairs(read_gray(sorted(chosen.union(runs))))
+    tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
-        plan = _filled(plan, capture, pairs)
+        plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))
+    alignment = None
+    if runs and plan.profile.intrinsics is not None:
+        alignment = _aligned(plan.profile, profile, capture, all_pairs)
+        plan = _with_clock(plan, profile, alignment)
+    if plan.copy_reason is None and not _clock_agrees(alignment, plan.profile):
         pairs = _through_resting_lens(tracked, capture, plan.profile)
-    if plan.copy_reason is None:
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
         if not agreement.agrees:
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
-    return plan
+    if alignment is None or plan.copy_reason is not None:
+        return plan
+    return _with_translations(plan, capture, alignment)
+
+
+# ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _wants_translation(profile: CameraProfile, capture: Capture) -> bool:
+    """A scene at infinity has no parallax; without an accelerometer there is no displacement in metres."""
+    far = profile.depth_m is not None and np.isinf(profile.depth_m)
+    return not far and bool(np.isfinite(capture.imu.accel_m_s2).all(axis=1).any())
+
+
+def _aligned(
+    filled: CameraProfile, given: CameraProfile, capture: Capture, pairs: list[TrackPair]
+) -> VisualInertialAlignment:
+    """Fit the translation; where the offset could not be told from turns alone, from where they agree best."""
+    observed = observe_tracks(capture, pairs, filled)
+    start = filled
+    if given.time_offset_s is None and "time_offset_s" not in filled.estimates and len(observed.pairs):
+        coarse = align_coarsely(observed.turns(filled), capture.imu, filled)
+        if coarse is None or coarse.explained < MIN_COARSE_EXPLAINED or coarse.at_end:
+            return VisualInertialAlignment((), "the clocks of pictures and gyroscope are not known")
+        offset_s = coarse.time_offset_s
+        start = filled.with_estimate("time_offset_s", offset_s, None, "coarse", time_offset_s=offset_s)
+    return align(observed, capture.imu, start, given.depth_m)
+
+
+def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualInertialAlignment) -> RestorationPlan:
+    """Take the joint fit's offset and bias over where the profile has none; say where it contradicts a stated one."""
+    clock, bias = alignment.clock(), alignment.gyro_bias()
+    if clock is None or bias is None:
+        return plan
+    offset_s, std_s = clock
+    if given.time_offset_s is not None:
+        if abs(offset_s - given.time_offset_s) < max(OFFSET_DOUBT_S, 3 * std_s):
+            return plan
+        said = f"the pictures put the time offset at {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
+        return replace(plan, warnings=(*plan.warnings, said))
+    source = "tracked points against gyroscope and accelerometer"
+    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
+    values, spread = bias[0], np.hypot(bias[1], BIAS_FLOOR_RAD_S)
+    if np.any(np.abs(values) > 3 * spread):
+        held = tuple(float(value) for value in values)
+        profile = profile.with_estimate("gyro_bias_rad_s", list(held), spread.tolist(), source, gyro_bias_rad_s=held)
+    warnings = tuple(text for text in plan.warnings if not text.startswith("time offset"))
+    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
+    copy = None if plan.copy_reason and plan.copy_reason.startswith("time offset") else plan.copy_reason
+    return replace(plan, profile=profile, warnings=(*warnings, said), copy_reason=copy)
+
+
+def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:
+    """Whether a trusted joint fit already shows that pictures and gyroscope belong together."""
+    clock = None if alignment is None else alignment.clock()
+    return clock is not None and abs(clock[0] - (profile.time_offset_s or 0.0)) < AGREEMENT_SLACK_S
+
+
+def _with_translations(plan: RestorationPlan, capture: Capture, alignment: VisualInertialAlignment) -> RestorationPlan:
+    """Velocity, acceleration and plane of every frame that has them, and an account of both kinds."""
+    profile, reference = plan.profile, plan.settings.reference
+    frames = [f for f in at_true_times(capture.frames, profile, capture.repeats) if np.isfinite(f.time_s)]
+    motions = {frame.index: _motion(alignment, profile, frame, reference) for frame in frames}
+    known = {index: motion for index, motion in motions.items() if isinstance(motion, FrameMotion)}
+    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
+    if not known:
+        return replace(plan, warnings=(*warnings, f"{NOT_ESTIMATED} ({alignment.refused or 'no frames'})"))
+    open_frames = [motion for index, motion in motions.items() if index not in known]
+    if open_frames:
+        reason = max(map(str, open_frames), key=[str(motion) for motion in open_frames].count)
+        warnings = (*warnings, f"{NOT_ESTIMATED} in {len(open_frames)} of {len(motions)} frames ({reason})")
+    translations = {index: _translation(motion, profile.depth_m) for index, motion in known.items()}
+    return replace(
+        plan, warnings=warnings, notes=(*plan.notes, _account(list(known.values()))), translations=translations
+    )
+
+
+def _motion(
+    alignment: VisualInertialAlignment, profile: CameraProfile, frame: Frame, reference: str
+) -> FrameMotion | str:
+    """Motion over the frame's exposure and readout, at the instants that the alignment's own clock gives them."""
+    start_s, reference_s = frame_times_s(profile, frame.time_s, frame.exposure_s, reference)
+    last_s = start_s + profile.shutter.readout_time_s + profile.shutter.true_exposure_s(frame.exposure_s or 0.0)
+    camera = [(t - (profile.time_offset_s or 0.0)) / (1 + profile.clock_skew) for t in (reference_s, start_s, last_s)]
+    return alignment.frame(*camera)
+
+
+def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTranslation:
+    """A stated depth is the one logged; the plane is then tilted as the pictures say, at that depth."""
+    depth = motion.depth
+    return FrameTranslation(
+        motion.velocity_m_s,
+        motion.acceleration_m_s2,
+        depth.plane_per_m,
+        depth.depth_m if stated_depth_m is None else stated_depth_m,
+        "triangulated" if stated_depth_m is None else "profile",
+    )
+
+
+def _account(known: list[FrameMotion]) -> str:
+    depth, std = (np.median([getattr(m.depth, name) for m in known]) for name in ("depth_m", "std_m"))
+    speed = np.sqrt(np.mean([(m.velocity_m_s**2).sum() for m in known]))
+    spread = np.sqrt(np.mean([(m.std_m_s**2).sum() for m in known]))
+    points = int(np.median([m.depth.points for m in known]))
+    return (
+        f"translation of {len(known)} frames from pictures and accelerometer: velocity {speed:.3f} ± {spread:.3f} m/s "
+        f"rms, depth {depth:.2f} ± {std:.2f} m in the middle, from some {points} points a frame"
+    )
 
 
 def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
@@ -223,7 +350,7 @@ def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[str, ...]:
     if all(frame.exposure_s is None for frame in capture.frames):
         warnings.append("exposure times unknown: frames are not deblurred")
     if profile.depth_m is None:
-        warnings.append("translation and depth not estimated: rotation only")
+        warnings.append(NOT_ESTIMATED)
     return tuple(warnings)
 
 

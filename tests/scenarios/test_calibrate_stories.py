@@ -1,0 +1,273 @@
+"""Calibration from starts that are far off, and from captures that determine nothing: never confident and wrong."""
+
+import json
+import shutil
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from virest.app.simulate import simulate_command
+from virest.capture.video import probe_movie
+
+pytestmark = pytest.mark.scenario
+
+OFFSET_S, READOUT_S, DIRECTION = -0.044, 0.0227, "right_to_left"
+ROTATION, BIAS = (-0.014, 0.019, 0.008), (-0.012, 0.021, 0.009)
+TRUTH = {"time_offset_s": OFFSET_S, "readout_time_s": READOUT_S, "gyro_bias_rad_s": BIAS}
+SIZE = {"width": 300, "height": 400}
+LARGEST_SIGMA = 4.5
+LARGEST = {"time_offset_s": 2e-3, "readout_time_s": 2e-3, "rotation_rad": 8e-3, "gyro_bias_rad_s": 8e-3}
+
+
+def capture_with(folder: Path, **options: Any) -> Path:
+    """Simulate a phone held upright with everything basic hidden."""
+    hidden = [
+        f"time_offset={OFFSET_S}",
+        f"readout_time={READOUT_S}",
+        "imu_rotation={},{},{}".format(*ROTATION),
+        "gyro_bias={},{},{}".format(*BIAS),
+    ]
+    simulate_command(folder, frames=75, exposure_ms=7, rate_rad_s=1.2, direction=DIRECTION, crf=20, effects=hidden,
+                     **SIZE, **options)  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="session")
+def turned(work: Path) -> Path:
+    """A phone that is turned by hand in front of a far scene."""
+    return capture_with(work / "turned", seed=61)
+
+
+@pytest.fixture(scope="session")
+def walked(work: Path) -> Path:
+    """A phone that is turned and moved before a wall that it sees at an angle, 1.5 m away."""
+    return capture_with(work / "walked", seed=62, depth_m=1.5, sway_m=0.08, tilt_deg=(14.0, -21.0))
+
+
+def calibrate(virest: Any, capture: Path, folder: Path, *arguments: object) -> dict[str, Any]:
+    """Run ``virest calibrate --json``; it has to end with 0."""
+    folder.mkdir(exist_ok=True)
+    out = folder / "calibrated.yaml"
+    done = virest("calibrate", capture, "--json", "--out", out, *arguments, timeout=300)
+    assert done.returncode == 0, done.stderr
+    facts: dict[str, Any] = json.loads(done.stdout)
+    return facts
+
+
+def start_from(capture: Path, folder: Path, **changes: Any) -> Path:
+    """Write a profile like the capture's own with ``section__key`` changed, and return it."""
+    content = yaml.safe_load((capture / "camera.yaml").read_text())
+    for name, value in changes.items():
+        section, key = name.split("__")
+        content[section][key] = value
+    (folder / "start.yaml").write_text(yaml.safe_dump(content))
+    return folder / "start.yaml"
+
+
+def value_of(facts: dict[str, Any], name: str) -> dict[str, Any]:
+    """One entry of ``values``."""
+    return next(value for value in facts["values"] if value["name"] == name)
+
+
+def assert_true(facts: dict[str, Any], capture: Path) -> None:
+    """Offset, readout, sense, axes and bias are those that were hidden, within their standard deviations."""
+    for name, truth in TRUTH.items():
+        found = value_of(facts, name)
+        error = np.abs(np.array(found["value"]) - truth)
+        assert found["determined"], name
+        assert (error < LARGEST_SIGMA * np.array(found["std"])).all(), (name, found)
+        assert (error < LARGEST[name]).all(), (name, found)
+    assert value_of(facts, "readout_direction")["value"] == DIRECTION
+    assert rotation_error_rad(facts["profile"], capture) < LARGEST["rotation_rad"]
+
+
+def rotation_error_rad(profile: dict[str, Any], capture: Path) -> float:
+    """Angle between a profile's axes and the true ones."""
+    nominal = np.array(yaml.safe_load((capture / "camera.yaml").read_text())["imu"]["T_cam_imu"])[:3, :3]
+    truth = cv2.Rodrigues(np.array(ROTATION))[0] @ nominal
+    turn = np.array(profile["imu"]["T_cam_imu"])[:3, :3] @ truth.T
+    return float(np.linalg.norm(cv2.Rodrigues(turn)[0]))
+
+
+def assert_refused_or_open(done: Any, folder: Path) -> None:
+    """Either exit 6 with one line and no file, or an answer in which nothing counts as determined."""
+    if done.returncode == 0:
+        assert not [v["name"] for v in json.loads(done.stdout)["values"] if v["determined"]], done.stdout
+        return
+    errors = [line for line in done.stderr.splitlines() if line.startswith("virest: error: ")]
+    assert done.returncode == 6, done.stderr
+    assert len(errors) == 1, done.stderr
+    assert done.stdout == ""
+    assert not list(folder.glob("*.yaml*"))
+
+
+# ── starts that are far off ──────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"imu__time_offset_s": OFFSET_S + 0.5},
+        {"imu__time_offset_s": OFFSET_S - 0.5},
+        {"imu__time_offset_s": None, "shutter__readout_time_s": None},
+        {"imu__T_cam_imu": [[0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]},
+        {"shutter__readout_direction": "left_to_right"},
+        {"shutter__readout_direction": "top_to_bottom", "imu__time_offset_s": 0.3},
+    ],
+    ids=["500 ms late", "500 ms early", "nothing known", "other axes", "wrong sense", "wrong axis of the readout"],
+)
+def test_a_start_that_is_far_off_ends_at_the_truth(
+    virest: Any, turned: Path, tmp_path: Path, changes: dict[str, Any]
+) -> None:
+    """Half a second, any axes and any direction of the readout: the hidden values are found all the same."""
+    facts = calibrate(virest, turned, tmp_path / "out", "--config", start_from(turned, tmp_path, **changes))
+    assert_true(facts, turned)
+    assert facts["translation"] == "none"
+
+
+def test_a_camera_that_also_travels_is_calibrated(virest: Any, walked: Path, tmp_path: Path) -> None:
+    """With a slanted wall 1.5 m away and 8 cm of sway, the accelerometer's path explains the parallax."""
+    facts = calibrate(virest, walked, tmp_path / "out")
+    assert_true(facts, walked)
+    assert facts["translation"] != "none"
+    assert facts["residual_px"] < 1.5 * facts["noise_px"]
+
+
+def test_a_calibrated_profile_is_good_for_processing(virest: Any, turned: Path, tmp_path: Path) -> None:
+    """``process --config`` takes what ``calibrate`` wrote, and uses its offset and readout."""
+    calibrate(virest, turned, tmp_path / "cal")
+    arguments = ("--config", tmp_path / "cal" / "calibrated.yaml", "--deblur", "none", "--frames", "20:22", "--jobs", 1)
+    done = virest("process", turned, "--out", tmp_path / "run", "--json", *arguments)
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["status"] for line in lines] == ["restored", "restored"]
+    assert lines[0]["shutter"]["readout_time_s"] == pytest.approx(READOUT_S, abs=1e-3)
+
+
+def test_two_values_that_a_motion_cannot_part_are_named(virest: Any, turned: Path, tmp_path: Path) -> None:
+    """Everything that --with knows at once: each is near the truth, or said not to be determined."""
+    names = "focal,distortion,principal-point,gyro-scale,clock-skew"
+    facts = calibrate(virest, turned, tmp_path / "out", "--with", names)
+    lens = yaml.safe_load((turned / "camera.yaml").read_text())["intrinsics"]
+    truth = {"fx_px": lens["fx_px"], "k1": 0.0, "principal_point_px": [lens["cx_px"], lens["cy_px"]], "gyro_scale": 1.0,
+             "clock_skew": 0.0, **TRUTH}  # fmt: skip
+    for name, true in truth.items():
+        found = value_of(facts, name)
+        if found["determined"]:
+            error = np.abs(np.array(found["value"]) - true) / np.array(found["std"])
+            assert (error < LARGEST_SIGMA).all(), (name, found)
+        else:
+            assert name in facts["not_determined"]
+            assert found["value"] == found["start"] or name in TRUTH
+
+
+# ── nothing to be had ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_camera_at_rest_determines_nothing(virest: Any, tmp_path: Path) -> None:
+    """A phone on a tripod: refused."""
+    simulate_command(tmp_path / "still", frames=30, rate_rad_s=0.0, seed=63, **SIZE)
+    done = virest("calibrate", tmp_path / "still", "--json", cwd=tmp_path)
+    assert_refused_or_open(done, tmp_path)
+
+
+def test_a_scene_without_texture_determines_nothing(virest: Any, turned: Path, tmp_path: Path) -> None:
+    """A grey wall: only the sensor's noise moves."""
+    capture = copy(turned, tmp_path / "wall")
+    rng = np.random.default_rng(64)
+    times_us = stamps_us(capture)
+    pictures = (np.clip(rng.normal(118, 2, (SIZE["height"], SIZE["width"])), 0, 255) for _ in times_us)
+    write_movie(capture / "movie.mp4", times_us, pictures)
+    assert_refused_or_open(virest("calibrate", capture, "--json", cwd=tmp_path), tmp_path)
+
+
+def test_the_gyroscope_of_another_recording_is_not_believed(
+    virest: Any, turned: Path, walked: Path, tmp_path: Path
+) -> None:
+    """Another shake with the times made to fit: refused."""
+    capture = copy(turned, tmp_path / "mixed")
+    shift_ns = first_stamp_ns(turned) - first_stamp_ns(walked)
+    head, *rows = (walked / "gyro_accel.csv").read_text().splitlines()
+    moved = [f"{int(t) + shift_ns},{rest}" for t, rest in (row.split(",", 1) for row in rows)]
+    (capture / "gyro_accel.csv").write_text("\n".join([head, *moved]) + "\n")
+    assert_refused_or_open(virest("calibrate", capture, "--json", cwd=tmp_path), tmp_path)
+
+
+def test_a_steady_pan_determines_nothing(virest: Any, turned: Path, tmp_path: Path) -> None:
+    """Constant turning about one axis looks the same at every offset: refused."""
+    rate_rad_s = 0.25
+    capture = copy(turned, tmp_path / "pan")
+    times_us = stamps_us(capture)
+    focal = yaml.safe_load((turned / "camera.yaml").read_text())["intrinsics"]["fx_px"]
+    write_movie(capture / "movie.mp4", times_us, pan_pictures(times_us * 1e-6, rate_rad_s, focal))
+    head, *rows = (turned / "gyro_accel.csv").read_text().splitlines()
+    rng = np.random.default_rng(65)
+    turns = rng.normal(0, 0.0015, (len(rows), 3))
+    # x_cam = diag(1, −1, −1) x_imu: turning to the right is about the phone's −y
+    turns[:, 1] -= rate_rad_s
+    lines = [
+        f"{row.split(',')[0]},{x:.6f},{y:.6f},{z:.6f},0.1,9.8,0.2" for row, (x, y, z) in zip(rows, turns, strict=True)
+    ]
+    (capture / "gyro_accel.csv").write_text("\n".join([head, *lines]) + "\n")
+    assert_refused_or_open(virest("calibrate", capture, "--json", cwd=tmp_path), tmp_path)
+
+
+# ── real phones and cameras ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_pictures_that_the_camera_stabilised_are_refused(virest: Any, realdata: Path, tmp_path: Path) -> None:
+    """An action camera with its stabiliser on: exit 6, no file."""
+    done = virest("calibrate", realdata / "gopro_hero7", "--json", cwd=tmp_path, timeout=300)
+    assert_refused_or_open(done, tmp_path)
+
+
+# ── helpers ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def copy(capture: Path, folder: Path) -> Path:
+    """Copy a capture without its truth."""
+    return Path(shutil.copytree(capture, folder, ignore=shutil.ignore_patterns("truth")))
+
+
+def first_stamp_ns(capture: Path) -> int:
+    """Row 0 of frame_timestamps.txt."""
+    return int((capture / "frame_timestamps.txt").read_text().splitlines()[1].split(",")[0])
+
+
+def stamps_us(capture: Path) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Presentation times of a capture's movie, whole microseconds."""
+    return np.rint(probe_movie(capture / "movie.mp4").pts_s * 1e6).astype(np.int64)
+
+
+def write_movie(path: Path, times_us: np.ndarray[Any, Any], pictures: Any) -> None:
+    """Write grey pictures (h, w) in 0..255 at these times."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "14", "bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = SIZE["width"], SIZE["height"], "yuv420p"
+        stream.codec_context.time_base = stream.time_base = Fraction(1, 1_000_000)
+        for time_us, picture in zip(times_us, pictures, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture.astype(np.uint8), format="gray").reformat(format="yuv420p")
+            frame.pts, frame.time_base = int(time_us), Fraction(1, 1_000_000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def pan_pictures(time_s: np.ndarray[Any, Any], rate_rad_s: float, focal_px: float) -> Any:
+    """Yield what a pinhole camera with a global shutter sees of a far texture while it turns about y at one rate."""
+    rng = np.random.default_rng(66)
+    panorama = cv2.GaussianBlur(rng.uniform(0, 255, (SIZE["height"] * 2, SIZE["width"] * 6)), (0, 0), 2.5)
+    panorama = np.clip(118 + 6 * (panorama - panorama.mean()), 0, 255)
+    y, x = np.mgrid[: SIZE["height"], : SIZE["width"]].astype(float)
+    across, down = (x - (SIZE["width"] - 1) / 2) / focal_px, (y - (SIZE["height"] - 1) / 2) / focal_px
+    azimuth, height = np.arctan(across), down / np.hypot(1, across)
+    for t in time_s:
+        column = focal_px * (azimuth + rate_rad_s * (t - time_s.mean())) + panorama.shape[1] / 2
+        row = focal_px * height + panorama.shape[0] / 2
+        seen = cv2.remap(panorama, column.astype(np.float32), row.astype(np.float32), cv2.INTER_CUBIC)
+        yield np.clip(seen + rng.normal(0, 1.5, seen.shape), 0, 255)

@@ -1,0 +1,122 @@
+"""What a diagnosis says: causes with their sizes, what each gains on frames it was not fitted to, and what remains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from virest.camera.profile import CameraProfile
+
+CONSISTENT, EXPLAINED, UNEXPLAINED = "consistent", "explained", "unexplained"
+GEOMETRY, PHOTOMETRY, BLUR = "geometry_rms_px", "photometric_rms", "blur_rms_px"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterChange:
+    """One value of the profile, as it was and as the data want it."""
+
+    nominal: Any
+    estimate: Any
+    """A number, a list of numbers, or a word."""
+    std: Any
+    """Standard deviation(s); None for a word."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutGain:
+    """How well frames that took no part in the fit are predicted, without and with a cause."""
+
+    quantity: str
+    """``geometry_rms_px``, ``photometric_rms`` or ``blur_rms_px``."""
+    before: float
+    after: float
+    noise: float
+
+    @property
+    def gain(self) -> float:
+        """1 − (after² − noise²) / (before² − noise²), in [0, 1]."""
+        excess_before = self.before**2 - self.noise**2
+        if excess_before <= 0:
+            return 0.0
+        return min(max(1.0 - (self.after**2 - self.noise**2) / excess_before, 0.0), 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """Another cause that explains as well."""
+
+    name: str
+    held_out_after: float
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One cause."""
+
+    name: str
+    """As in the contract's list of effects."""
+    parameters: dict[str, ParameterChange]
+    held_out: HeldOutGain
+    rivals: tuple[Rival, ...]
+    p_value: float
+    sentence: str
+    """What it means, for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nominal:
+    """How well the profile as given predicts the capture."""
+
+    geometry_rms_px: float
+    geometry_noise_px: float
+    photometric_rms: float | None
+    blur_rms_px: float | None
+    tracks: int
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class Remaining:
+    """Structure that no named cause removes."""
+
+    p_value: float
+    strongest_along: str
+    """``row``, ``time``, ``radius``, ``rate``, ``brightness`` ..."""
+    size: float
+    """rms of the structure, in the units of ``quantity``."""
+    quantity: str
+    significant: bool
+    sentence: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """One step of the ladder: what was tried and what entered."""
+
+    entered: str | None
+    """None: nothing gained enough."""
+    tried: dict[str, float]
+    """Held-out rms with each candidate added."""
+    before: float
+    quantity: str
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """The whole verdict on one capture."""
+
+    verdict: str
+    """``consistent``, ``explained`` or ``unexplained``."""
+    nominal: Nominal
+    causes: tuple[Finding, ...]
+    """Strongest first."""
+    unexplained: Remaining
+    nominal_profile: CameraProfile
+    """The given one, with null values fitted."""
+    extended_profile: CameraProfile
+    """With every cause built in."""
+    ladder: tuple[Rung, ...] = ()
+    residuals: dict[str, Any] = field(default_factory=dict)
+    """For figures: ``before`` and ``after``, each a mapping of covariate name to an array, with ``x_px`` and ``y_px``."""
+    notes: tuple[str, ...] = ()
+    """What was left out or could not be judged, and why."""
