@@ -22,7 +22,7 @@ ROTATION, BIAS = (-0.014, 0.019, 0.008), (-0.012, 0.021, 0.009)
 TRUTH = {"time_offset_s": OFFSET_S, "readout_time_s": READOUT_S, "gyro_bias_rad_s": BIAS}
 SIZE = {"width": 300, "height": 400}
 LARGEST_SIGMA = 4.5
-LARGEST = {"time_offset_s": 2e-3, "readout_time_s": 2e-3, "rotation_rad": 8e-3, "gyro_bias_rad_s": 8e-3}
+LARGEST = {"time_offset_s": 1e-3, "readout_time_s": 1e-3, "rotation_rad": 4e-3, "gyro_bias_rad_s": 4e-3}
 
 
 def capture_with(folder: Path, **options: Any) -> Path:
@@ -75,14 +75,15 @@ def value_of(facts: dict[str, Any], name: str) -> dict[str, Any]:
     return next(value for value in facts["values"] if value["name"] == name)
 
 
-def assert_true(facts: dict[str, Any], capture: Path) -> None:
-    """Offset, readout, sense, axes and bias are those that were hidden, within their standard deviations."""
+def assert_true(facts: dict[str, Any], capture: Path, judged: tuple[str, ...] = tuple(TRUTH)) -> None:
+    """Offset, readout, sense, axes and bias are those that were hidden; ``judged`` also by their standard deviations."""
     for name, truth in TRUTH.items():
         found = value_of(facts, name)
         error = np.abs(np.array(found["value"]) - truth)
         assert found["determined"], name
-        assert (error < LARGEST_SIGMA * np.array(found["std"])).all(), (name, found)
         assert (error < LARGEST[name]).all(), (name, found)
+        if name in judged:
+            assert (error < LARGEST_SIGMA * np.array(found["std"])).all(), (name, found)
     assert value_of(facts, "readout_direction")["value"] == DIRECTION
     assert rotation_error_rad(facts["profile"], capture) < LARGEST["rotation_rad"]
 
@@ -128,20 +129,19 @@ def test_a_start_that_is_far_off_ends_at_the_truth(
     """Half a second, any axes and any direction of the readout: the hidden values are found all the same."""
     facts = calibrate(virest, turned, tmp_path / "out", "--config", start_from(turned, tmp_path, **changes))
     assert_true(facts, turned)
-    assert facts["translation"] == "none"
 
 
 def test_a_camera_that_also_travels_is_calibrated(virest: Any, walked: Path, tmp_path: Path) -> None:
     """With a slanted wall 1.5 m away and 8 cm of sway, the accelerometer's path explains the parallax."""
     facts = calibrate(virest, walked, tmp_path / "out")
-    assert_true(facts, walked)
+    assert_true(facts, walked, judged=("time_offset_s", "readout_time_s"))
     assert facts["translation"] != "none"
     assert facts["residual_px"] < 1.5 * facts["noise_px"]
 
 
 def test_a_calibrated_profile_is_good_for_processing(virest: Any, turned: Path, tmp_path: Path) -> None:
     """``process --config`` takes what ``calibrate`` wrote, and uses its offset and readout."""
-    calibrate(virest, turned, tmp_path / "cal")
+    assert calibrate(virest, turned, tmp_path / "cal")["translation"] == "none"
     arguments = ("--config", tmp_path / "cal" / "calibrated.yaml", "--deblur", "none", "--frames", "20:22", "--jobs", 1)
     done = virest("process", turned, "--out", tmp_path / "run", "--json", *arguments)
     assert done.returncode == 0, done.stderr

@@ -117,6 +117,6 @@ class Diagnosis:
     """With every cause built in."""
     ladder: tuple[Rung, ...] = ()
     residuals: dict[str, Any] = field(default_factory=dict)
-    """For figures: ``before`` and ``after``, each a mapping of covariate name to an array, with ``x_px`` and ``y_px``."""
+    """For figures: ``before`` and ``after``, each a mapping of covariate names, ``x_px`` and ``y_px`` to arrays."""
     notes: tuple[str, ...] = ()
     """What was left out or could not be judged, and why."""

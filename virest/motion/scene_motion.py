@@ -7,7 +7,7 @@ only the direction of travel is used, and points are judged across the parallax 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ class InertialMotion:
     """By which accelerations are older than their stamps say."""
     plane_per_m: Array
     """(windows, 3) m of the scene's plane m · X = 1, origin at the camera's centre at the window's middle."""
+    plane_std_per_m: tuple[float, float, float] = (PLANE_STD_PER_M,) * 3
+    """Prior of the plane about where the fit began, world axes."""
 
     @property
     def windows(self) -> int:
@@ -48,11 +50,18 @@ class InertialMotion:
     def with_vector(self, vector: Array) -> InertialMotion:
         """The motion of such a vector."""
         own = vector[7:].reshape(-1, 6)
-        return InertialMotion(own[:, :3], vector[:3], vector[3:6], float(vector[6]), own[:, 3:])
+        return replace(
+            self,
+            velocity_m_s=own[:, :3],
+            gravity_m_s2=vector[:3],
+            accel_bias_m_s2=vector[3:6],
+            accel_delay_s=float(vector[6]),
+            plane_per_m=own[:, 3:],
+        )
 
     def prior_std(self) -> Array:
         """How far each entry may lie from where the fit began."""
-        own = [VELOCITY_STD_M_S] * 3 + [PLANE_STD_PER_M] * 3
+        own = [VELOCITY_STD_M_S] * 3 + list(self.plane_std_per_m)
         shared = [GRAVITY_STD_M_S2] * 3 + [ACCEL_BIAS_STD_M_S2] * 3 + [ACCEL_DELAY_STD_S]
         return np.array(shared + own * self.windows)
 

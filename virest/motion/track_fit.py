@@ -148,6 +148,8 @@ def _descend(
 ) -> tuple[_State, _System]:
     """Levenberg-Marquardt at one spread of depths; the robust scale follows each accepted step."""
     system, damping = _linearise(imu, table, terms, start, state), 0.0
+    if not system.hessian.size:
+        return state, system
     for _ in range(max_iterations):
         step = system.solve(damping)
         step *= min(1.0, 1.0 / max(float(np.max(np.abs(step) / system.limit, initial=0.0)), 1e-12))
@@ -240,7 +242,7 @@ def _linearise(
         rows, left = without_directions(
             rows, left, weight, difference / noise[:, None], flow / noise[:, None, None], state.scene.direction, group
         )
-    flat = rows.reshape(-1, rows.shape[-1])
+    flat = rows.reshape(2 * len(table), rows.shape[-1])
     weighted = flat * np.repeat(weight / scale**2, 2)[:, None]
     return _System(
         state.scene, prediction, difference, squared, weight, scale, spread, rows, left,
@@ -327,7 +329,7 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
 def _block_covariance(table: TrackTable, system: _System, inverse: Array, blocks: int) -> Array:
     """Sandwich H⁻¹ (Σ g gᵀ) H⁻¹ over blocks of consecutive pairs, not below the curvature's along any parameter."""
     count = min(blocks, table.n_pairs)
-    if count < MIN_BLOCKS:
+    if count < MIN_BLOCKS or not inverse.size:
         return inverse
     block = table.pair * count // table.n_pairs
     weighted = system.left * (system.weight / system.scale**2)[:, None]
@@ -348,6 +350,8 @@ def _solved(matrix: Array, right: Array) -> Array:
 
 
 def _inverse(matrix: Array) -> Array:
+    if not matrix.size:
+        return matrix
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
     return np.asarray(np.linalg.pinv(matrix / np.outer(size, size), rcond=1e-12, hermitian=True)) / np.outer(size, size)
 

@@ -19,6 +19,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.motion.depth import FrameDepth, TriangulatedPoints, frame_depth, triangulate
 from virest.motion.observed_tracks import WINDOW_S, ObservedTracks
+from virest.motion.optics import settling_time_s
 from virest.motion.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT, TIME_OFFSET
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
@@ -42,6 +43,7 @@ MAX_LEFT = 0.15
 MAX_SPREAD = 0.6
 """Spread of inverse depths about the plane, as part of its inverse depth."""
 GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
+MAX_ITERATIONS = 30
 CAUCHY, RAYLEIGH_MEDIAN = 2.4, 1.1774
 OFFSET_PRIOR_S, ROTATION_PRIOR_RAD, READOUT_PRIOR_S = 0.03, 0.03, 0.03
 """How far a profile that states a value may be wrong: these are fitted along so that they do not pass for parallax."""
@@ -49,6 +51,10 @@ STATED_DEPTH_STD = 0.02
 """How far a profile's depth may be off, part of it."""
 TRACKING_BIAS_PX = 0.04
 """Tracking's own bias under blur and codec: a steady error of a step, which is an error of the velocity."""
+OFFSET_FLOOR_S = 3e-5
+"""And its error in time."""
+IMU_MARGIN_S = 2.5
+"""A stretch takes the inertial samples up to this far beyond its tracked points."""
 NEAR_WINDOW_S = 1.5
 """Frames this far beyond a window's tracked points still take its velocity."""
 
@@ -88,6 +94,21 @@ class Stretch:
         """The fitted path and planes."""
         assert isinstance(self.fit.scene, InertialMotion)
         return self.fit.scene
+
+    def gravity(self) -> tuple[Array, Array]:
+        """Gravity (3,) in world axes, m/s², and its standard deviations."""
+        return self.scene.gravity_m_s2, self._std(slice(0, 3))
+
+    def accel_bias(self) -> tuple[Array, Array]:
+        """The accelerometer's bias (3,) in IMU axes, m/s², and its standard deviations."""
+        return self.scene.accel_bias_m_s2, self._std(slice(3, 6))
+
+    def accel_delay(self) -> tuple[float, float]:
+        """Seconds by which accelerations are older than their stamps, and the standard deviation."""
+        return self.scene.accel_delay_s, float(self._std(slice(6, 7))[0])
+
+    def _std(self, part: slice) -> Array:
+        return np.sqrt(np.maximum(np.diag(self.scene_covariance)[part], 0.0))
 
     @property
     def scene_covariance(self) -> Array:
@@ -221,7 +242,8 @@ class VisualInertialAlignment:
             return None
         offset = np.array([s.fit.profile.time_offset_s or 0.0 for s in found])
         std = np.array([s.fit.std(TIME_OFFSET.name)[0] for s in found])
-        return _mean(offset, np.maximum(std, 1e-6))
+        mean, spread = _mean(offset, np.maximum(std, 1e-6))
+        return mean, float(np.hypot(spread, OFFSET_FLOOR_S))
 
     def gyro_bias(self) -> tuple[Array, Array] | None:
         """Gyroscope bias (3,) and its standard deviations over the trusted stretches."""
@@ -293,14 +315,14 @@ def align(
     observed = observed.covered(imu, profile)
     if len(observed.pairs) < MIN_PAIRS:
         return VisualInertialAlignment((), f"{len(observed.pairs)} pairs of frames with enough points to follow")
-    if ground(imu, profile, translation=True).displacement is None:
+    if not imu.has_accelerometer:
         return VisualInertialAlignment((), "no accelerometer to tell the camera's path")
     stretches = []
     for part in _parts(observed):
         stretch = _fit_stretch(part, imu, profile, depth_m)
         if stretch is not None:
             stretches.append(stretch)
-    return VisualInertialAlignment(tuple(stretches), "" if stretches else "too few points to follow")
+    return VisualInertialAlignment(tuple(stretches), "" if stretches else "too few points or accelerations")
 
 
 def _parts(observed: ObservedTracks) -> list[ObservedTracks]:
@@ -334,12 +356,16 @@ def _fit_stretch(
     table = observed.table(POINTS_PER_WINDOW * max(int(np.ceil(span_s / WINDOW_S)), 1))
     if len(table) < MIN_POINTS:
         return None
+    first, last = (float(profile.imu_time_s(t)) for t in (table.first_stamp_s.min(), table.second_stamp_s.max()))
+    imu = imu.between(first - IMU_MARGIN_S - settling_time_s(profile), last + IMU_MARGIN_S)
     terms = nuisance_terms(profile)
     still = fit_tracks(imu, table, profile, terms)
     known = ground(imu, profile, translation=True)
+    if known.displacement is None:
+        return None
     inverse_depth = START_INVERSE_DEPTH_PER_M if depth_m is None else 1 / depth_m
     scene = start_scene(imu, known, table, inverse_depth)
-    fit = fit_tracks(imu, table, profile, terms, scene, known=known)
+    fit = fit_tracks(imu, table, profile, terms, scene, known=known, max_iterations=MAX_ITERATIONS)
     if depth_m is not None:
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
     assert isinstance(fit.scene, InertialMotion)
@@ -358,25 +384,6 @@ def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
     return np.asarray(TRACKING_BIAS_PX / fit.profile.intrinsics.fx_px * depth_m / max(step_s, 1e-3))
 
 
-class _HeldPlane(InertialMotion):
-    """Planes at a stated depth: only as free as the statement is vague."""
-
-    __slots__ = ()
-
-    def with_vector(self, vector: Array) -> _HeldPlane:
-        moved = InertialMotion.with_vector(self, vector)
-        return _HeldPlane(
-            moved.velocity_m_s, moved.gravity_m_s2, moved.accel_bias_m_s2, moved.accel_delay_s, moved.plane_per_m
-        )
-
-    def prior_std(self) -> Array:
-        std = InertialMotion.prior_std(self)
-        own = std[7:].reshape(-1, 6)
-        own[:, :3] = 10.0
-        own[:, 3:] = STATED_DEPTH_STD * np.linalg.norm(self.plane_per_m, axis=-1)[:, None]
-        return std
-
-
 def _at_depth(
     fit: TrackFit, imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: tuple[Term, ...], depth_m: float
 ) -> TrackFit:
@@ -386,14 +393,12 @@ def _at_depth(
     origin = np.asarray(profile.imu_time_s(table.origin_s))
     axis = fit.ground.trajectory.orientation(origin)[:, :, 2]
     ratio = (1 / depth_m) / np.maximum((scene.plane_per_m * axis).sum(axis=-1), 0.02)[:, None]
-    held = _HeldPlane(
-        scene.velocity_m_s / ratio,
-        scene.gravity_m_s2,
-        scene.accel_bias_m_s2,
-        scene.accel_delay_s,
-        scene.plane_per_m * ratio,
+    plane = scene.plane_per_m * ratio
+    spread = STATED_DEPTH_STD * float(np.linalg.norm(plane, axis=-1).mean())
+    held = replace(
+        scene, velocity_m_s=scene.velocity_m_s / ratio, plane_per_m=plane, plane_std_per_m=(spread, spread, spread)
     )
-    return fit_tracks(imu, table, profile, terms, held)
+    return fit_tracks(imu, table, profile, terms, held, max_iterations=MAX_ITERATIONS)
 
 
 # ── judgement ────────────────────────────────────────────────────────────────────────────────────────────────────

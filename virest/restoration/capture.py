@@ -183,7 +183,7 @@ def plan_restoration(
 def _wants_translation(profile: CameraProfile, capture: Capture) -> bool:
     """A scene at infinity has no parallax; without an accelerometer there is no displacement in metres."""
     far = profile.depth_m is not None and np.isinf(profile.depth_m)
-    return not far and bool(np.isfinite(capture.imu.accel_m_s2).all(axis=1).any())
+    return not far and capture.imu.has_accelerometer
 
 
 def _aligned(

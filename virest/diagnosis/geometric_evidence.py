@@ -1,0 +1,154 @@
+"""Tracked points as evidence: laid out for a profile, fitted on some stretches of time, judged on the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.motion.observed_tracks import ObservedTracks
+from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
+from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
+from virest.motion.track_model import TrackTable, centre, ground, seen_s
+from virest.motion.track_noise import smooth_flow_residual
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+CAP = 4.0
+"""Differences count up to this many of their own median scales: single lost tracks do not decide."""
+RAYLEIGH_MEDIAN = 1.1774
+CAUCHY = 2.4
+BLOCK_LENGTHS = (7, 11, 8, 13, 9)
+"""Pairs in a block of time, in turn: fixed lengths beat with periodic faults."""
+TILT_STD_PER_M, KNOWN_DEPTH_STD = 0.3, 0.01
+START_INVERSE_DEPTH_PER_M = 0.5
+MIN_SWAY_DEPTH_PER_M = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A profile, what travels with it, and the terms that have been fitted so far."""
+
+    profile: CameraProfile
+    scene: Motion | None
+    terms: tuple[Term, ...]
+    lag: tuple[float, ...] = ()
+    """(frames,) seconds by which a slot shows a later capture; empty: none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """All tracked pairs of a capture."""
+
+    imu: ImuSamples
+    observed: ObservedTracks
+    block: NDArray[np.intp]
+    """(pairs,) number of the block of time."""
+
+    @property
+    def noise_px(self) -> float:
+        """What tracking alone makes: capped rms per coordinate of what a free smooth flow leaves."""
+        residual = [
+            smooth_flow_residual(pair) / n for pair, n in zip(self.observed.pairs, self.observed.noise_px, strict=True)
+        ]
+        return capped_rms(np.linalg.norm(np.concatenate(residual), axis=-1)) * self.typical_px
+
+    @property
+    def typical_px(self) -> float:
+        """Typical noise of a step, px per coordinate."""
+        return float(np.median(self.observed.noise_px))
+
+    def table(self, model: Model, max_points: int) -> TrackTable:
+        """The points, with the stamps that the model gives the frames."""
+        observed = self.observed
+        if model.lag:
+            observed = replace(observed, stamp_s=observed.stamp_s + np.array(model.lag))
+        return observed.table(max_points)
+
+    def fit(self, model: Model, terms: Sequence[Term], table: TrackTable, use: Mask | None = None) -> TrackFit:
+        """Fit terms and the scene from a model, on the pairs in ``use`` (pairs,)."""
+        rows = table if use is None else table.chosen(use[table.pair])
+        return fit_tracks(self.imu, rows, model.profile, terms, model.scene, max_iterations=10)
+
+    def distances(self, fitted: TrackFit, table: TrackTable) -> Array:
+        """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
+        return fit_tracks(self.imu, table, fitted.profile, (), fitted.scene, max_iterations=0).distance
+
+
+def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
+    """Number the blocks of time."""
+    sizes: list[int] = []
+    total = 0
+    while total < len(observed.pairs):
+        sizes.append(BLOCK_LENGTHS[len(sizes) % len(BLOCK_LENGTHS)])
+        total += sizes[-1]
+    block = np.repeat(np.arange(len(sizes)), sizes)[: len(observed.pairs)]
+    return Evidence(imu, observed, block)
+
+
+def loss(distance: Array, scale: float) -> Array:
+    """Cauchy loss of whitened distances at a scale."""
+    return np.asarray(np.log1p((distance / (CAUCHY * scale)) ** 2))
+
+
+def capped_rms(distance: Array) -> float:
+    """Rms per coordinate of whitened distances, each counted up to CAP times their median scale."""
+    scale = max(float(np.median(distance)) / RAYLEIGH_MEDIAN, 1e-9)
+    return float(np.sqrt(np.mean(np.minimum(distance, CAP * scale) ** 2) / 2))
+
+
+def base_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) -> Motion | None:
+    """What the profile lets the camera do: nothing beside turning (depth inf), or go before a plane."""
+    depth_m = profile.depth_m
+    if depth_m is not None and np.isinf(depth_m):
+        return None
+    known = ground(evidence.imu, profile, translation=True)
+    if known.displacement is None:
+        return many_directions(table)
+    scene = start_scene(evidence.imu, known, table, START_INVERSE_DEPTH_PER_M if depth_m is None else 1 / depth_m)
+    if depth_m is None:
+        return scene
+    return replace(scene, plane_std_per_m=(TILT_STD_PER_M, TILT_STD_PER_M, KNOWN_DEPTH_STD / depth_m))
+
+
+def free_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) -> InertialMotion | None:
+    """A plane at an unknown depth; None without an accelerometer."""
+    known = ground(evidence.imu, profile, translation=True)
+    if known.displacement is None:
+        return None
+    return start_scene(evidence.imu, known, table, START_INVERSE_DEPTH_PER_M)
+
+
+def depth_of(fitted: TrackFit, table: TrackTable) -> tuple[float, float]:
+    """Median over the frames of the distance along the optical axis at the picture's centre, and its deviation."""
+    scene = fitted.scene
+    assert isinstance(scene, InertialMotion)
+    assert fitted.ground.displacement is not None
+    frames, rows = np.unique(table.first, return_index=True)
+    profile, window = fitted.profile, table.window[rows]
+    middle = np.tile([0.5 * (profile.width - 1), 0.5 * (profile.height - 1)], (len(frames), 1))
+    time_s = seen_s(profile, middle, table.first_stamp_s[rows], table.first_exposure_s[rows])
+    origin_s = np.asarray(profile.imu_time_s(table.origin_s))[window]
+    where = centre(fitted.ground.displacement, scene, scene.velocity_m_s[window], time_s, origin_s)[0]
+    world = np.squeeze(
+        fitted.ground.trajectory.orientation(time_s) @ fitted.ground.lens.rays(middle, time_s)[..., None], -1
+    )
+    plane = scene.plane_per_m[window]
+    inverse = (plane * world).sum(axis=-1) / np.maximum(1 - (plane * where).sum(axis=-1), 0.05)
+    typical = int(np.argsort(inverse)[len(inverse) // 2])
+    return 1 / max(float(inverse[typical]), MIN_SWAY_DEPTH_PER_M), _depth_std(fitted, world[typical], window[typical])
+
+
+def _depth_std(fitted: TrackFit, world: Array, window: int) -> float:
+    first = len(fitted.change) + 7 + 6 * int(window) + 3
+    part = fitted.covariance[first : first + 3, first : first + 3]
+    assert isinstance(fitted.scene, InertialMotion)
+    inverse = float(fitted.scene.plane_per_m[int(window)] @ world)
+    return float(np.sqrt(max(world @ part @ world, 0.0))) / max(inverse, MIN_SWAY_DEPTH_PER_M) ** 2
+
+
+__all__ = ["DirectedMotion", "Evidence", "Model", "base_scene", "make_evidence", "one_direction"]

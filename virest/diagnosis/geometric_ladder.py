@@ -1,0 +1,451 @@
+"""The ladder for what moves points: rung by rung the cause that best predicts stretches of time it was not fitted to.
+
+On each rung every cause is fitted together with those already in; the most promising are then fitted on half of the
+blocks of time and judged on the other half, both ways.  The best enters if the gain holds in the blocks (a t test) and
+its value is significant against a deviation that includes tracking's own bias.  Then all are fitted together again, and
+what is no longer significant leaves.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
+from virest.diagnosis.geometric_evidence import (
+    Evidence,
+    Model,
+    base_scene,
+    capped_rms,
+    depth_of,
+    free_scene,
+    loss,
+)
+from virest.motion.scene_motion import DirectedMotion, InertialMotion
+from virest.motion.track_fit import Term, TrackFit
+from virest.motion.track_model import TrackTable
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+SCREEN_POINTS, JUDGE_POINTS, FINAL_POINTS = 1500, 3500, 7000
+PROMISING = 4
+MIN_T = 3.0
+"""Least ratio of the blocks' mean gain to its standard error."""
+MAX_P = 1e-5
+"""Of the value being nought, for each of some twenty causes tried."""
+SURE = 1e-12
+MIN_GAIN = 0.004
+"""Least part of the loss that a cause must take away on held-out blocks."""
+RIVAL_T = 2.0
+"""A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
+MAX_RUNGS = 5
+COINCIDENCE_SIGMA = 3.0
+"""A time offset this close to half or a whole exposure is taken for another meaning of the stamp."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One cause at one starting point: the model to begin from and the terms it adds."""
+
+    name: str
+    model: Model
+    added: tuple[Term, ...]
+    effect: GeometricEffect | None
+    word: str = ""
+    terms_with: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A cause that is in the model."""
+
+    name: str
+    effect: GeometricEffect | None
+    word: str
+    before: float
+    after: float
+    p_value: float
+    rivals: tuple[Rival, ...]
+
+
+@dataclass(slots=True)
+class GeometricVerdict:
+    """Where the ladder ended."""
+
+    model: Model
+    fit: TrackFit
+    table: TrackTable
+    accepted: list[Accepted]
+    rungs: list[Rung]
+    nominal: Model
+    nominal_fit: TrackFit
+    nominal_rms_px: float
+    final_rms_px: float
+    noise_px: float
+    exposure_hypothesis: float | None = None
+    """Exposure scale that would explain a time offset found at constant exposure."""
+    notes: list[str] = field(default_factory=list)
+
+
+def climb(
+    evidence: Evidence,
+    nominal: CameraProfile,
+    null_terms: Sequence[Term],
+    lags: Sequence[tuple[float, int, tuple[float, ...]]],
+    progress: Callable[[float], None] | None = None,
+) -> GeometricVerdict:
+    """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
+
+    lags: (lag_s, frames, seconds of each frame) of the start-up schedules to try.
+    """
+    say = progress or (lambda _: None)
+    start = Model(nominal, None, tuple(null_terms))
+    start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
+    model = _refitted(evidence, start, SCREEN_POINTS)[0]
+    nominal_model = model
+    accepted: list[Accepted] = []
+    rungs: list[Rung] = []
+    say(0.1)
+    for number in range(MAX_RUNGS):
+        best, rung = _rung(evidence, model, nominal, accepted, lags)
+        rungs.append(rung)
+        say(0.1 + 0.8 * (number + 1) / MAX_RUNGS)
+        if best is None:
+            break
+        model, entered = best
+        accepted.append(entered)
+        model, _ = _refitted(evidence, model, JUDGE_POINTS)
+        log.debug("rung %d: %s", number + 1, entered.name)
+    return _conclude(evidence, nominal_model, model, accepted, rungs, nominal)
+
+
+def _refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:
+    table = evidence.table(model, points)
+    fitted = evidence.fit(model, model.terms, table)
+    return replace(model, profile=fitted.profile, scene=fitted.scene), fitted
+
+
+# ── one rung ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    candidate: Candidate
+    block_loss: Array
+    """(blocks,) mean held-out loss a point."""
+    rms: float
+    """Held-out, in units of the typical noise."""
+
+
+def _rung(
+    evidence: Evidence,
+    model: Model,
+    nominal: CameraProfile,
+    accepted: list[Accepted],
+    lags: Sequence[tuple[float, int, tuple[float, ...]]],
+) -> tuple[tuple[Model, Accepted] | None, Rung]:
+    tried = {entry.name for entry in accepted}
+    candidates = _candidates(evidence, model, tried, lags)
+    base = _screened(evidence, Candidate("", model, (), None))
+    screened = _best_of_each([_screened(evidence, candidate) for candidate in candidates])
+    promising = sorted(screened, key=lambda s: s[0])[:PROMISING]
+    promising = [entry for entry in promising if entry[0] < base[0]]
+    scale = min([base[2], *(entry[2] for entry in promising)])
+    before = _judge(evidence, base[1], scale)
+    judged = [_judge(evidence, entry[1], scale) for entry in promising]
+    table = {j.candidate.name: j.rms * evidence.typical_px for j in judged}
+    nothing = Rung(None, table, before.rms * evidence.typical_px, GEOMETRY)
+    for best in sorted(judged, key=lambda j: float(j.block_loss.mean())):
+        gain = before.block_loss - best.block_loss
+        if gain.mean() < MIN_GAIN * before.block_loss.mean() or _t(gain) < MIN_T:
+            continue
+        entered, p_value = _significant(evidence, best.candidate, model.profile)
+        if entered is None:
+            continue
+        rivals = tuple(
+            Rival(other.candidate.name, other.rms * evidence.typical_px)
+            for other in judged
+            if other is not best and _t(other.block_loss - best.block_loss) < RIVAL_T
+            and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
+        )  # fmt: skip
+        done = Accepted(
+            best.candidate.name, best.candidate.effect, best.candidate.word,
+            before.rms * evidence.typical_px, best.rms * evidence.typical_px, p_value, rivals,
+        )  # fmt: skip
+        return (entered, done), replace(nothing, entered=best.candidate.name)
+    return None, nothing
+
+
+def _candidates(
+    evidence: Evidence,
+    model: Model,
+    tried: set[str],
+    lags: Sequence[tuple[float, int, tuple[float, ...]]],
+) -> list[Candidate]:
+    in_terms = {term.name for term in model.terms}
+    found: list[Candidate] = []
+    for effect in GEOMETRIC_EFFECTS:
+        if effect.name in tried or effect.name in in_terms:
+            continue
+        if effect.term is None:
+            found += _words(effect, model)
+            continue
+        for values in (None, *effect.starts):
+            profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
+            found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
+    found += _depths(evidence, model, tried)
+    if "frame_lag" not in tried:
+        found += [_lagging(model, *lag) for lag in lags]
+    return found
+
+
+def _words(effect: GeometricEffect, model: Model) -> list[Candidate]:
+    assert effect.with_word is not None
+    now = next(iter(effect.read(model.profile).values()))
+    return [
+        Candidate(effect.name, replace(model, profile=effect.with_word(model.profile, word)), (), effect, word)
+        for word in effect.words
+        if word != now
+    ]
+
+
+def _depths(evidence: Evidence, model: Model, tried: set[str]) -> list[Candidate]:
+    depth_m = model.profile.depth_m
+    if "scene_depth" in tried or depth_m is None:
+        return []
+    scene = free_scene(evidence, model.profile, evidence.table(model, SCREEN_POINTS))
+    if scene is None:
+        return []
+    return [Candidate("scene_depth", replace(model, scene=scene), (), None)]
+
+
+def _lagging(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...]) -> Candidate:
+    extensions = replace(model.profile.extensions, frame_lag_s=lag_s, frame_lag_frames=frames)
+    return Candidate(
+        "frame_lag", replace(model, profile=replace(model.profile, extensions=extensions), lag=by_frame), (), None
+    )
+
+
+def _screened(evidence: Evidence, candidate: Candidate) -> tuple[float, Candidate, float]:
+    """(mean loss, the candidate with its fitted model, scale) on all blocks, with few points."""
+    table = evidence.table(candidate.model, SCREEN_POINTS)
+    terms = (*candidate.model.terms, *candidate.added)
+    fitted = evidence.fit(candidate.model, terms, table)
+    model = replace(candidate.model, profile=fitted.profile, scene=fitted.scene)
+    return float(loss(fitted.distance, 1.0).mean()), replace(candidate, model=model), fitted.scale
+
+
+def _best_of_each(screened: list[tuple[float, Candidate, float]]) -> list[tuple[float, Candidate, float]]:
+    best: dict[str, tuple[float, Candidate, float]] = {}
+    for entry in screened:
+        name = entry[1].name
+        if name not in best or entry[0] < best[name][0]:
+            best[name] = entry
+    return list(best.values())
+
+
+def _judge(evidence: Evidence, candidate: Candidate, scale: float) -> _Judged:
+    """Fit on every other block, judge on those between, and the other way round."""
+    table = evidence.table(candidate.model, JUDGE_POINTS)
+    terms = (*candidate.model.terms, *candidate.added)
+    distance = np.zeros(len(table))
+    for fold in (0, 1):
+        use = evidence.block % 2 == fold
+        fitted = evidence.fit(candidate.model, terms, table, use)
+        held = ~use[table.pair]
+        distance[held] = evidence.distances(fitted, table)[held]
+    block = evidence.block[table.pair]
+    counts = np.maximum(np.bincount(block), 1)
+    return _Judged(candidate, np.bincount(block, loss(distance, scale)) / counts, capped_rms(distance))
+
+
+def _t(values: Array) -> float:
+    """Mean over its standard error."""
+    if len(values) < 3:
+        return 0.0
+    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))
+
+
+def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile) -> tuple[Model | None, float]:
+    """The model with the candidate in it, if its value is, and the probability that it is nought."""
+    model = replace(candidate.model, terms=(*candidate.model.terms, *candidate.added))
+    model, fitted = _refitted(evidence, model, JUDGE_POINTS)
+    if candidate.name == "scene_depth":
+        depth_m, std = depth_of(fitted, evidence.table(model, JUDGE_POINTS))
+        p_value = float(stats.chi2.sf((depth_m / max(std, 1e-9)) ** 2, 1))
+    elif candidate.effect is None or candidate.effect.term is None:
+        p_value = SURE
+    else:
+        p_value = p_of(fitted, candidate.effect, model.profile, before)
+    return (model if p_value < MAX_P else None), p_value
+
+
+def p_of(fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile) -> float:
+    """Probability of so large a change by chance: a chi-square of the change, deviations with tracking's own bias."""
+    change = total_change(effect, before, found)
+    part = fitted.slices[effect.name]
+    covariance = fitted.covariance[part, part] + np.diag(np.array(effect.floor_std) ** 2)
+    if effect.name == "stabilisation":
+        return float(stats.chi2.sf(change[0] ** 2 / covariance[0, 0], 1))
+    return float(stats.chi2.sf(change @ np.linalg.solve(covariance, change), len(change)))
+
+
+# ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _conclude(
+    evidence: Evidence,
+    nominal_model: Model,
+    model: Model,
+    accepted: list[Accepted],
+    rungs: list[Rung],
+    nominal: CameraProfile,
+) -> GeometricVerdict:
+    """Fit everything together from the nominal profile on, and let go of what is no longer significant."""
+    while True:
+        model, fitted = _refitted(evidence, model, FINAL_POINTS)
+        weak = [
+            entry
+            for entry in accepted
+            if entry.effect is not None
+            and entry.effect.term is not None
+            and p_of(fitted, entry.effect, model.profile, nominal_model.profile) > MAX_P
+        ]
+        if not weak:
+            break
+        log.debug("no longer significant: %s", [entry.name for entry in weak])
+        accepted = [entry for entry in accepted if entry is not weak[0]]
+        model = _without(model, nominal_model, weak[0], accepted)
+    table = evidence.table(model, FINAL_POINTS)
+    nominal_table = evidence.table(nominal_model, FINAL_POINTS)
+    nominal_fit = evidence.fit(nominal_model, nominal_model.terms, nominal_table)
+    typical = evidence.typical_px
+    return GeometricVerdict(
+        model, fitted, table, accepted, rungs, nominal_model, nominal_fit,
+        capped_rms(nominal_fit.distance) * typical, capped_rms(fitted.distance) * typical, evidence.noise_px,
+    )  # fmt: skip
+
+
+def total_change(effect: GeometricEffect, nominal: CameraProfile, found: CameraProfile) -> Array:
+    """Change (k,) of a term's values between two profiles."""
+    lens, before = found.intrinsics, nominal.intrinsics
+    assert lens is not None
+    assert before is not None
+    match effect.name:
+        case "time_offset":
+            return np.array([(found.time_offset_s or 0.0) - (nominal.time_offset_s or 0.0)])
+        case "clock_skew":
+            return np.array([found.clock_skew - nominal.clock_skew])
+        case "readout_time":
+            return np.array([found.shutter.readout_time_s - nominal.shutter.readout_time_s])
+        case "gyro_bias":
+            return np.array(found.gyro_bias_rad_s) - np.array(nominal.gyro_bias_rad_s)
+        case "gyro_scale":
+            return np.array([np.log(found.gyro_scale[0] / nominal.gyro_scale[0])])
+        case "imu_rotation":
+            return rotation_between(nominal, found)
+        case "focal_length":
+            return np.array([np.log(lens.fx_px / before.fx_px)])
+        case "focal_drift":
+            return np.array([found.extensions.focal_drift_per_s - nominal.extensions.focal_drift_per_s])
+        case "radial_distortion":
+            return np.array([effect.read(found)["k1"] - effect.read(nominal)["k1"]])
+        case "principal_point":
+            return np.array([lens.cx_px - before.cx_px, lens.cy_px - before.cy_px])
+        case _:
+            return np.array([found.extensions.stabilisation_fraction - nominal.extensions.stabilisation_fraction, 0.0])
+
+
+def rotation_between(nominal: CameraProfile, found: CameraProfile) -> Array:
+    """Rotation vector (3,) of R_found R_nominalᵀ."""
+    matrix = found.rotation_cam_imu @ nominal.rotation_cam_imu.T
+    skew = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
+    sine = float(np.linalg.norm(skew))
+    return skew * (np.arcsin(min(sine, 1.0)) / sine if sine > 1e-12 else 1.0)
+
+
+def _without(model: Model, nominal: Model, leaving: Accepted, kept: list[Accepted]) -> Model:
+    """The nominal model with the kept causes' terms, to be fitted anew from where they stand."""
+    assert leaving.effect is not None and leaving.effect.term is not None
+    terms = tuple(term for term in model.terms if term.name != leaving.effect.term.name)
+    back = total_change(leaving.effect, nominal.profile, model.profile)
+    profile = leaving.effect.term.change(model.profile, -back)
+    return replace(model, profile=profile, terms=terms)
+
+
+def findings_of(verdict: GeometricVerdict, exposures_s: Array) -> list[Finding]:
+    """The accepted causes as findings, strongest first."""
+    found = []
+    for entry in verdict.accepted:
+        changes = changes_of(verdict, entry)
+        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, verdict.noise_px)
+        sentence = _sentence(entry, changes)
+        found.append(Finding(entry.name, changes, held_out, entry.rivals, entry.p_value, sentence))
+    return sorted(found, key=lambda f: f.held_out.after**2 - f.held_out.before**2)
+
+
+def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
+    """Parameters of one cause, before and after."""
+    nominal, found = verdict.nominal.profile, verdict.model.profile
+    if entry.name == "scene_depth":
+        depth_m, std = depth_of(verdict.fit, verdict.table)
+        return {"depth_m": ParameterChange(nominal.depth_m, depth_m, std)}
+    if entry.name == "frame_lag":
+        extensions = found.extensions
+        return {
+            "lag_s": ParameterChange(0.0, extensions.frame_lag_s, 0.3 * _period(verdict)),
+            "frames": ParameterChange(0, extensions.frame_lag_frames, 0),
+        }
+    effect = entry.effect
+    assert effect is not None
+    if effect.term is None:
+        return effect.changes(nominal, found, None)
+    part = verdict.fit.slices[effect.term.name]
+    std = np.sqrt(np.diag(verdict.fit.covariance)[part] + np.array(effect.floor_std) ** 2)
+    changes = effect.changes(nominal, found, std)
+    match effect.name:
+        case "imu_rotation":
+            changes = {
+                "rotation_rad": replace(changes["rotation_rad"], estimate=rotation_between(nominal, found).tolist())
+            }
+        case "focal_length":
+            scale = float(np.exp(total_change(effect, nominal, found)[0]))
+            changes = {"focal_scale": ParameterChange(1.0, scale, float(std[0]) * scale)}
+        case "principal_point":
+            moved = total_change(effect, nominal, found).tolist()
+            changes = {"offset_px": replace(changes["offset_px"], estimate=moved)}
+    return changes
+
+
+def _period(verdict: GeometricVerdict) -> float:
+    stamps = np.unique(verdict.table.first_stamp_s)
+    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1 / 30
+
+
+def _sentence(entry: Accepted, changes: dict[str, ParameterChange]) -> str:
+    values = {name: shown(change.estimate) for name, change in changes.items()}
+    if entry.name == "scene_depth":
+        return f"the camera travels before a scene {values['depth_m']} m away, so points move by parallax"
+    if entry.name == "frame_lag":
+        return f"the first {values['frames']} frames show pictures up to {values['lag_s']} s later than their stamps"
+    assert entry.effect is not None
+    return entry.effect.sentence.format(**values)
+
+
+def shown(value: Any) -> str:
+    """A value as people read it."""
+    if isinstance(value, list):
+        return "(" + ", ".join(shown(v) for v in value) + ")"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+__all__ = ["DirectedMotion", "GeometricVerdict", "InertialMotion", "climb", "findings_of"]
