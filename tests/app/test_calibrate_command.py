@@ -254,6 +254,8 @@ def test_refusals_are_one_line_with_their_code(virest: Virest, shaken: Path) -> 
         (("shaken", "--with", "focal,clock-scew"), 2, "'clock-skew'"),
         (("shaken", "--config", "bad.yaml"), 3, "height"),
         (("empty",), 4, "movie.mp4"),
+        (("nowhere",), 4, "nowhere"),
+        (("-",), 2, "0 captures"),
         (("shaken", "--out", "taken.yaml"), 8, "exists already"),
         (("shaken", "--out", "no/where.yaml"), 8, "does not exist"),
     ]

@@ -6,7 +6,7 @@ rows are timed anew: nothing of the code under test is used but its records.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +107,7 @@ class SwayingCamera:
         time_s = camera_s + self.setup.time_offset_s
         return self.orientation(time_s).inv().apply(self.position(np.array([time_s]), 1)[0])
 
-    def depth(self, camera_s: float, normal: bool = False) -> Array:
+    def plane(self, camera_s: float) -> Array:
         """The wall's plane (3,) in camera axes at an instant on the camera's clock: inverse depth of a ray, z = 1."""
         time_s = camera_s + self.setup.time_offset_s
         away = self.distance - self.normal @ self.position(np.array([time_s]))[0]
@@ -163,7 +163,5 @@ class SwayingCamera:
 
 def turned_aside(profile: CameraProfile, angle_rad: float) -> CameraProfile:
     """A profile whose IMU is mounted a little differently from what is true."""
-    from dataclasses import replace
-
     matrix = Rotation.from_rotvec([angle_rad, -angle_rad / 2, angle_rad]).as_matrix() @ profile.rotation_cam_imu
     return replace(profile, r_cam_imu=tuple(map(tuple, matrix.tolist())))

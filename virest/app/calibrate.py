@@ -55,7 +55,6 @@ class CalibrationPlan:
     extra: tuple[str, ...]
     frames: tuple[int, ...]
     """Movie indices that are tracked."""
-    every_frame: bool
 
     @property
     def steps(self) -> int:
@@ -104,12 +103,16 @@ def unknown_extra(name: str) -> str | None:
 
 
 def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str] = ()) -> CalibrationPlan:
-    """Read the capture and its profile, and choose the frames. Raises CaptureError and SettingsError."""
+    """Read the capture and its profile, and choose the frames. Raises CaptureError, SettingsError, CalibrationError."""
     capture = read_capture(path)
     profile, source = resolve_profile(capture, config)
     frames = choose_frames(capture, profile, FRAME_LAG in extra and FRAME_LAG in OPTIONAL)
-    every = len(frames) == len(capture.frames)
-    return CalibrationPlan(capture, profile, source, _imu_file(source), tuple(extra), tuple(frames), every)
+    if not frames:
+        raise CalibrationError(
+            f"{capture.name}: no frame can be used: {capture.frames[0].skip_reason}",
+            hint="look at it by virest inspect, or record longer",
+        )
+    return CalibrationPlan(capture, profile, source, _imu_file(source), tuple(extra), tuple(frames))
 
 
 def choose_frames(capture: Capture, profile: CameraProfile, with_startup: bool = False) -> list[int]:
@@ -326,7 +329,7 @@ def describe(facts: Json) -> str:
 _TRANSLATIONS = {
     "none": "none seen",
     "inertial": "by the accelerometer, before a plane",
-    "directed": "one direction a pair of frames, any depths",
+    "direction": "one direction for each pair of frames, any depths",
     "free": "a smooth path of its own, before a plane; the accelerometer does not tell it",
 }
 

@@ -358,7 +358,7 @@ def simulate(
 
 @app.command()
 def calibrate(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its name from stdin.")],
     config: Config = None,
     extra: Annotated[
         list[str] | None,
@@ -378,9 +378,19 @@ def calibrate(
 ) -> int:
     """Fit time offset, readout, IMU-camera rotation and gyroscope bias to an ordinary capture.
 
-        \b
-        $ virest calibrate shaken --with focal
-    SESSION
+    \b
+    $ virest calibrate shaken --with focal
+    shaken: calibrated
+    value                       start     calibrated        ±  determined  note
+    time_offset_s            0.000000       0.030998  3.9e-05  yes
+    readout_time_s           0.020000       0.022700  6.7e-05  yes
+    readout_direction   right_to_left  right_to_left           yes
+    ...
+    residual 0.399 -> 0.123 px, of which tracking makes 0.123 px
+    wrote camera.yaml
+
+    \b
+    $ virest calibrate shaken --json --out found.yaml | jq '.values[] | select(.determined) | .name, .value, .std'
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     _one_thread_each()
@@ -389,7 +399,10 @@ def calibrate(
     names = _parse_extras(extra or [])
     output = CalibrationOutput(out, kalibr, overwrite)
     output.require()
-    plan = plan_calibration(capture, config, names)
+    paths = console.expand_dash([capture])
+    if len(paths) != 1:
+        raise typer.BadParameter(f"standard input names {len(paths)} captures; a profile is calibrated from one")
+    plan = plan_calibration(Path(paths[0]), config, names)
     with console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
         facts, text = run_calibration(plan, output, bar.update if bar else None)
     if json:

@@ -25,21 +25,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.app.png import png_bytes
 from virest.errors import OutputError, RestorationError
 
-PNG_OPTIONS = (
-    cv2.IMWRITE_PNG_COMPRESSION,
-    1,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
-    cv2.IMWRITE_PNG_FILTER,
-    cv2.IMWRITE_PNG_FILTER_PAETH,
-)
-"""Photographs hold no runs worth looking for: a predictor of each pixel does the work, in two thirds of the time."""
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
 PART = re.compile(r".*\.[0-9a-f]{8}\.part")
 REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs")
@@ -90,10 +81,11 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     """Write an RGB picture as PNG."""
-    done, data = cv2.imencode(".png", picture[..., ::-1], PNG_OPTIONS)
-    if not done:
-        raise RestorationError(f"{path.name}: the picture {picture.shape} cannot be encoded")
-    write_whole(path, data.tobytes())
+    try:
+        data = png_bytes(picture)
+    except ValueError as error:
+        raise RestorationError(f"{path.name}: cannot be encoded: {error}") from error
+    write_whole(path, data)
 
 
 def plain(value: Any) -> Any:

@@ -276,7 +276,8 @@ def measure_imu_noise(time_s: Array, gyro_rad_s: Array, accel_m_s2: Array) -> Im
     """Measure the noise of samples (n,), (n, 3), (n, 3) that were taken in motion; None where there are too few.
 
     Model: white noise on a hand's smooth motion.  High differences keep the noise and suppress what is slow; windows
-    are chosen by their motion and not by their noise, so the choice does not bias it.  Too high below 100 Hz.  NaN in the accelerometer: its density is unknown.
+    are chosen by their motion and not by their noise, so the choice does not bias it.  Too high below 100 Hz.
+    NaN in the accelerometer: its density is unknown.
     """
     if len(time_s) < MIN_NOISE_SAMPLES:
         return None

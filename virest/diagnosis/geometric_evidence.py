@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.observed_tracks import ObservedTracks
-from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
-from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
+from virest.motion.scene_motion import InertialMotion, Motion
+from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.motion.track_model import TrackTable, centre, ground, seen_s
 from virest.motion.track_noise import smooth_flow_residual
 
@@ -149,6 +149,3 @@ def _depth_std(fitted: TrackFit, world: Array, window: int) -> float:
     assert isinstance(fitted.scene, InertialMotion)
     inverse = float(fitted.scene.plane_per_m[int(window)] @ world)
     return float(np.sqrt(max(world @ part @ world, 0.0))) / max(inverse, MIN_SWAY_DEPTH_PER_M) ** 2
-
-
-__all__ = ["DirectedMotion", "Evidence", "Model", "base_scene", "make_evidence", "one_direction"]

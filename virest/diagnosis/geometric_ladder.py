@@ -29,7 +29,6 @@ from virest.diagnosis.geometric_evidence import (
     free_scene,
     loss,
 )
-from virest.motion.scene_motion import DirectedMotion, InertialMotion
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable
 
@@ -48,8 +47,6 @@ MIN_GAIN = 0.004
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 MAX_RUNGS = 5
-COINCIDENCE_SIGMA = 3.0
-"""A time offset this close to half or a whole exposure is taken for another meaning of the stamp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +88,6 @@ class GeometricVerdict:
     nominal_rms_px: float
     final_rms_px: float
     noise_px: float
-    exposure_hypothesis: float | None = None
-    """Exposure scale that would explain a time offset found at constant exposure."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -299,6 +294,11 @@ def p_of(fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before
     return float(stats.chi2.sf(change @ np.linalg.solve(covariance, change), len(change)))
 
 
+def refit(evidence: Evidence, model: Model) -> TrackFit:
+    """The fit of a model's terms on many points."""
+    return _refitted(evidence, model, FINAL_POINTS)[1]
+
+
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -375,14 +375,16 @@ def rotation_between(nominal: CameraProfile, found: CameraProfile) -> Array:
 
 def _without(model: Model, nominal: Model, leaving: Accepted, kept: list[Accepted]) -> Model:
     """The nominal model with the kept causes' terms, to be fitted anew from where they stand."""
-    assert leaving.effect is not None and leaving.effect.term is not None
-    terms = tuple(term for term in model.terms if term.name != leaving.effect.term.name)
+    assert leaving.effect is not None
+    assert leaving.effect.term is not None
+    name = leaving.effect.term.name
+    terms = tuple(term for term in model.terms if term.name != name)
     back = total_change(leaving.effect, nominal.profile, model.profile)
     profile = leaving.effect.term.change(model.profile, -back)
     return replace(model, profile=profile, terms=terms)
 
 
-def findings_of(verdict: GeometricVerdict, exposures_s: Array) -> list[Finding]:
+def findings_of(verdict: GeometricVerdict) -> list[Finding]:
     """The accepted causes as findings, strongest first."""
     found = []
     for entry in verdict.accepted:
@@ -446,6 +448,3 @@ def shown(value: Any) -> str:
     if isinstance(value, list):
         return "(" + ", ".join(shown(v) for v in value) + ")"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-__all__ = ["DirectedMotion", "GeometricVerdict", "InertialMotion", "climb", "findings_of"]

@@ -437,10 +437,12 @@ def _reason(found: Window, gravity_m_s2: float, spread: float, before: float) ->
             f"the accelerometer does not fit the pictures: {unexplained:.0%} of the parallax unexplained, "
             f"gravity {gravity_m_s2:.2f} m/s²"
         )
+    if found.scale_std > MAX_RELATIVE_STD:
+        return f"scale undetermined: ± {min(found.scale_std, 1):.0%}{' or more' if found.scale_std > 1 else ''}"
+    if found.velocity_std > MAX_RELATIVE_STD:
+        return (
+            f"velocity undetermined: ± {min(found.velocity_std, 1):.0%}{' or more' if found.velocity_std > 1 else ''}"
+        )
     if spread > MAX_SPREAD:
         return f"no common plane: inverse depths spread by {spread:.0%}"
-    if found.scale_std > MAX_RELATIVE_STD:
-        return f"scale undetermined: ± {found.scale_std:.0%}"
-    if found.velocity_std > MAX_RELATIVE_STD:
-        return f"velocity undetermined: ± {found.velocity_std:.0%}"
     return ""

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from virest.calibration.response_curve import CurveFit
 
 FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
 DPI = 110
+COVARIATES = ("row", "time", "radius", "rate")
+"""Drawn first, in this order; others follow, up to MAX_COVARIATES."""
+RESIDUALS = ("x_px", "y_px")
+MAX_COVARIATES = 6
+BINS, MIN_IN_BIN = 24, 8
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+RungBars = tuple[str, float, Mapping[str, float], str | None]
 
 
 def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -> bytes:
@@ -19,18 +30,12 @@ def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -
 
     image_format: one of FORMATS.  Returns the file's bytes.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _canvas(11.0, 7.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.3, 1.0))
     _draw_curve(figure.add_subplot(grid[:, 0]), fit, title)
     _draw_residuals(figure.add_subplot(grid[0, 1]), fit)
     _draw_pictures(figure.add_subplot(grid[1, 1]), fit)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=image_format, dpi=DPI, metadata={} if image_format == "png" else None)
-    return buffer.getvalue()
+    return _as_file(figure, image_format)
 
 
 def _literal(text: str) -> str:
@@ -88,3 +93,122 @@ def _draw_pictures(axes: Any, fit: CurveFit) -> None:
                     fontsize=8)  # fmt: skip
     axes.set_ylabel("listed / true exposure, EV")
     axes.set_title("exposure error of each picture")
+
+
+# ── a diagnosis ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def comparison_figure(
+    rows: Sequence[tuple[str, Picture, Picture]], title: str = "", image_format: str = "png"
+) -> bytes:
+    """Measured picture, simulated picture and their difference, a row each: (label, measured, simulated).
+
+    Pictures (h, w) or (h, w, 3) of 8 bits.  The difference is of luma, all on one scale; its rms stands above.
+    """
+    figure = _canvas(11.0, 0.6 + 3.0 * len(rows))
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    differences = [_luma(measured) - _luma(simulated) for _, measured, simulated in rows]
+    reach = max(1.0, *(float(np.percentile(np.abs(d), 99)) for d in differences))
+    for line, (label, measured, simulated), difference in zip(axes, rows, differences, strict=True):
+        for place, picture, name in zip(line, (measured, simulated), ("measured", f"simulated, {label}"), strict=False):
+            place.imshow(picture, cmap="gray", vmin=0, vmax=255)
+            place.set_title(_literal(name), fontsize=9)
+        shown = line[2].imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
+        rms = float(np.sqrt(np.mean(difference**2)))
+        line[2].set_title(f"measured − simulated, rms {rms:.1f} levels", fontsize=9)
+        figure.colorbar(shown, ax=line[2], shrink=0.8)
+        for place in line:
+            place.set_xticks([])
+            place.set_yticks([])
+    figure.suptitle(_literal(title))
+    return _as_file(figure, image_format)
+
+
+def residual_figure(
+    before: Mapping[str, Any], after: Mapping[str, Any], title: str = "", image_format: str = "png"
+) -> bytes:
+    """Residuals along x and y over every covariate, before and after: medians of equal shares, and their middle 68 %.
+
+    before, after: covariate name → (n,), and ``x_px``, ``y_px`` (n,).
+    """
+    names = [name for name in (*COVARIATES, *before) if name in before and name not in RESIDUALS]
+    names = list(dict.fromkeys(names))[:MAX_COVARIATES]
+    figure = _canvas(3.4 * max(len(names), 1), 5.6)
+    axes = figure.subplots(2, max(len(names), 1), squeeze=False, sharey="row")
+    for line, component in zip(axes, RESIDUALS, strict=True):
+        for place, name in zip(line, names, strict=False):
+            for label, colour, data in (("before", "0.45", before), ("after", "steelblue", after)):
+                if name in data and component in data:
+                    _draw_binned(place, np.asarray(data[name]), np.asarray(data[component]), label, colour)
+            place.axhline(0, color="0.7", lw=0.8, zorder=0)
+            place.set_xlabel(_literal(name))
+        line[0].set_ylabel(f"residual along {component[0]}, px")
+    if names:
+        axes[0][0].legend(loc="upper right", fontsize=8)
+    figure.suptitle(_literal(title))
+    return _as_file(figure, image_format)
+
+
+def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str = "png") -> bytes:
+    """What was tried on each rung, the best on top, and what entered; the line is where the rung began.
+
+    rungs: (quantity, before, {name: after}, entered or None).
+    """
+    figure = _canvas(4.2 * max(len(rungs), 1), 0.9 + 0.26 * max([8, *(len(tried) for _, _, tried, _ in rungs)]))
+    axes = figure.subplots(1, max(len(rungs), 1), squeeze=False)[0]
+    for number, (place, rung) in enumerate(zip(axes, rungs, strict=False), start=1):
+        _draw_rung(place, number, rung)
+    figure.suptitle(_literal(title))
+    return _as_file(figure, image_format)
+
+
+def _draw_rung(axes: Any, number: int, rung: RungBars) -> None:
+    quantity, before, tried, entered = rung
+    known = sorted((after, name) for name, after in tried.items() if np.isfinite(after))
+    names = [name for _, name in known]
+    colours = ["steelblue" if name == entered else "0.75" for name in names]
+    axes.barh(range(len(names)), [after for after, _ in known], color=colours)
+    axes.set_yticks(range(len(names)), [_literal(name) for name in names], fontsize=8)
+    axes.invert_yaxis()
+    if np.isfinite(before):
+        axes.axvline(before, color="crimson", lw=1.2, label=f"before: {before:.3g}")
+        axes.legend(loc="lower right", fontsize=8)
+    axes.set_xlabel(f"{_literal(quantity)}, held-out frames")
+    axes.set_title(_literal(f"{number}. {entered or 'nothing gains enough'}"), fontsize=10)
+
+
+def _draw_binned(axes: Any, along: Array, residual: Array, label: str, colour: str) -> None:
+    known = np.isfinite(along) & np.isfinite(residual)
+    along, residual = along[known], residual[known]
+    if len(along) < MIN_IN_BIN:
+        return
+    order = np.argsort(along, kind="stable")
+    shares = np.array_split(order, min(BINS, len(order) // MIN_IN_BIN))
+    middle = [float(np.median(along[share])) for share in shares]
+    low, centre, high = (np.array([np.percentile(residual[share], q) for share in shares]) for q in (16, 50, 84))
+    axes.fill_between(middle, low, high, color=colour, alpha=0.2, lw=0)
+    axes.plot(middle, centre, color=colour, lw=1.6, marker=".", label=f"{label}: rms {_rms(residual):.3g} px")
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _luma(picture: Picture) -> Array:
+    values = np.asarray(picture, float)
+    return values if values.ndim == 2 else values @ np.array([0.299, 0.587, 0.114])
+
+
+def _canvas(width_in: float, height_in: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _as_file(figure: Any, image_format: str) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=image_format, dpi=DPI, metadata={} if image_format == "png" else None)
+    return buffer.getvalue()

@@ -157,6 +157,8 @@ def plan_restoration(
     )
     if not any(f.skip_reason is None for f in frames):
         return plan
+    if profile.depth_m is None and not capture.imu.has_accelerometer:
+        plan = _without_translation(plan, "no accelerometer")
     chosen = set(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0))
     runs = choose_runs(frames) if _wants_translation(profile, capture) else []
     all_pairs = track_pairs(read_gray(sorted(chosen.union(runs))))
@@ -236,9 +238,9 @@ def _with_translations(plan: RestorationPlan, capture: Capture, alignment: Visua
     frames = [f for f in at_true_times(capture.frames, profile, capture.repeats) if np.isfinite(f.time_s)]
     motions = {frame.index: _motion(alignment, profile, frame, reference) for frame in frames}
     known = {index: motion for index, motion in motions.items() if isinstance(motion, FrameMotion)}
-    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
     if not known:
-        return replace(plan, warnings=(*warnings, f"{NOT_ESTIMATED} ({alignment.refused or 'no frames'})"))
+        return _without_translation(plan, alignment.refused or "no frames")
+    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
     open_frames = [motion for index, motion in motions.items() if index not in known]
     if open_frames:
         reason = max(map(str, open_frames), key=[str(motion) for motion in open_frames].count)
@@ -247,6 +249,11 @@ def _with_translations(plan: RestorationPlan, capture: Capture, alignment: Visua
     return replace(
         plan, warnings=warnings, notes=(*plan.notes, _account(list(known.values()))), translations=translations
     )
+
+
+def _without_translation(plan: RestorationPlan, reason: str) -> RestorationPlan:
+    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
+    return replace(plan, warnings=(*warnings, f"{NOT_ESTIMATED} ({reason})"))
 
 
 def _motion(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,13 @@ SHARE_PER_AXIS = (0.64, 0.64, 0.42)
 """Of the RMS rate, on pitch, yaw and roll: hands roll less than they nod and turn."""
 _GAUSS = 0.5 - np.sqrt(3.0) / 6.0
 _COMPONENTS = 18
+
+
+class Signal(Protocol):
+    """A vector that is known at every time."""
+
+    def at(self, time_s: Array, derivative: int = 0) -> Array:
+        """Value, or a time derivative of it, at times (...,): (..., 3)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +60,9 @@ class Waves:
 class HandMotion:
     """A camera's motion, known at every time of [start_s, end_s] (and, more slowly integrated, a little beyond)."""
 
-    rate: Waves
+    rate: Signal
     """Angular rate, rad/s, camera axes."""
-    sway: Waves
+    sway: Signal
     """Position of the camera's centre, metres, world axes."""
     node_s: Array
     """(n,) times of the integrated orientations."""
@@ -138,7 +146,7 @@ def constant_motion(
 
 
 def integrate_motion(
-    rate: Waves, sway: Waves, start_s: float, end_s: float, *, centre_on_s: tuple[float, float]
+    rate: Signal, sway: Signal, start_s: float, end_s: float, *, centre_on_s: tuple[float, float]
 ) -> HandMotion:
     """Orientation at nodes over [start_s, end_s]; the mean orientation over ``centre_on_s`` is the world's axes."""
     count = int(np.ceil((end_s - start_s) / NODE_STEP_S)) + 1
@@ -152,7 +160,7 @@ def integrate_motion(
     return HandMotion(rate, sway, node_s, centred.as_quat(scalar_first=True))
 
 
-def _magnus(rate: Waves, start_s: Array, step_s: Array) -> Array:
+def _magnus(rate: Signal, start_s: Array, step_s: Array) -> Array:
     """Rotation vectors of steps (n,) that begin at start_s (n,), in the axes at the start: (n, 3); O(step⁵)."""
     first = rate.at(start_s + _GAUSS * step_s)
     second = rate.at(start_s + (1 - _GAUSS) * step_s)

@@ -88,6 +88,10 @@ class Session:
     """First and last inertial sample."""
     exposures: Exposures
     """Of every capture, the first ``frames`` of them shown or not."""
+    capture_s: Array | None = None
+    """(captures,) stamp of every capture from stamp_0, camera clock; None: even, at the settings' frame rate."""
+    recorded_imu: ImuLog | None = None
+    """Samples of a phone, to be written as they are; None: worked out from the motion."""
 
     def logged_exposure_s(self, capture: int) -> float:
         """Exposure that the log gives for a capture."""
@@ -99,7 +103,9 @@ class Session:
 
     def first_row_start_s(self, capture: int) -> float:
         """Start of the first row's exposure, IMU clock from stamp_0."""
-        return _first_row_start_s(self.true, _stamp_s(capture, self.settings.fps), self.true_exposure_s(capture))
+        stamps = self.capture_s
+        stamp_s = _stamp_s(capture, self.settings.fps) if stamps is None else float(stamps[capture])
+        return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture))
 
     def middle_s(self, capture: int) -> float:
         """Start of the first row + half the readout + half the exposure."""
@@ -176,7 +182,7 @@ def plan_session(
             sway_rms_m=sway,
             margin_s=float(spare),
         )
-    shows = _shown_captures(true, settings)
+    shows = shown_captures(true, settings)
     if scene is None:
         scene = _draw_scene(nominal, motion, settings, duration)
         if np.isfinite(depth):
@@ -216,6 +222,8 @@ def render_truth(session: Session, slot: int, *, middle: bool = False) -> Pictur
 
 def sample_imu(session: Session) -> ImuLog:
     """Gyroscope (scale × true + bias + noise) and accelerometer, at the IMU's place and in its axes."""
+    if session.recorded_imu is not None:
+        return session.recorded_imu
     settings, true = session.settings, session.true
     grid_s = np.arange(session.imu_span_s[0], session.imu_span_s[1], 1 / settings.imu_rate_hz)
     time_ns: NDArray[np.int64] = np.rint(grid_s * 1e9).astype(np.int64)
@@ -262,7 +270,7 @@ def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: flo
     return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0)
 
 
-def _shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np.int64]:
+def shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np.int64]:
     """Slot k shows capture k + lag − repeats so far; the repeats are spread over slots 1 … frames."""
     slots = np.arange(settings.frames)
     last = true.extensions.frame_lag_frames

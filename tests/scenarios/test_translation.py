@@ -1,0 +1,228 @@
+"""A hand that sways near a wall: displacement and depth found in the capture itself, or rotation only with the reason."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+from story import Picture, Result, process, truth_picture
+
+from virest.app.bench.measures import psnr_db
+from virest.app.simulate import simulate_command
+from virest.camera.profile import CameraProfile
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.records import Capture
+from virest.capture.video import probe_movie, read_frames, read_gray
+from virest.degradation.row_motion import FrameTranslation, frame_times_s
+from virest.restoration.capture import RestorationPlan, plan_restoration, restore_frames
+from virest.restoration.settings import PRESETS
+
+pytestmark = pytest.mark.scenario
+
+SETTINGS = PRESETS["fast"]
+CHOSEN = range(4, 60, 11)
+USUAL: dict[str, Any] = {"frames": 60, "noise_levels": 1.5, "bitrate_bits_per_px": 0.6, "exposure_ms": 10.0}
+SWAYS: dict[str, dict[str, Any]] = {
+    "landscape": {"width": 640, "height": 480, "seed": 311, "depth_m": 1.5, "sway_m": 0.08, "tilt_deg": (12.0, -18.0)}
+    | {"rate_rad_s": 0.6, "effects": ["time_offset=0.011"]},
+    "portrait": {"width": 480, "height": 640, "seed": 312, "depth_m": 2.0, "sway_m": 0.08, "tilt_deg": (-15.0, 10.0)}
+    | {"rate_rad_s": 0.8, "effects": ["time_offset=-0.007"]},
+}
+
+
+@dataclass(frozen=True)
+class Story:
+    """A capture whose profile knows all but the depth."""
+
+    capture: Capture
+    profile: CameraProfile
+
+    @property
+    def truth(self) -> dict[int, FrameTranslation]:
+        """Velocity, acceleration and the scene's plane of each frame, from the true trajectory in world axes."""
+        table = np.loadtxt(self.capture.folder / "truth" / "trajectory.csv", delimiter=",", skiprows=1)
+        turn = Slerp(table[:, 0], Rotation.from_quat(table[:, 4:8], scalar_first=True))
+        position = CubicSpline(table[:, 0], table[:, 1:4])
+        plane = json.loads((self.capture.folder / "truth" / "effects.json").read_text())["scene_plane"]
+        normal, foot = np.array(plane["normal"]), np.array([0, 0, plane["depth_m"]])
+        found = {}
+        for frame in self.capture.frames:
+            _, at_s = frame_times_s(self.profile, frame.time_s, frame.exposure_s, SETTINGS.reference)
+            to_camera = turn(at_s).as_matrix().T
+            nearness = to_camera @ normal / (normal @ (foot - position(at_s)))
+            velocity, acceleration = (to_camera @ position(at_s, order) for order in (1, 2))
+            found[frame.index] = FrameTranslation(velocity, acceleration, nearness, 1 / nearness[2], "triangulated")
+        return found
+
+    def plan(self, **changes: Any) -> RestorationPlan:
+        """What process plans for the capture."""
+        index = probe_movie(self.capture.movie)
+
+        def read(numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
+            yield from read_gray(self.capture.movie, index, numbers)
+
+        return plan_restoration(self.capture, replace(self.profile, **changes), SETTINGS, read)
+
+    def psnr_db(self, plan: RestorationPlan) -> np.ndarray[Any, Any]:
+        """Of the chosen frames, against truth, away from the edges."""
+        folder, movie = self.capture.folder, self.capture.movie
+        pictures = dict(read_frames(movie, probe_movie(movie), 0, max(CHOSEN)))
+        frames = [(self.capture.frames[k], pictures[k]) for k in CHOSEN]
+        found = []
+        for restored in restore_frames(frames, self.capture.imu, plan):
+            truth = truth_picture(folder, restored.frame.index)
+            assert restored.picture is not None
+            found.append(psnr_db(restored.picture, truth, (30, 30, truth.shape[1] - 30, truth.shape[0] - 30)))
+        return np.array(found)
+
+
+@pytest.fixture(scope="module")
+def story(work: Path) -> Callable[[str], Story]:
+    """Make each capture once; its profile is the true one without the depth."""
+    made: dict[str, Story] = {}
+
+    def make(name: str) -> Story:
+        if name not in made:
+            folder = work / f"sway_{name}"
+            simulate_command(folder, **USUAL, **SWAYS[name])
+            capture = read_capture(folder)
+            profile = resolve_profile(capture, folder / "truth" / "camera.yaml")[0]
+            made[name] = Story(capture, replace(profile, depth_m=None))
+        return made[name]
+
+    return make
+
+
+def require_close(found: RestorationPlan, story: Story, velocity: float = 0.1, depth: float = 0.05) -> None:
+    """Check velocities (rms error over rms) and depths (each frame) against truth."""
+    assert found.translations is not None, found.warnings
+    assert len(found.translations) == len(story.capture.frames)
+    true = story.truth
+    v, t = (np.array([of[k].velocity_m_s for k in true]) for of in (found.translations, true))
+    assert math.sqrt(((v - t) ** 2).sum() / (t**2).sum()) < velocity
+    ratio = np.array([found.translations[k].inverse_depth_plane[2] / true[k].inverse_depth_plane[2] for k in true])
+    np.testing.assert_allclose(ratio, 1, atol=depth)
+
+
+@pytest.mark.parametrize("name", SWAYS)
+def test_velocity_and_depth_are_found_and_restore_as_well_as_the_true_ones(story: Callable[[str], Story], name: str):
+    """Velocity within 10 %, depth within 5 %; 6 dB above rotation alone, and within 1 dB of the true translation."""
+    told = story(name)
+    plan = told.plan()
+    require_close(plan, told)
+    assert {t.source for t in (plan.translations or {}).values()} == {"triangulated"}
+    assert not any("rotation only" in warning for warning in plan.warnings)
+    turned, found, true = (told.psnr_db(replace(plan, translations=t)) for t in (None, plan.translations, told.truth))
+    assert (found - turned).mean() > 6, found - turned
+    assert (found - turned).min() > -0.1
+    assert (true - found).max() < 1
+
+
+def test_an_unknown_offset_is_found_along(story: Callable[[str], Story]):
+    """Clock, velocity and depth come from one fit where the profile knows none of them."""
+    told = story("landscape")
+    plan = told.plan(time_offset_s=None)
+    assert plan.copy_reason is None
+    assert plan.profile.time_offset_s == pytest.approx(0.011, abs=2e-4)
+    assert plan.profile.estimates["time_offset_s"].std < 1e-3
+    require_close(plan, told)
+
+
+def test_a_stated_depth_is_the_one_logged_and_infinity_asks_for_no_translation(story: Callable[[str], Story]):
+    """The velocity is still found in the capture; at infinity nothing is estimated."""
+    told = story("portrait")
+    plan = told.plan(depth_m=2.0)
+    require_close(plan, told, depth=0.06)
+    assert {(t.depth_m, t.source) for t in (plan.translations or {}).values()} == {(2.0, "profile")}
+    far = told.plan(depth_m=math.inf)
+    assert far.translations is None
+    assert not any("rotation only" in warning for warning in far.warnings)
+
+
+def test_accelerations_a_sample_late_do_not_matter(story: Callable[[str], Story]):
+    """Shifting the accelerometer by one row of the log changes neither velocity nor depth."""
+    told = story("landscape")
+    imu = told.capture.imu
+    late = replace(imu, accel_m_s2=np.roll(imu.accel_m_s2, 1, axis=0))
+    require_close(Story(replace(told.capture, imu=late), told.profile).plan(), told)
+
+
+# ── as the program runs ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def with_depth(capture: Path, out: Path, depth: str | None) -> Path:
+    """A copy of the true profile with another depth."""
+    profile = yaml.safe_load((capture / "truth" / "camera.yaml").read_text(encoding="utf-8"))
+    profile["scene"]["depth_m"] = depth
+    out.write_text(yaml.safe_dump(profile), encoding="utf-8")
+    return out
+
+
+def run(virest: Any, capture: Path, out: Path, depth: str | None, *options: object) -> Result:
+    """Process a few frames with a profile of this depth."""
+    out.mkdir(parents=True, exist_ok=True)
+    config = with_depth(capture, out / "camera.yaml", depth)
+    return process(virest, capture, out, "--preset", "fast", "--frames", "10:50:13", "--config", config, *options)
+
+
+def pictures(result: Result) -> list[Picture]:
+    """All that were written."""
+    return [result.picture(line) for line in result.lines]
+
+
+def test_the_log_says_what_was_found_whatever_the_jobs(virest, work: Path, story: Callable[[str], Story]):
+    """Depth and velocity of every frame, the same pictures from one process and from two."""
+    told = story("landscape")
+    folder = told.capture.folder
+    one = run(virest, folder, work / "one", None)
+    two = run(virest, folder, work / "two", None, "--jobs", 2)
+    truth = told.truth
+    for line, other, a, b in zip(one.lines, two.lines, pictures(one), pictures(two), strict=True):
+        assert line["depth_source"] == "triangulated"
+        assert line["depth_m"] == pytest.approx(truth[line["frame"]].depth_m, rel=0.05)
+        assert np.linalg.norm(line["motion"]["velocity_m_s"]) > 0
+        assert {**line, "seconds": 0} == {**other, "seconds": 0}
+        np.testing.assert_array_equal(a, b)
+    assert not any("rotation only" in warning for line in one.lines for warning in line["warnings"])
+
+
+REFUSED = {
+    "still": {"rate_rad_s": 0.0, "sway_m": 0.0, "depth_m": 1.5},
+    "turning": {"rate_rad_s": 1.0, "sway_m": 0.0, "depth_m": 1.5},
+    "shuffled": {"rate_rad_s": 0.8, "sway_m": 0.07, "depth_m": 1.7, "tilt_deg": (10.0, -12.0)},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_determine_the_translation_is_restored_by_rotation_alone(virest, work: Path, name: str):
+    """With the reason in the log, and the very pictures of a scene at infinity: never worse."""
+    folder = work / f"refused_{name}"
+    simulate_command(folder, **{**USUAL, "width": 320, "height": 240, "seed": 77, **REFUSED[name]})
+    if name == "shuffled":
+        shuffle(folder / "gyro_accel.csv")
+    refused = run(virest, folder, work / f"{name}_null", None)
+    rotation = run(virest, folder, work / f"{name}_inf", "inf")
+    assert any("rotation only (" in warning for warning in refused.account["warnings"]), refused.account["warnings"]
+    for line, a, b in zip(refused.lines, pictures(refused), pictures(rotation), strict=True):
+        assert line["depth_source"] == "none"
+        assert line["depth_m"] is None
+        assert line["motion"]["velocity_m_s"] is None
+        np.testing.assert_array_equal(a, b)
+
+
+def shuffle(log: Path) -> None:
+    """Move the accelerations by a second against everything else."""
+    table = pd.read_csv(log, dtype=str)
+    columns = [name for name in table.columns if name.startswith("a")]
+    table[columns] = np.roll(table[columns].to_numpy(), 200, axis=0)
+    table.to_csv(log, index=False)

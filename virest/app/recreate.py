@@ -1,0 +1,185 @@
+"""``virest simulate OUT --like CAPTURE``: a measured capture taken once more by the simulator, with known truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.records import Capture, Frame
+from virest.capture.video import probe_movie, read_frames, read_gray
+from virest.errors import CaptureError, OutputError, SettingsError
+from virest.motion.integration import integrate_gyro
+from virest.motion.trajectory import vector_from_rotation
+from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration, restore_frames
+from virest.restoration.settings import PRESETS, RestorationSettings
+from virest.simulation.effects import EffectContext, hide_effects
+from virest.simulation.recording import RecordingOptions, write_recording
+from virest.simulation.recreation import ScenePicture, known_frames, recreate_session
+from virest.simulation.session import Session, SessionSettings
+
+log = logging.getLogger(__name__)
+
+Picture = NDArray[np.uint8]
+Json = dict[str, Any]
+NEAREST_PART = 0.25
+"""The scene is the calmest of this part of the frames: those that look most nearly where all look on average."""
+MAX_TRIES = 5
+BITS_PER_PX = (0.03, 2.0)
+"""The movie's own rate of bits is taken over, within this."""
+
+
+def simulate_like(
+    out: Path,
+    like: Path,
+    *,
+    config: Path | None = None,
+    frames: slice | None = None,
+    noise_levels: float = 1.5,
+    effects: Sequence[str] = (),
+    reference: str = "exposure-start",
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Json:
+    """Write a capture with the stamps, exposures, inertial samples, size and profile of another; returns a summary.
+
+    The scene is one of its frames, restored.  effects: hidden from everything but ``truth/``, as in any simulation.
+    """
+    if Path(out).resolve() == Path(like).resolve():
+        raise OutputError(f"{out}: is the capture that is to be re-created", hint="name another folder")
+    capture = read_capture(like)
+    given, source = resolve_profile(capture, config)
+    log.info("%s: camera profile from %s", capture.name, source)
+    plan = scene_plan(capture, given)
+    for warning in (*plan.warnings, *([plan.copy_reason] if plan.copy_reason else [])):
+        log.warning("%s: %s", capture.name, warning)
+    kept = _kept(capture, frames)
+    nominal = plan.profile
+    scene = find_scene(capture, plan, kept)
+    context = EffectContext(len(kept), _fps(kept), np.random.default_rng([seed, 5]))
+    true, applied = hide_effects(nominal, list(effects), context)
+    settings = SessionSettings(noise_levels=noise_levels, seed=seed)
+    session = recreate_session(capture, kept, nominal, true, scene, settings)
+    options = RecordingOptions(bits_per_px=_bits_per_px(capture), middle_truth=reference == "frame-middle")
+    folder = write_recording(session, out, applied=applied, options=options, overwrite=overwrite, progress=progress)
+    return {
+        "capture": str(folder),
+        "like": str(capture.folder),
+        "scene": f"frame {scene.frame}, restored",
+        "width": nominal.width,
+        "height": nominal.height,
+        "frames": len(kept),
+        "fps": round(session.settings.fps, 4),
+        "exposure_ms": _range_ms(kept),
+        "readout_ms": nominal.shutter.readout_time_s * 1000,
+        "readout_direction": nominal.shutter.readout_direction,
+        "seed": seed,
+        "blur_px": blur_px(session),
+        "effects": [{"name": effect.name, "parameters": effect.parameters} for effect in applied],
+    }
+
+
+def count_frames(like: Path, frames: slice | None = None) -> int:
+    """How many frames a re-creation is about to render, at most: for the progress bar."""
+    movie = like / "movie.mp4"
+    return len(range(len(probe_movie(movie)))[frames or slice(None)]) if movie.is_file() else 0
+
+
+def scene_plan(
+    capture: Capture, profile: CameraProfile, settings: RestorationSettings = PRESETS["balanced"]
+) -> RestorationPlan:
+    """What a restoration of this capture needs, unknown values filled in. Raises SettingsError without focal length."""
+    index = probe_movie(capture.movie)
+
+    def read_decodable(numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        for number, picture in read_gray(capture.movie, index, numbers):
+            if picture is not None:
+                yield number, picture
+
+    plan = plan_restoration(capture, profile, settings, read_decodable)
+    if plan.profile.intrinsics is None:
+        raise SettingsError(
+            f"{capture.name}: {plan.copy_reason or 'focal length unknown'}", hint="--config takes a camera profile"
+        )
+    return plan
+
+
+def find_scene(capture: Capture, plan: RestorationPlan, frames: Sequence[Frame]) -> ScenePicture:
+    """Restore the frame that the scene is made of: near the middle of all views, and calm."""
+    for number in _scene_order(capture, plan.profile, frames)[:MAX_TRIES]:
+        picture = restore_one(capture, plan, number)
+        if picture is not None:
+            return ScenePicture(picture, number)
+    raise CaptureError(f"{capture.name}: no frame can be restored as the scene", hint="see `virest process`")
+
+
+def restore_one(capture: Capture, plan: RestorationPlan, number: int) -> Picture | None:
+    """One restored frame, or its decoded picture where restoring is refused; None: it cannot be had."""
+    frames = at_true_times(capture.frames, plan.profile, capture.repeats)
+    frame = dataclasses.replace(frames[number], skip_reason=None, skip_codes=())
+    _, picture = next(read_frames(capture.movie, probe_movie(capture.movie), number, number), (number, None))
+    restored = next(restore_frames([(frame, picture)], capture.imu, plan), None)
+    return None if restored is None else restored.picture
+
+
+def blur_px(session: Session) -> float:
+    """Median over the frames of the picture's motion at its centre during one exposure, in pixels."""
+    lens = session.true.intrinsics
+    assert lens is not None
+    captures = session.shows.tolist()
+    begin = np.array([session.first_row_start_s(k) for k in captures]) + 0.5 * session.true.shutter.readout_time_s
+    lasting = np.array([session.true_exposure_s(k) for k in captures])
+    turn = session.motion.rotation(begin).inv() * session.motion.rotation(begin + lasting)
+    return round(lens.fx_px * float(np.median(np.linalg.norm(turn.as_rotvec()[:, :2], axis=1))), 2)
+
+
+# ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _kept(capture: Capture, frames: slice | None) -> tuple[Frame, ...]:
+    if frames is not None and frames.step not in (None, 1):
+        raise SettingsError("a re-creation takes frames that follow each other", hint="write --frames A:B")
+    chosen = capture.frames[frames or slice(None)]
+    kept = known_frames(chosen)
+    if len(kept) < len(chosen):
+        log.warning("%s: %d frames without time or motion left out", capture.name, len(chosen) - len(kept))
+    if not kept:
+        raise CaptureError(f"{capture.name}: --frames selects no frame", hint=f"it has {len(capture.frames)}")
+    return kept
+
+
+def _scene_order(capture: Capture, profile: CameraProfile, frames: Sequence[Frame]) -> list[int]:
+    """Movie indices, the best scene first: of the quarter nearest to the mean view the calmest."""
+    trajectory = integrate_gyro(capture.imu, profile)
+    usable = [frame for frame in frames if frame.skip_reason is None] or list(frames)
+    time_s = np.array([float(profile.imu_time_s(frame.time_s)) for frame in usable])
+    turned = trajectory.orientation(time_s)
+    u, _, v = np.linalg.svd(turned.mean(axis=0))
+    away = np.linalg.norm(vector_from_rotation(turned @ (u @ v).T), axis=-1)
+    streak = np.linalg.norm(trajectory.rate_rad_s(time_s), axis=-1) * [frame.exposure_s or 0.0 for frame in usable]
+    near = away <= np.quantile(away, NEAREST_PART)
+    order = np.lexsort((streak, ~near))
+    return [usable[i].index for i in order]
+
+
+def _fps(frames: Sequence[Frame]) -> float:
+    steps = np.diff([frame.time_s for frame in frames])
+    return float(1 / np.median(steps)) if len(steps) else 30.0
+
+
+def _bits_per_px(capture: Capture) -> float:
+    bits = 8 * capture.movie.stat().st_size / (len(capture.frames) * capture.width * capture.height)
+    return float(np.clip(bits, *BITS_PER_PX))
+
+
+def _range_ms(frames: Sequence[Frame]) -> list[float]:
+    exposures = sorted({round(1000 * (frame.exposure_s or 0.0), 4) for frame in frames})
+    return exposures if len(exposures) == 1 else [exposures[0], exposures[-1]]

@@ -1,0 +1,389 @@
+"""`virest diagnose`: what the model gets wrong on a capture, why, and what each cause gains where it was not fitted.
+
+First what moves points (tracked from frame to frame), for brightness and blur are only comparable once points are where
+they should be; then brightness, then blur.  What is left is tested for structure.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from virest.camera.profile import CameraProfile
+from virest.camera.shutter import STAMP_FRACTION
+from virest.capture.records import NO_STAMP, Capture, Frame
+from virest.diagnosis import picture_ladder
+from virest.diagnosis.findings import (
+    CONSISTENT,
+    EXPLAINED,
+    GEOMETRY,
+    PHOTOMETRY,
+    UNEXPLAINED,
+    Diagnosis,
+    Finding,
+    Nominal,
+    ParameterChange,
+    Remaining,
+    Rival,
+)
+from virest.diagnosis.geometric_evidence import Evidence, make_evidence
+from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_of, refit
+from virest.diagnosis.picture_ladder import Reader, climb_blur, climb_photometry
+from virest.diagnosis.start_up import lag_schedules
+from virest.diagnosis.structure import Structure, structures
+from virest.errors import CaptureError
+from virest.motion import profile_terms as terms_of
+from virest.motion.coarse_alignment import align_coarsely
+from virest.motion.integration import integrate_gyro
+from virest.motion.observed_tracks import ObservedTracks, observe_tracks
+from virest.motion.track_fit import Term
+from virest.motion.track_model import seen_s
+from virest.motion.tracking import track_pairs
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+MIN_PAIRS = 12
+MIN_EXPLAINED = 0.3
+CONSTANT_EXPOSURE = 0.03
+COINCIDENCE_SIGMA = 3.5
+STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
+"""Structure of this size, and of this part of the noise, has a cause."""
+STRUCTURE_P = 1e-4
+TRACKING_BIAS_PX = 0.02
+SCALE_EXCESS = 1.25
+"""Differences this many times their noise, measured without the model, are not all noise."""
+STRAY_DISTANCE, STRAY_PART = 6.0, 0.1
+PHOTOMETRIC_STRUCTURE = 2.0
+"""Grey levels."""
+
+
+def diagnose_capture(
+    capture: Capture,
+    profile: CameraProfile,
+    pictures: Reader,
+    gray: Reader,
+    progress: Callable[[str, float], None] | None = None,
+) -> Diagnosis:
+    """Climb the ladder on one capture; pictures gives (index, RGB), gray (index, luma) of the frames asked for.
+
+    Raises CaptureError where there is nothing to judge by: no focal length, too few points.
+    """
+    say = progress or (lambda _text, _part: None)
+    if profile.intrinsics is None:
+        raise CaptureError(
+            "the focal length is unknown", hint="give fx_px in camera.yaml, or run virest calibrate first"
+        )
+    indices = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
+    say("tracking", 0.02)
+    observed = observe_tracks(capture, track_pairs(gray(indices)), profile)
+    start, null_terms, notes = _with_null_values(observed, capture, profile)
+    observed = observed.covered(capture.imu, start)
+    if len(observed.pairs) < MIN_PAIRS:
+        raise CaptureError(
+            f"{len(observed.pairs)} pairs of frames have points to follow, {MIN_PAIRS} are needed",
+            hint="a longer capture, or one with more texture",
+        )
+    evidence = make_evidence(capture.imu, observed)
+    say("points", 0.15)
+    schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
+    geometric = climb(evidence, start, null_terms, schedules, lambda part: say("points", 0.15 + 0.4 * part))
+    findings = _stamped(geometric, findings_of(geometric), observed.exposure_s)
+    found = geometric.model.profile
+    frames = _at_model_times(capture, geometric)
+    trajectory = integrate_gyro(capture.imu, found)
+    say("brightness", 0.55)
+    photometric = climb_photometry(capture, frames, found, trajectory, pictures, gray)
+    say("blur", 0.8)
+    shown = replace(capture, frames=tuple(frames))
+    hypothesis = _exposure_hypothesis(findings, observed.exposure_s)
+    blurred, is_exposure = climb_blur(shown, photometric.profile, trajectory, gray, hypothesis)
+    if is_exposure and hypothesis is not None:
+        findings = _as_exposure(evidence, geometric, findings, hypothesis, float(np.median(observed.exposure_s)))
+        blurred = _one_exposure(blurred)
+    say("what is left", 0.95)
+    extended = _merged(geometric.model.profile, photometric.profile, blurred.profile, is_exposure, hypothesis)
+    findings = [*findings, *photometric.findings, *blurred.findings]
+    findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
+    remaining = _remaining(geometric, photometric)
+    verdict = UNEXPLAINED if remaining.significant else EXPLAINED if findings else CONSISTENT
+    nominal = Nominal(
+        geometric.nominal_rms_px, geometric.noise_px, photometric.photometric_rms, blurred.blur_rms_px,
+        observed.tracks, len(indices),
+    )  # fmt: skip
+    rungs = (*geometric.rungs, *photometric.rungs, *blurred.rungs)
+    residuals = {"before": _residuals(evidence, geometric, True), "after": _residuals(evidence, geometric, False)}
+    all_notes = (*notes, *geometric.notes, *photometric.notes, *blurred.notes)
+    return Diagnosis(
+        verdict, nominal, tuple(findings), remaining, geometric.nominal.profile, extended, rungs, residuals, all_notes
+    )
+
+
+# ── what the profile leaves open ─────────────────────────────────────────────────────────────────────────────────
+
+
+def _with_null_values(
+    observed: ObservedTracks, capture: Capture, profile: CameraProfile
+) -> tuple[CameraProfile, list[Term], list[str]]:
+    """The profile with an unknown offset found coarsely, and the terms to be fitted on every rung."""
+    terms: list[Term] = []
+    notes: list[str] = []
+    if profile.time_offset_s is None and len(observed.pairs) >= MIN_PAIRS:
+        coarse = align_coarsely(observed.turns(profile), capture.imu, profile)
+        if coarse is not None and coarse.explained > MIN_EXPLAINED:
+            profile = replace(profile, time_offset_s=coarse.time_offset_s)
+            terms.append(terms_of.TIME_OFFSET)
+        else:
+            notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
+            profile = replace(profile, time_offset_s=0.0)
+    if not profile.readout_known:
+        terms.append(terms_of.READOUT)
+    return profile, terms, notes
+
+
+def _at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]:
+    """Frames that can be looked at, with the stamps that the model gives them."""
+    lag = geometric.model.lag
+    frames = []
+    for frame in capture.frames:
+        if frame.skip_reason is None or (frame.only_startup and lag):
+            shift = lag[frame.index] if lag else 0.0
+            frames.append(replace(frame, time_s=frame.time_s + shift, skip_reason=None, skip_codes=()))
+    return frames
+
+
+# ── causes that look alike ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def _is_constant(exposure_s: Array) -> bool:
+    return float(np.ptp(exposure_s)) < CONSTANT_EXPOSURE * float(np.median(exposure_s))
+
+
+def _stamped(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
+    """At constant exposure an offset of just half or one exposure is another meaning of the stamp; rivals in any case."""
+    if not _is_constant(exposure_s) or float(np.median(exposure_s)) <= 0:
+        return findings
+    nominal = geometric.nominal.profile
+    exposure = nominal.shutter.true_exposure_s(float(np.median(exposure_s)))
+    result = []
+    for finding in findings:
+        if finding.name == "timestamp_reference":
+            known = tuple(rival for rival in finding.rivals if rival.name != "time_offset")
+            result.append(replace(finding, rivals=(Rival("time_offset", finding.held_out.after), *known)))
+            continue
+        if finding.name != "time_offset":
+            result.append(finding)
+            continue
+        change = finding.parameters["time_offset_s"]
+        shift, std = change.estimate - (change.nominal or 0.0), float(change.std)
+        others = [rival for rival in finding.rivals if rival.name != "timestamp_reference"]
+        meaning = _meaning(nominal.shutter.timestamp, shift, exposure, std)
+        if meaning is None:
+            result.append(finding)
+            continue
+        result.append(
+            replace(
+                finding,
+                name="timestamp_reference",
+                parameters={"timestamp": ParameterChange(nominal.shutter.timestamp, meaning, None)},
+                rivals=(Rival("time_offset", finding.held_out.after), *others),
+                sentence=f"a frame's stamp means its {meaning}; or the clocks differ by {shift:.4g} s",
+            )
+        )
+        shutter = replace(geometric.model.profile.shutter, timestamp=meaning)
+        geometric.model = replace(
+            geometric.model,
+            profile=replace(geometric.model.profile, shutter=shutter, time_offset_s=nominal.time_offset_s),
+        )
+    return result
+
+
+def _meaning(now: str, shift_s: float, exposure_s: float, std_s: float) -> str | None:
+    """The stamp's meaning that an offset amounts to: its first row starts later by (now − meaning) exposures."""
+    for meaning, fraction in STAMP_FRACTION.items():
+        expected = (STAMP_FRACTION[now] - fraction) * exposure_s
+        if meaning != now and abs(shift_s - expected) < COINCIDENCE_SIGMA * std_s:
+            return meaning
+    return None
+
+
+def _exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array) -> float | None:
+    """The exposure scale whose longer or shorter middle would look like the time offset found."""
+    exposure = float(np.median(exposure_s))
+    for finding in findings:
+        if finding.name == "time_offset" and _is_constant(exposure_s) and exposure > 0:
+            change = finding.parameters["time_offset_s"]
+            return 1.0 + 2.0 * (change.estimate - (change.nominal or 0.0)) / exposure
+    return None
+
+
+def _as_exposure(
+    evidence: Evidence, geometric: GeometricVerdict, findings: list[Finding], scale: float, exposure_s: float
+) -> list[Finding]:
+    """Put an offset down to the exposure: the points tell its size better than the blur."""
+    result = []
+    for finding in findings:
+        if finding.name != "time_offset":
+            result.append(finding)
+            continue
+        std = 2.0 * float(finding.parameters["time_offset_s"].std) / exposure_s
+        sentence = picture_ladder.SENTENCES["exposure_time"].format(exposure_scale=f"{scale:.3g}")
+        result.append(
+            replace(
+                finding,
+                name="exposure_time",
+                parameters={"exposure_scale": ParameterChange(1.0, scale, std)},
+                rivals=(Rival("time_offset", finding.held_out.after),),
+                sentence=sentence,
+            )
+        )
+    nominal = geometric.nominal.profile
+    shutter = replace(geometric.model.profile.shutter, exposure_scale=nominal.shutter.exposure_scale * scale)
+    geometric.model = replace(
+        geometric.model,
+        profile=replace(geometric.model.profile, time_offset_s=nominal.time_offset_s, shutter=shutter),
+    )
+    geometric.fit = refit(evidence, geometric.model)
+    return result
+
+
+def _one_exposure(blurred: picture_ladder.PictureVerdict) -> picture_ladder.PictureVerdict:
+    blurred.findings = [finding for finding in blurred.findings if finding.name != "exposure_time"]
+    return blurred
+
+
+def _merged(
+    moved: CameraProfile,
+    lit: CameraProfile,
+    blurred: CameraProfile,
+    is_exposure: bool,
+    scale: float | None,
+) -> CameraProfile:
+    """Every cause in one profile: geometry from the first, light from the second, blur from the third."""
+    light = lit.extensions
+    extensions = replace(
+        moved.extensions,
+        vignetting_corner_loss=light.vignetting_corner_loss,
+        flicker_amplitude=light.flicker_amplitude,
+        flicker_frequency_hz=light.flicker_frequency_hz,
+        flicker_phase_rad=light.flicker_phase_rad,
+        gain=light.gain,
+        defocus_sigma_px=blurred.extensions.defocus_sigma_px,
+    )
+    shutter = moved.shutter if is_exposure else replace(moved.shutter, exposure_scale=blurred.shutter.exposure_scale)
+    return replace(moved, response=lit.response, extensions=extensions, shutter=shutter)
+
+
+# ── what is left ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _residuals(evidence: Evidence, geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
+    """Differences (px) and what they may run along."""
+    model = geometric.nominal if nominal else geometric.model
+    fitted = geometric.nominal_fit if nominal else geometric.fit
+    table = evidence.table(model, len(fitted.distance))
+    if len(table) != len(fitted.distance):
+        table = geometric.table
+    profile, lens = fitted.profile, fitted.profile.intrinsics
+    assert lens is not None
+    centre = np.array([lens.cx_px, lens.cy_px])
+    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    rate = np.linalg.norm(fitted.ground.trajectory.rate_rad_s(second_s), axis=-1)
+    return {
+        "x_px": fitted.difference_px[:, 0],
+        "y_px": fitted.difference_px[:, 1],
+        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
+        "time": second_s,
+        "radius": np.linalg.norm(table.second_px - centre, axis=-1),
+        "rate": rate,
+        "column": table.second_px[:, 0],
+        "line": table.second_px[:, 1],
+        "pair": table.pair.astype(float),
+        "weight": fitted.weight,
+        "distance": fitted.distance,
+    }
+
+
+def _remaining(geometric: GeometricVerdict, photometric: picture_ladder.PictureVerdict) -> Remaining:
+    """The strongest structure, in the points first, then in brightness."""
+    geometric_left = _points_left(geometric)
+    if geometric_left.significant or photometric.observations is None:
+        return geometric_left
+    light_left = _light_left(photometric)
+    return light_left if light_left.significant else geometric_left
+
+
+def _points_left(geometric: GeometricVerdict) -> Remaining:
+    fitted, table = geometric.fit, geometric.table
+    profile, lens = fitted.profile, fitted.profile.intrinsics
+    assert lens is not None
+    noise = geometric.noise_px
+    from_centre = table.second_px - np.array([lens.cx_px, lens.cy_px])
+    radius = np.linalg.norm(from_centre, axis=-1)
+    outwards = from_centre / np.maximum(radius, 1.0)[:, None]
+    radial = (fitted.difference_px * outwards).sum(axis=-1)
+    difference = np.concatenate([fitted.difference_px, radial[:, None]], axis=-1)
+    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    covariates = {
+        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
+        "radius": radius,
+        "x": table.second_px[:, 0],
+        "y": table.second_px[:, 1],
+        "rate": np.linalg.norm(fitted.ground.trajectory.rate_rad_s(second_s), axis=-1),
+    }
+    found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
+    found.append(_along_time(fitted.difference_px, fitted.weight, table.pair))
+    strongest = max(found, key=lambda s: s.size)
+    stray = float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0)))
+    limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
+    excess = geometric.final_rms_px / max(noise, 1e-9)
+    log.debug("left: %s, limit %.3f, excess %.3f, stray %.3f", found, limit, excess, stray)
+    structured = strongest.size > limit and strongest.p_value < STRUCTURE_P
+    significant = structured or excess > SCALE_EXCESS or stray > STRAY_PART
+    along = strongest.along
+    size = strongest.size
+    if not structured and excess > SCALE_EXCESS:
+        size = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
+    if not structured and stray > STRAY_PART:
+        along = "place"
+    p_value = strongest.p_value if structured or not significant else 0.0
+    sentence = f"{size:.3f} px remain, strongest along {along}" if significant else ""
+    return Remaining(p_value, along, size, GEOMETRY, significant, sentence)
+
+
+def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Structure:
+    """Between the pairs: how much more their mean differences scatter than their points do."""
+    total = np.maximum(np.bincount(pair, weight), 1e-9)
+    excess, chi2, freedom = 0.0, 0.0, 0
+    for column in difference.T:
+        mean = np.bincount(pair, weight * column) / total
+        variance = np.bincount(pair, (weight * (column - mean[pair])) ** 2) / total**2
+        used = np.bincount(pair) > 8
+        spread = 2 * variance[used] + TRACKING_BIAS_PX**2
+        excess += float(np.mean(np.maximum(mean[used] ** 2 - spread, 0.0)))
+        chi2 += float(np.sum(mean[used] ** 2 / spread))
+        freedom += int(used.sum())
+    return Structure("time", float(np.sqrt(excess / 2)), float(stats.chi2.sf(chi2, max(freedom, 1))))
+
+
+def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
+    observations = photometric.observations
+    assert observations is not None
+    left = picture_ladder.residual_levels(observations, photometric.profile)
+    covariates = {
+        name: values
+        for name, values in observations.covariates(photometric.profile).items()
+        if name in ("row", "radius", "brightness", "row_fraction", "x_px", "y_px")
+    }
+    weight = 1.0 / (1.0 + (left / (2.5 * max(float(np.median(np.abs(left))) / 0.6745, 1e-6))) ** 2)
+    found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)
+    strongest = max(found, key=lambda s: s.size)
+    log.debug("light left: %s", found)
+    significant = strongest.size > PHOTOMETRIC_STRUCTURE and strongest.p_value < STRUCTURE_P
+    sentence = f"{strongest.size:.1f} grey levels remain, strongest along {strongest.along}" if significant else ""
+    return Remaining(strongest.p_value, strongest.along, strongest.size, PHOTOMETRY, significant, sentence)

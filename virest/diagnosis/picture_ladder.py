@@ -1,0 +1,321 @@
+"""The ladder for what changes brightness and blur, after the points' causes are in the profile.
+
+Brightness of patches seen again and again: curve, black level, vignetting, flicker, gain.  Where exposure × ISO stays
+the same, the curve shows only in how blur mixes light.  Blur: exposure and defocus, from edges and from spectra.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.capture.records import Capture, Frame
+from virest.diagnosis import local_blur, local_blur_fit
+from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
+from virest.diagnosis.photometry_effects import PhotometricEffect, photometric_effects
+from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judge, significance
+from virest.diagnosis.photometry_mixing import estimate_mixing, judge_mixing, observe_mixing
+from virest.diagnosis.photometry_patches import observe_photometry
+from virest.motion.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
+MAX_P = 1e-5
+MIN_GAIN = 0.15
+"""Least part of the excess over the noise that a cause of brightness must take away on held-out blocks."""
+MAX_RUNGS = 3
+MIN_OBSERVATIONS = 300
+VARIED_LIGHT = 0.25
+"""Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
+MIXING_P, MIXING_GAMMA, MIXING_BLACK = 1.5e-3, 0.05, 0.02
+FLOOR_QUANTILE, FLOOR_PART = 0.001, 0.6
+"""Greys darker than this part of a black level exclude it."""
+BLUR_Z = 3.6
+MIN_DEFOCUS_PX = 0.5
+MIN_EXPOSURE_CHANGE = 0.08
+GREY_LEVELS = 255.0
+
+SENTENCES = {
+    "response_curve": "the grey levels follow a gamma of {gamma} on top of the profile's curve",
+    "black_level": "no light at all reads {black_level} of full scale",
+    "vignetting": "the corners lose {corner_loss} of the light",
+    "flicker": "the lamps pulse by {amplitude} at {frequency_hz} Hz",
+    "gain_drift": "brightness changes from frame to frame without exposure or ISO saying so",
+    "defocus": "the picture is out of focus by a Gaussian of {sigma_px} px",
+    "exposure_time": "the true exposure is {exposure_scale} times the logged one",
+}
+
+
+@dataclass(slots=True)
+class PictureVerdict:
+    """Where this ladder ended."""
+
+    profile: CameraProfile
+    findings: list[Finding] = field(default_factory=list)
+    rungs: list[Rung] = field(default_factory=list)
+    observations: PhotometricObservations | None = None
+    photometric_rms: float | None = None
+    blur_rms_px: float | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+# ── brightness ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def climb_photometry(
+    capture: Capture, frames: Sequence[Frame], profile: CameraProfile, trajectory: Trajectory, rgb: Reader, gray: Reader
+) -> PictureVerdict:
+    """Find what changes the brightness of patches; frames at their true times."""
+    verdict = PictureVerdict(profile)
+    by_index = {frame.index: frame for frame in frames}
+    pictures = ((by_index[k], picture) for k, picture in rgb([frame.index for frame in frames]))
+    observations = observe_photometry(pictures, trajectory, profile, intra_frames=capture.keyframes)
+    if len(observations) < MIN_OBSERVATIONS:
+        verdict.notes.append("too few flat patches are seen again: brightness not judged")
+    else:
+        _climb(verdict, observations, len(capture.frames))
+    _mixing(verdict, frames, trajectory, gray)
+    return verdict
+
+
+def _climb(verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int) -> None:
+    nominal = verdict.profile
+    verdict.photometric_rms = normalised_rms(observations, nominal)[0]
+    effects = photometric_effects(observations, movie_frames)
+    if _light_spread(observations) < VARIED_LIGHT:
+        effects = tuple(e for e in effects if e.name not in ("response_curve", "black_level"))
+    accepted: list[PhotometricEffect] = []
+    plain = fit_photometry(observations, nominal, ())
+    for _ in range(MAX_RUNGS):
+        rung = _rung(observations, nominal, plain, effects, accepted)
+        verdict.rungs.append(rung[0])
+        if rung[1] is None:
+            break
+        accepted, plain = [*accepted, rung[1]], rung[2]
+    if not accepted:
+        verdict.observations = observations.with_memory(plain.memory)
+        return
+    verdict.profile, verdict.observations = plain.profile, observations.with_memory(plain.memory)
+    for effect in accepted:
+        verdict.findings.append(_finding(observations, nominal, plain, effect, accepted, effects, verdict.rungs))
+
+
+def _light_spread(observations: PhotometricObservations) -> float:
+    spread = np.quantile(observations.log_product, [0.05, 0.95])
+    return float(spread[1] - spread[0])
+
+
+def _rung(
+    observations: PhotometricObservations,
+    nominal: CameraProfile,
+    plain: PhotometricFit,
+    effects: Sequence[PhotometricEffect],
+    accepted: list[PhotometricEffect],
+) -> tuple[Rung, PhotometricEffect | None, PhotometricFit]:
+    """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part."""
+    before = normalised_rms(observations.with_memory(plain.memory), plain.profile)[0]
+    fits = {e.name: fit_photometry(observations, nominal, [*accepted, e]) for e in effects if e not in accepted}
+    tried = {name: fitted.rms for name, fitted in fits.items()}
+    size = np.log(max(len(observations), 2))
+    order = sorted(fits, key=lambda name: fits[name].cost + 0.5 * size * len(fits[name].of(name)[0]))
+    nothing = Rung(None, tried, before, PHOTOMETRY)
+    for name in order[:2]:
+        effect = next(e for e in effects if e.name == name)
+        p_value = significance(fits[name], name, observations)[1]
+        if fits[name].cost >= plain.cost or p_value > MAX_P:
+            continue
+        held_out = judge(observations, nominal, [*accepted, effect])
+        log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
+        if held_out.gain > MIN_GAIN:
+            return replace(nothing, entered=name), effect, fits[name]
+    return nothing, None, plain
+
+
+def _finding(
+    observations: PhotometricObservations,
+    nominal: CameraProfile,
+    fitted: PhotometricFit,
+    effect: PhotometricEffect,
+    accepted: Sequence[PhotometricEffect],
+    effects: Sequence[PhotometricEffect],
+    rungs: Sequence[Rung],
+) -> Finding:
+    values, covariance = fitted.of(effect.name)
+    std = np.sqrt(np.diag(covariance))
+    held = judge(observations, nominal, list(accepted))
+    changes = _changes(effect, nominal, fitted.profile, values, std)
+    p_value = significance(fitted, effect.name, observations)[1]
+    gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
+    return Finding(effect.name, changes, gain, (), p_value, _sentence(effect.name, changes))
+
+
+def _changes(
+    effect: PhotometricEffect, nominal: CameraProfile, found: CameraProfile, values: Array, std: Array
+) -> dict[str, ParameterChange]:
+    if effect.name == "gain_drift":
+        gain = list(found.extensions.gain)
+        spread = [float(s) for s in np.resize(std, len(gain))]
+        return {"gain": ParameterChange([1.0] * len(gain), gain, spread)}
+    now = {
+        "corner_loss": found.extensions.vignetting_corner_loss,
+        "amplitude": found.extensions.flicker_amplitude,
+        "frequency_hz": found.extensions.flicker_frequency_hz,
+        "phase_rad": found.extensions.flicker_phase_rad,
+        "gamma": _curve(found).extra_gamma,
+        "black_level": _curve(found).black_level,
+    }
+    before = {
+        "corner_loss": nominal.extensions.vignetting_corner_loss,
+        "amplitude": nominal.extensions.flicker_amplitude,
+        "frequency_hz": nominal.extensions.flicker_frequency_hz,
+        "phase_rad": nominal.extensions.flicker_phase_rad,
+        "gamma": _curve(nominal).extra_gamma,
+        "black_level": _curve(nominal).black_level,
+    }
+    return {
+        name: ParameterChange(before[name], now[name], float(s)) for name, s in zip(effect.parameters, std, strict=True)
+    }
+
+
+def _curve(profile: CameraProfile) -> ResponseCurve:
+    return profile.response or ResponseCurve("srgb")
+
+
+def _sentence(name: str, changes: dict[str, ParameterChange]) -> str:
+    return SENTENCES[name].format(**{key: _shown(change.estimate) for key, change in changes.items()})
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _mixing(verdict: PictureVerdict, frames: Sequence[Frame], trajectory: Trajectory, gray: Reader) -> None:
+    """Gamma or black level from how blur mixes light, where nothing else tells them."""
+    observations = verdict.observations
+    if observations is not None and _light_spread(observations) >= VARIED_LIGHT:
+        return
+    usable = [frame for frame in frames if frame.exposure_s]
+    evidence = observe_mixing(gray, usable, trajectory, verdict.profile)
+    found = {name: estimate_mixing(evidence, verdict.profile, name) for name in ("response_curve", "black_level")}
+    gamma, black = found["response_curve"], found["black_level"]
+    log.debug("mixing: gamma %s, black %s", gamma, black)
+    if gamma is None or black is None:
+        verdict.notes.append("no blurred frames beside sharp ones: the curve was not judged at constant exposure")
+        return
+    is_gamma = gamma.p_value < MIXING_P and abs(np.log(gamma.value)) > MIXING_GAMMA
+    is_black = black.p_value < MIXING_P and black.value > MIXING_BLACK
+    if is_black and is_gamma:
+        is_black = _floor_allows(gray, usable, black.value)
+        is_gamma = not is_black
+    name = "black_level" if is_black else "response_curve" if is_gamma else None
+    if name is None:
+        return
+    estimate = black if is_black else gamma
+    key, before = ("black_level", 0.0) if is_black else ("gamma", 1.0)
+    changes = {key: ParameterChange(before, estimate.value, estimate.std)}
+    held = judge_mixing(evidence, name)
+    gain = HeldOutGain(PHOTOMETRY, held.before, held.after, min(held.noise, held.after)) if held else None
+    gain = gain or HeldOutGain(PHOTOMETRY, abs(estimate.value - before), estimate.std, estimate.std)
+    other = "response_curve" if is_black else "black_level"
+    rivals = (Rival(other, gain.after),) if (black if not is_black else gamma).p_value < MIXING_P else ()
+    verdict.findings.append(Finding(name, changes, gain, rivals, estimate.p_value, _sentence(name, changes)))
+    curve = _curve(verdict.profile)
+    value = estimate.value
+    curve = replace(curve, black_level=value) if is_black else replace(curve, extra_gamma=value)
+    verdict.profile = replace(verdict.profile, response=curve)
+    verdict.rungs.append(Rung(name, {name: gain.after}, gain.before, PHOTOMETRY))
+
+
+def _floor_allows(gray: Reader, frames: Sequence[Frame], black_level: float) -> bool:
+    """Whether no grey is much darker than a black level would be."""
+    picked = [frames[int(k)].index for k in np.linspace(0, len(frames) - 1, min(8, len(frames)))]
+    darkest = [
+        float(np.quantile(picture, FLOOR_QUANTILE)) for _, picture in gray(sorted(set(picked))) if picture is not None
+    ]
+    return bool(darkest) and float(np.median(darkest)) > FLOOR_PART * black_level * GREY_LEVELS
+
+
+def residual_levels(observations: PhotometricObservations, profile: CameraProfile) -> Array:
+    """What is left of the patches' brightness (n,), grey levels."""
+    return np.asarray(residuals(observations, profile))
+
+
+# ── blur ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def climb_blur(
+    capture: Capture,
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    gray: Reader,
+    exposure_hypothesis: float | None,
+) -> tuple[PictureVerdict, bool]:
+    """Find a wrong exposure and defocus from local blur; also whether a time offset is really a wrong exposure.
+
+    exposure_hypothesis: the exposure scale that would put an offset found at constant exposure down to the exposure.
+    """
+    verdict = PictureVerdict(profile)
+    wanted = local_blur.frames_to_read(capture)
+    observations = local_blur.observe_blur(gray(wanted), capture, profile, trajectory)
+    if len(observations) < local_blur.MIN_EDGES:
+        verdict.notes.append("too little texture to measure local blur")
+        return verdict, False
+    effects: tuple[Any, ...] = (local_blur_fit.ExposureTime(), local_blur_fit.Defocus())
+    fitted = local_blur_fit.fit(observations, profile, trajectory, effects)
+    log.debug("blur: %s ± %s", fitted.values, fitted.std)
+    everything = np.ones(len(observations), bool)
+    plain = local_blur_fit.fit(observations, profile, trajectory, ())
+    verdict.blur_rms_px = local_blur_fit.judge(observations, plain, trajectory, everything)
+    is_exposure = _exposure_holds(fitted, exposure_hypothesis)
+    named = []
+    scale, sigma = float(fitted.values[0][0]), float(fitted.values[1][0])
+    std = fitted.std
+    if fitted.determined[0] and (is_exposure or _is_exposure(scale, float(std[0]))):
+        named.append(0)
+    if fitted.determined[1] and sigma > MIN_DEFOCUS_PX and sigma**2 > BLUR_Z * 2 * sigma * float(std[1]):
+        named.append(1)
+    for k in named:
+        alone = tuple(effects[j] for j in named)
+        before, after = local_blur_fit.held_out(observations, profile, trajectory, alone)
+        changes = _blur_change(k, profile, scale, sigma, std)
+        noise = min(after, fitted.rms_px)
+        z = abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / (2 * std[1])
+        p_value = float(np.exp(-0.5 * z**2))
+        name = effects[k].name
+        verdict.findings.append(
+            Finding(name, changes, HeldOutGain(BLUR, before, after, noise), (), p_value, _sentence(name, changes))
+        )
+        verdict.rungs.append(Rung(name, {name: after}, before, BLUR))
+        values = np.array([scale]) if k == 0 else np.array([sigma])
+        verdict.profile = effects[k].apply(verdict.profile, values)
+    return verdict, is_exposure
+
+
+def _is_exposure(scale: float, std: float) -> bool:
+    return abs(np.log(scale)) > max(MIN_EXPOSURE_CHANGE, BLUR_Z * std / scale)
+
+
+def _exposure_holds(fitted: local_blur_fit.BlurFit, hypothesis: float | None) -> bool:
+    """Whether the blur wants another exposure, and the one that the points' offset asks for."""
+    if hypothesis is None or not fitted.determined[0] or not 0.3 < hypothesis < 3.0:
+        return False
+    scale, std = float(fitted.values[0][0]), max(float(fitted.std[0]), 0.03)
+    agrees = abs(scale - hypothesis) < 2.5 * std
+    return agrees and abs(scale - 1) > 1.5 * std and abs(scale - 1) > 2 * abs(scale - hypothesis)
+
+
+def _blur_change(k: int, nominal: CameraProfile, scale: float, sigma: float, std: Array) -> dict[str, ParameterChange]:
+    if k == 0:
+        return {"exposure_scale": ParameterChange(nominal.shutter.exposure_scale, scale, float(std[0]))}
+    return {"sigma_px": ParameterChange(nominal.extensions.defocus_sigma_px, sigma, float(std[1]))}

@@ -1,0 +1,313 @@
+"""What a better model does for the restored pictures, measured without truth.
+
+Some pairs of neighbouring frames, lively ones spread over the capture, are restored with the profile as given and with
+the extended one.  Two neighbours are two independent witnesses of one scene:
+
+- *sharpness*: the gradient that both show.  One picture is laid on the other by a homography through tracked points,
+  and the product of their gradients is averaged: noise and the ringing of a wrong kernel differ between the two and
+  cancel, the scene's own detail stays.  No model of the camera enters, and none is favoured.
+- *disagreement*: the model says where a point of one restored picture lies in the other, from the gyroscope alone (and
+  the translation, where it is known); the distance to where it is found is what geometry, clocks and rows get wrong.
+- *brightness*: the light along the same points, which flicker left in one picture and not in the other changes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.capture.records import Capture, Frame
+from virest.degradation.row_motion import frame_times_s
+from virest.motion.alignment import choose_pairs
+from virest.motion.integration import integrate_gyro
+from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.tracking import TrackPair, track_pairs
+from virest.motion.trajectory import Trajectory
+from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration, restore_frames
+from virest.restoration.frame import RestoredFrame
+from virest.restoration.settings import PRESETS, RestorationSettings
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Rectangle = tuple[int, int, int, int]
+Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
+
+PAIRS = 3
+MIN_TRACKS = 16
+"""Fewer points than this lay no picture on another."""
+HOMOGRAPHY_PX = 2.0
+EDGE_PX = 4
+"""Left out along the border of what is real: half the gradient's and the interpolation's reach."""
+PATCH_PX = 9
+LIGHT_RANGE = (0.02, 0.9)
+"""Of the curve's whole range; darker is noise, brighter may be clipped."""
+
+
+@dataclass(frozen=True, slots=True)
+class RestorationGain:
+    """``before`` with the profile as given, ``after`` with the extended one; NaN where it could not be measured."""
+
+    sharpness_recorded: float
+    """Grey levels per pixel: root of the mean gradient product of neighbours, of the pictures as recorded."""
+    sharpness_before: float
+    """The same, restored; all three over the area that is real in both restorations."""
+    sharpness_after: float
+    disagreement_before_px: float
+    """Median distance between where the model puts points of a restored neighbour and where they are found."""
+    disagreement_after_px: float
+    brightness_disagreement_before: float
+    """Spread of the light's ratio along those points about the pair's own (robust standard deviation, relative)."""
+    brightness_disagreement_after: float
+    frames: tuple[int, ...]
+    """Movie indices of the frames that were restored."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Two neighbouring pictures, restored or not."""
+
+    pictures: tuple[Picture, Picture]
+    valid_px: tuple[Rectangle, Rectangle]
+    tracks: TrackPair | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Restoration:
+    """What one profile makes of the frames, and what it says of their poses."""
+
+    plan: RestorationPlan
+    frames: dict[int, Frame]
+    restored: dict[int, RestoredFrame]
+    trajectory: Trajectory | None
+    lens: MovingLens | None
+
+    def pair(self, first: int) -> _Pair | None:
+        """Frames ``first`` and the next; None where one of them was not to be had."""
+        a, b = (self.restored.get(first + step) for step in (0, 1))
+        if a is None or b is None or a.picture is None or b.picture is None:
+            return None
+        return _tracked(first, (a.picture, b.picture), (a.valid_px, b.valid_px))
+
+    def predicted(self, points_px: Array, first: int) -> Array:
+        """Where points (n, 2) of the restored frame ``first`` lie in the next one, by the model."""
+        assert self.trajectory is not None and self.lens is not None
+        from_s, to_s = (self._reference_s(first + step) for step in (0, 1))
+        rays = self.lens.rays(points_px, from_s)
+        turn = self.trajectory.orientation(to_s).T @ self.trajectory.orientation(from_s)
+        moved = rays @ turn.T
+        translation = (self.plan.translations or {}).get(first)
+        if translation is not None:
+            nearness = np.maximum(rays @ translation.inverse_depth_plane, 0.0)
+            moved = moved - nearness[:, None] * (turn @ translation.position_m(to_s - from_s))
+        return self.lens.project(moved, to_s)
+
+    def _reference_s(self, number: int) -> float:
+        frame = self.frames[number]
+        reference = self.plan.settings.reference
+        return frame_times_s(self.plan.profile, frame.time_s, frame.exposure_s, reference)[1]
+
+
+def measure_restoration_gain(
+    capture: Capture,
+    nominal: CameraProfile,
+    extended: CameraProfile,
+    pictures: Reader,
+    gray: Reader,
+    settings: RestorationSettings = PRESETS["balanced"],
+) -> RestorationGain:
+    """Restore a few pairs of neighbours with both profiles and compare; pictures: RGB by index, gray: luma."""
+    firsts = chosen_pairs(capture, extended)
+    numbers = sorted({first + step for first in firsts for step in (0, 1)})
+    recorded = {index: picture for index, picture in pictures(numbers) if picture is not None}
+    before = _restored(capture, nominal, recorded, gray, settings)
+    after = before if extended == nominal else _restored(capture, extended, recorded, gray, settings)
+    whole = (0, 0, capture.width, capture.height)
+    sharp: dict[str, list[float]] = {"recorded": [], "before": [], "after": []}
+    apart: dict[str, list[Array]] = {"before": [], "after": []}
+    light: dict[str, list[Array]] = {"before": [], "after": []}
+    for first in firsts:
+        both = {"before": before.pair(first), "after": after.pair(first)}
+        pairs = {name: pair for name, pair in both.items() if pair is not None and pair.tracks is not None}
+        if len(pairs) < len(both):
+            continue
+        shared = _shared([pair.valid_px for pair in pairs.values()])
+        raw = _tracked(first, (recorded[first], recorded[first + 1]), (whole, whole))
+        for name, pair in {"recorded": raw, **pairs}.items():
+            sharp[name].append(shared_gradient(pair.pictures, shared, pair.tracks))
+        for name, restoration in (("before", before), ("after", after)):
+            apart[name].append(_distances(restoration, pairs[name], first))
+            light[name].append(_light_ratios(restoration.plan.profile, pairs[name]))
+    return RestorationGain(
+        *(_root_mean(sharp[name]) for name in ("recorded", "before", "after")),
+        *(_median(apart[name]) for name in ("before", "after")),
+        *(_spread(light[name]) for name in ("before", "after")),
+        frames=tuple(numbers),
+    )
+
+
+def chosen_pairs(capture: Capture, profile: CameraProfile) -> list[int]:
+    """First frames of lively pairs spread over the capture; one of the start-up where the profile knows its lag."""
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    offset_s = profile.time_offset_s or 0.0
+    chosen = choose_pairs(frames, capture.imu, 2 * PAIRS, 2, offset_s)
+    lagging = profile.extensions.frame_lag_frames
+    if lagging:
+        chosen += choose_pairs(frames[: lagging + 1], capture.imu, 2, 2, offset_s)
+    firsts: list[int] = []
+    for index in sorted(set(chosen)):
+        free = not firsts or index > firsts[-1] + 1
+        if free and index + 1 in chosen and index + 1 not in capture.repeats:
+            firsts.append(index)
+    return firsts
+
+
+def shared_gradient(
+    pictures: tuple[Picture, Picture], valid_px: tuple[Rectangle, Rectangle], tracks: TrackPair | None
+) -> float:
+    """Mean product of the gradients of two pictures of one scene, (grey levels per pixel)²; NaN without a common area.
+
+    The second is laid on the first by a homography through the tracks.
+    """
+    place = _homography(tracks)
+    if place is None:
+        return np.nan
+    first, second = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in pictures)
+    size = first.shape[1], first.shape[0]
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    laid = cv2.warpPerspective(second, place, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    real = [_inside(rectangle, first.shape) for rectangle in valid_px]
+    there = cv2.warpPerspective(real[1], place, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+    common = cv2.erode(real[0] & there, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8), borderValue=0) > 0
+    if not common.any():
+        return np.nan
+    product = sum(_slope(first, *way) * _slope(laid, *way) for way in ((1, 0), (0, 1)))
+    return float(np.mean(np.asarray(product)[common]))
+
+
+# ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _restored(
+    capture: Capture, profile: CameraProfile, recorded: dict[int, Picture], gray: Reader, settings: RestorationSettings
+) -> _Restoration:
+    plan = _plan(capture, profile, gray, settings)
+    frames = {frame.index: frame for frame in at_true_times(capture.frames, plan.profile, capture.repeats)}
+    known = plan.profile.intrinsics is not None
+    trajectory = integrate_gyro(capture.imu, plan.profile) if known else None
+    lens = moving_lens(trajectory, plan.profile) if trajectory is not None else None
+    asked = [(dataclasses.replace(frames[n], skip_reason=None, skip_codes=()), recorded[n]) for n in sorted(recorded)]
+    restored = {frame.frame.index: frame for frame in restore_frames(asked, capture.imu, plan)}
+    return _Restoration(plan, frames, restored, trajectory, lens)
+
+
+def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> RestorationPlan:
+    """As `process` plans it; a scene at infinity has no translation to be estimated."""
+    if profile.depth_m is not None and np.isinf(profile.depth_m) and profile.intrinsics is not None:
+        return RestorationPlan(profile, settings, imu_gaps_s=capture.imu_gaps_s)
+
+    def decodable(numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        for index, picture in gray(numbers):
+            if picture is not None:
+                yield index, picture
+
+    return dataclasses.replace(plan_restoration(capture, profile, settings, decodable), copy_reason=None)
+
+
+def _tracked(first: int, pictures: tuple[Picture, Picture], valid_px: tuple[Rectangle, Rectangle]) -> _Pair:
+    luma = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
+    found = track_pairs([(first, luma[0]), (first + 1, luma[1])])
+    if not found:
+        return _Pair(pictures, valid_px, None)
+    pair = found[0]
+    points = pair.points_first_px, pair.points_second_px
+    kept = np.logical_and(*(_within(p, v) for p, v in zip(points, valid_px, strict=True)))
+    tracks = TrackPair(first, first + 1, points[0][kept], points[1][kept])
+    return _Pair(pictures, valid_px, tracks if len(tracks) >= MIN_TRACKS else None)
+
+
+def _within(points_px: Array, rectangle: Rectangle) -> NDArray[np.bool_]:
+    x0, y0, x1, y1 = rectangle
+    low, high = np.array([x0, y0]) + EDGE_PX, np.array([x1, y1]) - 1 - EDGE_PX
+    return np.all((points_px >= low) & (points_px <= high), axis=1)
+
+
+def _shared(pairs: list[tuple[Rectangle, Rectangle]]) -> tuple[Rectangle, Rectangle]:
+    """Of the first and of the second pictures, the area that is real in every restoration."""
+    first, second = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
+    return _overlap(first), _overlap(second)
+
+
+def _overlap(rectangles: NDArray[np.int64]) -> Rectangle:
+    x0, y0 = rectangles[:, :2].max(axis=0).tolist()
+    x1, y1 = rectangles[:, 2:].min(axis=0).tolist()
+    return x0, y0, x1, y1
+
+
+def _inside(rectangle: Rectangle, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    x0, y0, x1, y1 = rectangle
+    mask = np.zeros(shape[:2], np.uint8)
+    mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 1
+    return mask
+
+
+def _homography(tracks: TrackPair | None) -> Array | None:
+    """First to second picture; None where the points do not determine it."""
+    if tracks is None or len(tracks) < MIN_TRACKS:
+        return None
+    place, used = cv2.findHomography(tracks.points_first_px, tracks.points_second_px, cv2.RANSAC, HOMOGRAPHY_PX)
+    return None if place is None or int(used.sum()) < MIN_TRACKS // 2 else np.asarray(place, float)
+
+
+def _slope(picture: NDArray[np.float32], across: int, down: int) -> NDArray[np.float32]:
+    """Sobel's derivative, grey levels per pixel."""
+    return np.asarray(cv2.Sobel(picture, cv2.CV_32F, across, down, ksize=3, scale=1 / 8))
+
+
+def _distances(restoration: _Restoration, pair: _Pair, first: int) -> Array:
+    if restoration.lens is None or pair.tracks is None:
+        return np.empty(0)
+    put = restoration.predicted(pair.tracks.points_first_px, first)
+    return np.asarray(np.linalg.norm(pair.tracks.points_second_px - put, axis=1))
+
+
+def _light_ratios(profile: CameraProfile, pair: _Pair) -> Array:
+    """Log of the ratio of light at tracked points, less the pair's median: exposure may change between frames."""
+    if pair.tracks is None:
+        return np.empty(0)
+    curve = profile.response or ResponseCurve("srgb")
+    points = pair.tracks.points_first_px, pair.tracks.points_second_px
+    a, b = (_patch_light(picture, curve, where) for picture, where in zip(pair.pictures, points, strict=True))
+    low, high = (part * float(curve.linear_table().max()) for part in LIGHT_RANGE)
+    usable = (np.minimum(a, b) > low) & (np.maximum(a, b) < high)
+    ratio = np.log(a[usable] / b[usable])
+    return ratio - np.median(ratio) if len(ratio) else ratio
+
+
+def _patch_light(picture: Picture, curve: ResponseCurve, points_px: Array) -> Array:
+    light = curve.linear_table()[cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)]
+    smooth = cv2.blur(light, (PATCH_PX, PATCH_PX))
+    where = points_px.astype(np.float32)[:, None]
+    sampled = cv2.remap(smooth, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled[:, 0].astype(float)
+
+
+def _root_mean(energies: list[float]) -> float:
+    known = [energy for energy in energies if np.isfinite(energy)]
+    return float(np.sqrt(max(np.mean(known), 0.0))) if known else float("nan")
+
+
+def _median(lengths: list[Array]) -> float:
+    values = np.concatenate([np.empty(0), *lengths])
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _spread(ratios: list[Array]) -> float:
+    values = np.concatenate([np.empty(0), *ratios])
+    return float(np.median(np.abs(values)) / 0.6745) if len(values) else float("nan")

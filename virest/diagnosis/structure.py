@@ -1,0 +1,84 @@
+"""What is left when no named cause gains any more, and whether it runs along anything.
+
+Residuals are averaged in bins of each covariate.  A mean that the scatter between stretches of time does not explain is
+structure: the model is wrong in a way that has no name here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+BINS = 10
+LEAST_IN_CELL = 4
+"""Residuals of one bin in one stretch of time; fewer tell no mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """What the residuals do along one covariate."""
+
+    along: str
+    size: float
+    """rms of the bins' means beyond what scatter makes, in the residuals' unit."""
+    p_value: float
+    """Of no structure, scatter between stretches of time taken as it is."""
+
+
+def structures(
+    values: Array, weight: Array, covariates: dict[str, Array], stretch: NDArray[np.intp], floor: float
+) -> list[Structure]:
+    """Test each covariate (n,); values (n, k) residuals, weight (n,), stretch (n,) number of the stretch of time.
+
+    floor: means this small, in the residuals' unit, are tracking's or the codec's own bias.
+    """
+    found = [_along(name, values, weight, c, stretch, floor) for name, c in covariates.items()]
+    return sorted(found, key=lambda s: -s.size)
+
+
+def _along(
+    name: str, values: Array, weight: Array, covariate: Array, stretch: NDArray[np.intp], floor: float
+) -> Structure:
+    edges = np.unique(np.quantile(covariate, np.linspace(0, 1, BINS + 1)[1:-1]))
+    number = np.searchsorted(edges, covariate, side="right")
+    by_time = name == "time"
+    excess, chi2, freedom, bins = 0.0, 0.0, 0, 0
+    for b in range(len(edges) + 1):
+        inside = number == b
+        for column in values.T:
+            mean, error, count = _mean_of_stretches(column[inside], weight[inside], stretch[inside], by_time)
+            if count < 2:
+                continue
+            spread = error**2 + floor**2
+            excess += max(mean**2 - spread, 0.0)
+            chi2 += mean**2 / spread
+            freedom, bins = freedom + 1, bins + 1
+    if not freedom:
+        return Structure(name, 0.0, 1.0)
+    return Structure(name, float(np.sqrt(excess / bins)), float(stats.chi2.sf(chi2, freedom)))
+
+
+def _mean_of_stretches(
+    values: Array, weight: Array, stretch: NDArray[np.intp], by_time: bool
+) -> tuple[float, float, int]:
+    """Weighted mean, its standard error from the scatter between stretches, and how many there were."""
+    if not len(values):
+        return 0.0, 0.0, 0
+    count = np.bincount(stretch)
+    total = np.bincount(stretch, weight)
+    usable = (count >= LEAST_IN_CELL) & (total > 0)
+    means = np.bincount(stretch, weight * values)[usable] / total[usable]
+    if by_time:
+        scatter = values - np.average(values, weights=weight)
+        error = np.sqrt(np.sum((weight * scatter) ** 2)) / weight.sum()
+        return float(np.average(values, weights=weight)), float(2 * error), len(values)
+    if len(means) < 2:
+        return 0.0, 0.0, len(means)
+    share = total[usable] / total[usable].sum()
+    mean = float(share @ means)
+    error = np.sqrt(np.sum(share**2 * (means - mean) ** 2) * len(means) / (len(means) - 1))
+    return mean, float(error), len(means)

@@ -1,0 +1,60 @@
+"""A motion that a phone recorded, for the simulator: its gyroscope's samples instead of a random hand.
+
+Between samples the rate follows modified Akima polynomials (Akima 1970, doi:10.1145/321607.321609): each piece hangs on
+six samples around it, so a gap or a knock does not ring through the rest.  Orientation is then integrated as for any
+other simulated motion, by :func:`virest.simulation.hand_motion.integrate_motion`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
+
+from virest.camera.profile import CameraProfile
+from virest.errors import ImuError
+from virest.simulation.hand_motion import HandMotion, Waves, integrate_motion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRate:
+    """Angular rate in camera axes at any time; before the first sample and after the last those are held."""
+
+    start_s: float
+    end_s: float
+    pieces: Any
+    """Piecewise cubic polynomials over [start_s, end_s], values (3,)."""
+
+    def at(self, time_s: Array, derivative: int = 0) -> Array:
+        """Rate in rad/s, or its time derivative, at times (...,): (..., 3)."""
+        time_s = np.asarray(time_s, float)
+        value = np.asarray(self.pieces(np.clip(time_s, self.start_s, self.end_s), nu=derivative))
+        outside = (time_s < self.start_s) | (time_s > self.end_s)
+        return np.where(outside[..., None], 0.0, value) if derivative else value
+
+
+def recorded_rate(sample_s: Array, gyro_rad_s: Array, profile: CameraProfile) -> RecordedRate:
+    """True rate of the camera, R_cam_imu (measured − bias) / scale, from samples (n,), (n, 3) at rising times.
+
+    sample_s: seconds on the IMU's clock from stamp_0.  Raises ImuError for fewer than two samples.
+    """
+    if len(sample_s) < 2:
+        raise ImuError(f"{len(sample_s)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
+    true = (gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    camera = true @ np.array(profile.r_cam_imu).T
+    return RecordedRate(float(sample_s[0]), float(sample_s[-1]), Akima1DInterpolator(sample_s, camera, method="makima"))
+
+
+def recorded_motion(sample_s: Array, gyro_rad_s: Array, profile: CameraProfile, centre_s: float) -> HandMotion:
+    """A camera that turns as the gyroscope said and stays in its place; the world's axes are its own at ``centre_s``.
+
+    Arguments as :func:`recorded_rate`.
+    """
+    rate = recorded_rate(sample_s, gyro_rad_s, profile)
+    still = Waves(np.zeros((3, 1)), np.zeros((3, 1)), np.zeros((3, 1)))
+    return integrate_motion(rate, still, rate.start_s, rate.end_s, centre_on_s=(centre_s, centre_s))

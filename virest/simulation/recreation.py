@@ -1,0 +1,235 @@
+"""Take a recorded capture once more: its stamps, exposures, inertial samples and camera, before a known scene.
+
+The scene is one picture, sharp and straight, laid at infinity where the camera looked when it was taken; beyond its
+edges it goes on mirrored.  The camera's translation is left out, since one picture holds no depth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.response import ResponseCurve
+from virest.capture.records import Capture, Frame
+from virest.errors import CaptureError, SettingsError
+from virest.simulation.auto_exposure import NOMINAL_ISO, Exposures
+from virest.simulation.exposure import View, make_view, pixel_rays
+from virest.simulation.hand_motion import HandMotion
+from virest.simulation.recorded_motion import recorded_motion
+from virest.simulation.scenes import MAX_CHART_PX, Scene
+from virest.simulation.sensor import sensor_light
+from virest.simulation.session import TICKS_PER_S, ImuLog, Session, SessionSettings, shown_captures
+
+Array = NDArray[np.float64]
+
+UNSEEN = frozenset({"no-imu", "imu-gap", "no-stamp"})
+"""Frames of which neither time nor motion is known cannot be taken again."""
+LEAST_AHEAD = 0.15
+"""z of the unit rays through the picture's corners, in the scene's axes: below this a picture holds no such view."""
+IMU_MARGIN_S = 1.0
+_CHART_MARGIN = 1.02
+_DARKEST = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePicture:
+    """What the scene is made of: a picture as a global shutter without blur takes it, and when it was taken."""
+
+    picture: NDArray[np.uint8]
+    """(h, w, 3) RGB, of the profile's lens, vignetting and curve."""
+    frame: int
+    """Movie index of the frame; the picture shows the start of its first row's exposure."""
+
+
+def known_frames(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """The frames whose times and motions are known, those of the recorder's start-up too."""
+    return tuple(frame for frame in frames if not UNSEEN & set(frame.skip_codes) and np.isfinite(frame.time_s))
+
+
+def recreate_session(
+    capture: Capture,
+    frames: Sequence[Frame],
+    nominal: CameraProfile,
+    true: CameraProfile,
+    scene: ScenePicture,
+    settings: SessionSettings,
+) -> Session:
+    """Plan the recording of these frames once more; slot k of the new movie is frames[k].
+
+    frames: in order, with times and exposures.  nominal, true: profiles of the capture as it was read; where the frames
+    do not begin with its first, all that counts from stamp_0 is counted anew.  settings: noise and seed are used.
+    """
+    _require(frames, true)
+    begin_s = frames[0].time_s
+    nominal, true = (from_frame(p, frames) for p in (nominal, true))
+    stamp_s = np.array([frame.time_s - begin_s for frame in frames])
+    period_s = float(np.median(np.diff(stamp_s))) if len(frames) > 1 else 1 / settings.fps
+    settings = dataclasses.replace(
+        settings,
+        scene=f"frame {scene.frame}",
+        frames=len(frames),
+        fps=float(np.clip(1 / period_s, 1.0, 1000.0)),
+        exposure_s=tuple(frame.exposure_s or 0.0 for frame in frames),
+    )
+    shows = shown_captures(true, settings)
+    later = np.arange(1, max(int(shows.max()) + 1 - len(frames), 0) + 1)
+    capture_s = np.concatenate([stamp_s, stamp_s[-1] + period_s * later])
+    slot = [frame.index for frame in frames].index(scene.frame)
+    exposures = _exposures(frames, len(capture_s), int(shows[slot]))
+    imu, sample_s = _cut_imu(capture, begin_s, stamp_s[-1], true)
+    session = Session(
+        nominal, true, settings, _NO_SCENE, recorded_motion(sample_s, imu.gyro_rad_s, true, 0.0), _NO_VIEW,
+        np.rint(stamp_s * TICKS_PER_S).astype(np.int64), np.array([f.timestamp_ns for f in frames], np.int64), shows,
+        (float(sample_s[0]), float(sample_s[-1])), exposures, capture_s, imu,
+    )  # fmt: skip
+    seen_s = session.first_row_start_s(int(shows[slot]))
+    motion = recorded_motion(sample_s, imu.gyro_rad_s, true, seen_s)
+    view = make_view(true, motion, rest_s=session.imu_span_s[0])
+    _require_ahead(motion, true, session, shows)
+    chart = _scene(scene.picture, view, motion, seen_s, _slot_gain(true, shows, slot), settings.oversampling)
+    return dataclasses.replace(session, scene=chart, motion=motion, view=view)
+
+
+def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile:
+    """The profile with its times counted from the first of these frames, and with the scene at infinity.
+
+    ``t_imu − s = (t − s)(1 + skew) + offset`` about another s has the offset ``offset + skew · later``;
+    ``f (1 + drift t)`` about another time has another f and drift, flicker another phase.
+    """
+    later_s, extensions = frames[0].time_s, profile.extensions
+    offset_s = (profile.time_offset_s or 0.0) + profile.clock_skew * later_s
+    drift = extensions.focal_drift_per_s
+    lens = profile.intrinsics
+    if lens is not None and drift:
+        lens = lens.scaled_focal(1 + drift * later_s)
+    index = [frame.index for frame in frames]
+    lag_s, lag_frames = _lag_left(extensions, index[0])
+    gain = tuple(extensions.gain[i] if i < len(extensions.gain) else 1.0 for i in index) if extensions.gain else ()
+    changed = dataclasses.replace(
+        extensions,
+        focal_drift_per_s=drift / (1 + drift * later_s),
+        flicker_phase_rad=extensions.flicker_phase_rad
+        + 2 * np.pi * float(np.remainder(extensions.flicker_frequency_hz * later_s, 1.0)),
+        gain=gain,
+        frame_lag_s=lag_s,
+        frame_lag_frames=lag_frames,
+    )
+    return dataclasses.replace(profile, intrinsics=lens, time_offset_s=offset_s, depth_m=np.inf, extensions=changed)
+
+
+# ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _require(frames: Sequence[Frame], profile: CameraProfile) -> None:
+    if not frames:
+        raise CaptureError("no frame whose time and motion are known", hint="see `virest inspect`")
+    if profile.intrinsics is None:
+        raise SettingsError("the focal length is not known", hint="give fx_px in camera.yaml, or --config")
+    without = [frame.index for frame in frames if not frame.exposure_s]
+    if without:
+        raise CaptureError(
+            f"frame {without[0]} and {len(without) - 1} more have no exposure time", hint="check movie_metadata.csv"
+        )
+
+
+def _lag_left(extensions: Extensions, first: int) -> tuple[float, int]:
+    """What remains of the recorder's start-up lag at a slot: it is used up evenly over the first slots."""
+    last = extensions.frame_lag_frames
+    left = max(last - first, 0)
+    return (extensions.frame_lag_s * left / last if last else 0.0), left
+
+
+def _exposures(frames: Sequence[Frame], captures: int, scene: int) -> Exposures:
+    """Logged exposures and sensitivities; light is their product against the capture that the scene is made of."""
+    ends = [*frames, *[frames[-1]] * (captures - len(frames))]
+    exposure_s = np.array([frame.exposure_s or 0.0 for frame in ends])
+    iso = np.array([round(frame.iso) if frame.iso else NOMINAL_ISO for frame in ends], np.int64)
+    known = all(frame.iso for frame in frames)
+    light = exposure_s * iso if known else np.ones(captures)
+    return Exposures(exposure_s, iso, light / light[scene])
+
+
+def _cut_imu(capture: Capture, begin_s: float, lasting_s: float, true: CameraProfile) -> tuple[ImuLog, Array]:
+    """The capture's own samples, and their seconds from the first frame; all of them, or those about the frames.
+
+    A stabiliser is at rest at the first sample, as it is at the capture's: then nothing is cut before the frames.
+    """
+    imu, rows = capture.imu, np.arange(len(capture.imu))
+    first_s = begin_s + (true.time_offset_s or 0.0) - IMU_MARGIN_S
+    last_s = begin_s + (true.time_offset_s or 0.0) + lasting_s * (1 + true.clock_skew) + IMU_MARGIN_S
+    last_s += true.extensions.frame_lag_s + true.shutter.readout_time_s
+    whole = begin_s == capture.frames[0].time_s and begin_s + lasting_s == capture.frames[-1].time_s
+    inside = (imu.time_s <= last_s) & ((imu.time_s >= first_s) | bool(true.extensions.stabilisation_fraction))
+    rows = rows if whole else rows[inside]
+    time_ns = capture.stamp_0_ns + np.rint(imu.time_s[rows] * 1e9).astype(np.int64)
+    log = ImuLog(time_ns, imu.gyro_rad_s[rows], imu.accel_m_s2[rows])
+    return log, imu.time_s[rows] - begin_s
+
+
+def _slot_gain(true: CameraProfile, shows: NDArray[np.int64], slot: int) -> float:
+    """The hidden gain of a slot's picture: that of the first slot which shows it."""
+    first = int(np.argmax(shows == shows[slot]))
+    gain = true.extensions.gain
+    return gain[first] if first < len(gain) else 1.0
+
+
+def _require_ahead(motion: HandMotion, true: CameraProfile, session: Session, shows: NDArray[np.int64]) -> None:
+    """Raise CaptureError where a frame looks so far away that the scene's plane does not reach there."""
+    x, y = pixel_rays(true.intrinsics)  # type: ignore[arg-type]
+    right, below = float(np.abs(x).max()), float(np.abs(y).max())
+    corners = np.array([[i, j, 1.0] for i in (-right, right) for j in (-below, below)])
+    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
+    turns = motion.rotation(np.array([session.first_row_start_s(int(k)) for k in shows])).as_matrix()
+    ahead = np.einsum("tj,kj->tk", turns[:, 2], corners).min(axis=1)
+    if ahead.min() < LEAST_AHEAD:
+        far = int(np.argmin(ahead))
+        raise CaptureError(
+            f"frame {far} of those asked for looks {np.degrees(np.arccos(turns[far, 2, 2])):.0f} degrees past the "
+            "picture that the scene is made of",
+            hint="choose fewer frames with --frames A:B",
+        )
+
+
+def _scene(
+    picture: NDArray[np.uint8], view: View, motion: HandMotion, seen_s: float, gain: float, oversampling: float
+) -> Scene:
+    """The picture's light as a chart at infinity, where the camera looked at ``seen_s``; mirrored past its edges."""
+    profile = view.profile
+    curve = profile.response or ResponseCurve("srgb")
+    left = sensor_light(np.ones((profile.height, profile.width, 1), np.float32), profile, gain, defocus=False)
+    light = curve.linearise(picture.astype(np.float32) / 255).astype(np.float32) / np.maximum(left, _DARKEST)
+    x, y = view.rays(seen_s, slice(None), slice(None))
+    reach = [_CHART_MARGIN * float(np.abs(plane).max()) for plane in (x, y)]
+    lens = profile.intrinsics
+    assert lens is not None
+    focal = oversampling * max(lens.fx_px, lens.fy_px)
+    focal = min(focal, float(np.sqrt(MAX_CHART_PX / (4 * reach[0] * reach[1]))))
+    width, height = (2 * int(np.ceil(extent * focal)) for extent in reach)
+    u, v = np.meshgrid((np.arange(width) - (width - 1) / 2) / focal, (np.arange(height) - (height - 1) / 2) / focal)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ motion.rotation(np.array([seen_s])).as_matrix()[0]
+    source = _pixels(view, rays, seen_s).astype(np.float32)
+    chart = cv2.remap(light, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return Scene(np.maximum(chart, 0.0), focal)
+
+
+def _pixels(view: View, rays: Array, time_s: float) -> Array:
+    """Pixels (..., 2) that look along rays (..., 3) at a time: the inverse of :meth:`View.rays`."""
+    profile, lens = view.profile, view.profile.intrinsics
+    assert lens is not None
+    plane = rays[..., :2] / rays[..., 2:]
+    if len(view.filter_s):
+        pitch, yaw = (np.interp(time_s, view.filter_s, view.filter_rad[:, i]) for i in (0, 1))
+        plane = plane + profile.extensions.stabilisation_fraction * np.array([yaw, -pitch])
+    pixels = lens.project(np.concatenate([plane, np.ones_like(plane[..., :1])], -1))
+    centre = np.array([lens.cx_px, lens.cy_px])
+    return centre + (pixels - centre) * (1 + profile.extensions.focal_drift_per_s * time_s)
+
+
+_NO_SCENE = Scene(np.zeros((2, 2, 3), np.float32), 1.0)
+_NO_VIEW = View(CameraProfile(2, 2), np.zeros((1, 2)), np.zeros((2, 1)), None, None, np.empty(0), np.empty((0, 2)))
