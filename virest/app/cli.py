@@ -33,6 +33,22 @@ CALIBRATED_EXTRAS = (
     "exposure-scale",
     "frame-lag",
 )
+LIKE_OPTIONS = (
+    "out",
+    "like",
+    "frames",
+    "config",
+    "noise",
+    "effect",
+    "reference",
+    "seed",
+    "overwrite",
+    "json",
+    "quiet",
+    "verbose",
+    "version",
+)
+"""What `simulate --like` heeds; all else is the capture's."""
 CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
 USAGE = 2
 INTERRUPTED = 130
@@ -263,11 +279,18 @@ def _first_error(facts: dict[str, Any]) -> str:
 
 @app.command()
 def simulate(
+    context: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the capture to write.")],
+    like: Annotated[
+        Path | None,
+        typer.Option(metavar="CAPTURE", help="Re-create this capture: its camera, times, exposures and motion."),
+    ] = None,
     scene: Annotated[str, typer.Option(metavar="KIND", help="leaves, bright, board or text.")] = "leaves",
     width: Annotated[int, typer.Option(metavar="PX")] = 720,
     height: Annotated[int, typer.Option(metavar="PX")] = 1280,
-    frames: Annotated[int, typer.Option(metavar="N")] = 12,
+    frames: Annotated[
+        str | None, typer.Option(metavar="N", help="How many. With --like A:B, these of its frames. [12; all]")
+    ] = None,
     fps: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
     exposure_ms: Annotated[str, typer.Option(metavar="MS[,MS...]", help="Exposure; several are taken in turn.")] = "10",
     auto_exposure: Annotated[
@@ -314,21 +337,31 @@ def simulate(
     \b
     $ virest simulate bracket --auto-exposure 5:9 --rate 0 --exposure-ms 4 --frames 27
     $ virest calibrate-curve bracket
+
+    \b
+    $ virest simulate again --like 2022_03_09_15_21_07 --frames 30:90 --effect flicker=0.2,100
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
+    if like is not None:
+        _require_only(context, LIKE_OPTIONS, "--like takes it from the capture")
+        wishes = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
+        facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **wishes)
+        _emit_facts(facts, _describe_simulation(facts), as_json=json)
+        return 0
+    count = _parse_count(frames, 12)
     exposures_ms = _parse_exposures(exposure_ms)
     auto_exposure_ev, auto_exposure_steps = _parse_auto_exposure(auto_exposure)
     _one_thread_each()
     from virest.app.simulate import simulate_command
     from virest.camera.profile import read_profile
 
-    with console.progress_bar(frames, "simulate", quiet=quiet) as bar:
+    with console.progress_bar(count, "simulate", quiet=quiet) as bar:
         facts = simulate_command(
             out,
             scene=scene,
             width=width,
             height=height,
-            frames=frames,
+            frames=count,
             fps=fps,
             exposure_ms=exposures_ms,
             auto_exposure_ev=auto_exposure_ev,
@@ -347,12 +380,7 @@ def simulate(
             overwrite=overwrite,
             progress=(lambda _done, _total: bar.update(1)) if bar else None,
         )
-    if json:
-        from virest.app.outputs import json_line
-
-        console.emit(json_line(facts))
-    else:
-        console.emit(_describe_simulation(facts))
+    _emit_facts(facts, _describe_simulation(facts), as_json=json)
     return 0
 
 
@@ -413,6 +441,35 @@ def calibrate(
     return 0
 
 
+@app.command()
+def diagnose(
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
+    config: Config = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="The capture's folder in here takes the results.")
+    ] = Path("virest-out"),
+    check: Annotated[bool, typer.Option("--check", help="Exit with 10 unless the verdict is consistent.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing diagnosis.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Say what the camera model gets wrong on a capture, why, what to add, and what that gains.
+
+    \b
+    $ virest diagnose shaken
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    _one_thread_each()
+    from virest.app.diagnose import DiagnosisOptions, run_diagnosis
+
+    with console.progress_bar(100, "diagnose", quiet=quiet) as bar:
+        outcome = run_diagnosis(capture, DiagnosisOptions(out, config, overwrite), _on_bar(bar))
+    _emit_facts(outcome.facts, outcome.text, as_json=json)
+    return outcome.check_code if check else 0
+
+
 @app.command("calibrate-curve")
 def calibrate_curve(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture.")],
@@ -456,6 +513,54 @@ def calibrate_curve(
 
 
 # ── help for the commands ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _emit_facts(facts: dict[str, Any], text: str, *, as_json: bool) -> None:
+    from virest.app.outputs import json_line
+
+    console.emit(json_line(facts) if as_json else text)
+
+
+def _on_bar(bar: Any) -> Callable[[str, float], None] | None:
+    """Show the part that is done and the stage on a bar of 100."""
+    if bar is None:
+        return None
+
+    def show(stage: str, part: float) -> None:
+        bar.set_description(f"diagnose: {stage}", refresh=False)
+        bar.update(max(round(100 * part) - bar.n, 0))
+
+    bar.unit = "%"
+    return show
+
+
+def _require_only(context: typer.Context, allowed: tuple[str, ...], why: str) -> None:
+    """Refuse options that were typed and would do nothing."""
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if name not in allowed and source is not None and source.name == "COMMANDLINE":
+            raise typer.BadParameter(f"--{name.replace('_', '-')}: {why}")
+
+
+def _parse_count(text: str | None, default: int) -> int:
+    if text is None:
+        return default
+    if not re.fullmatch(r"\s*[+-]?\d{1,9}\s*", text, re.ASCII):
+        raise typer.BadParameter(f"--frames {text!r} is no number; A:B is for --like")
+    return int(text)
+
+
+def _simulate_like(
+    out: Path, like: Path, config: Path | None, frames: str | None, quiet: bool, **wishes: Any
+) -> dict[str, Any]:
+    """Re-create a capture; a bare N of ``--frames`` means its first N."""
+    chosen = _parse_frames(frames if frames is None or ":" in frames else f":{frames}")
+    _one_thread_each()
+    from virest.app.recreate import count_frames, simulate_like
+
+    with console.progress_bar(count_frames(like, chosen), "simulate", quiet=quiet) as bar:
+        step = (lambda _done, _total: bar.update(1)) if bar else None
+        return simulate_like(out, like, config=config, frames=chosen, progress=step, **wishes)
 
 
 def _parse_extras(options: list[str]) -> tuple[str, ...]:

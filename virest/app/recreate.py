@@ -115,19 +115,21 @@ def scene_plan(
 def find_scene(capture: Capture, plan: RestorationPlan, frames: Sequence[Frame]) -> ScenePicture:
     """Restore the frame that the scene is made of: near the middle of all views, and calm."""
     for number in _scene_order(capture, plan.profile, frames)[:MAX_TRIES]:
-        picture = restore_one(capture, plan, number)
-        if picture is not None:
-            return ScenePicture(picture, number)
+        scene = restored_scene(capture, plan, number)
+        if scene is not None:
+            return scene
     raise CaptureError(f"{capture.name}: no frame can be restored as the scene", hint="see `virest process`")
 
 
-def restore_one(capture: Capture, plan: RestorationPlan, number: int) -> Picture | None:
+def restored_scene(capture: Capture, plan: RestorationPlan, number: int) -> ScenePicture | None:
     """One restored frame, or its decoded picture where restoring is refused; None: it cannot be had."""
     frames = at_true_times(capture.frames, plan.profile, capture.repeats)
     frame = dataclasses.replace(frames[number], skip_reason=None, skip_codes=())
     _, picture = next(read_frames(capture.movie, probe_movie(capture.movie), number, number), (number, None))
     restored = next(restore_frames([(frame, picture)], capture.imu, plan), None)
-    return None if restored is None else restored.picture
+    if restored is None or restored.picture is None:
+        return None
+    return ScenePicture(restored.picture, number, restored.valid_px)
 
 
 def blur_px(session: Session) -> float:

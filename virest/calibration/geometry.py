@@ -22,11 +22,13 @@ from virest.capture.records import Capture
 from virest.errors import CalibrationError
 from virest.motion import profile_terms as terms_of
 from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
+from virest.motion.displacement import drift_std_m
 from virest.motion.observed_tracks import ObservedTracks, observe_tracks
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
 from virest.motion.track_model import TrackTable, ground
 from virest.motion.tracking import TrackPair
+from virest.motion.tracking_bias import bias_std
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +52,8 @@ DIRECTION_COST = 12.0
 """Readouts along rows and along columns are told apart from this difference in cost, in units of its own noise."""
 OUTLIER_WEIGHT = 0.1
 ASTRAY_PASSES = 3
+MIN_STRETCHES = 2.5
+"""A value that rests on fewer stretches of time is a single moment's, and nothing else bears it out."""
 MANY_OUTLIERS = 0.1
 STABILISER_SIGMA, STABILISER_FRACTION, STABILISER_GAIN = 6.0, 0.1, 0.9
 LARGE_CORRELATION = 0.9
@@ -77,21 +81,6 @@ MAX_STD = {
     "exposure_time": 0.25,
 }
 """Values known no better than this are not determined and stay where they were."""
-TYPICAL_NOISE_PX, LEAST_NOISE_PX = 0.15, 0.06
-FLOOR_STD = {
-    "time_offset": 2.5e-5,
-    "imu_rotation": 2.5e-4,
-    "gyro_bias": 2e-4,
-    "focal_length": 7e-4,
-    "radial_distortion": 7e-4,
-    "principal_point": 0.15,
-    "gyro_scale": 7e-4,
-    "clock_skew": 1e-5,
-    "exposure_time": 0.03,
-}
-READOUT_FLOOR = 0.0035
-"""Biases of tracking under changing blur and of the codec, which no statistics of one capture show, at a typical noise
-of 0.15 px; they grow with it.  The readout's is a part of itself: predicted blocks shear less than rows do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +173,7 @@ def calibrate_geometry(
         if not astray:
             break
     say("joint")
-    return _conclude(profile, start, observed, coarse, rough, fit, left_out)
+    return _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out)
 
 
 def _for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
@@ -272,6 +261,9 @@ def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, want
     second = fit_tracks(imu, table, _without_readout(start, across), [*wanted, terms_of.READOUT], scene)
     difference = (first.cost - second.cost) / max(min(first.scale, second.scale) ** 2, 1e-9)
     best = second if difference > 0 else first
+    if best is second and best.scene is not None:
+        plain = fit_tracks(imu, table, best.profile, [*wanted, terms_of.READOUT])
+        best = plain if plain.scale < EXPLAINED_SCALE else best
     log.debug("readout: cost %.1f %s, %.1f %s", first.cost, along, second.cost, across)
     return _Rough(best.profile, best.scene, abs(difference) > DIRECTION_COST, before)
 
@@ -305,6 +297,7 @@ def _fit_with_translation(imu: ImuSamples, table: TrackTable, start: CameraProfi
 
 
 def _conclude(
+    imu: ImuSamples,
     given: CameraProfile,
     start: CameraProfile,
     observed: ObservedTracks,
@@ -314,8 +307,8 @@ def _conclude(
     astray: float,
 ) -> GeometryCalibration:
     noise = float(np.median(observed.noise_px))
-    variances = _variances(fit, noise)
-    determined = {term.name: bool(np.all(np.sqrt(variances[term.name]) <= MAX_STD[term.name])) for term in fit.terms}
+    variances = _variances(fit, noise, _drift_rad(fit, imu))
+    determined = {term.name: _is_determined(fit, term.name, variances[term.name]) for term in fit.terms}
     profile = right_way_round(_held_back(fit, given, start, determined))
     if not rough.direction_known and not determined["readout_time"]:
         profile = _with_given_readout(profile, given)
@@ -329,6 +322,12 @@ def _conclude(
         profile, values, _correlations(fit, variances), _translation(fit), _robust_px(fit), noise,
         _robust_px(rough.before), coarse.explained, moving, len(observed.pairs), observed.tracks, notes, fit,
     )  # fmt: skip
+
+
+def _is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
+    """Known well enough, and not by a single moment alone."""
+    known = bool(np.all(np.sqrt(variance) <= MAX_STD[name]))
+    return known and bool(np.all(fit.stretches[fit.slices[name]] >= MIN_STRETCHES))
 
 
 def right_way_round(profile: CameraProfile) -> CameraProfile:
@@ -351,11 +350,24 @@ def right_way_round(profile: CameraProfile) -> CameraProfile:
     )
 
 
-def _variances(fit: TrackFit, noise_px: float) -> dict[str, Array]:
+def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
+    """Turn that the accelerometer's noise over a window could be taken for, and the window's length in seconds."""
+    if not isinstance(fit.scene, InertialMotion):
+        return 0.0, 1.0
+    span_s = float(np.ptp(fit.seconds)) / fit.scene.windows
+    nearness = float(np.median(np.linalg.norm(fit.scene.plane_per_m, axis=-1)))
+    return drift_std_m(imu, span_s) * nearness, max(span_s, 0.1)
+
+
+def _variances(fit: TrackFit, noise_px: float, drift: tuple[float, float]) -> dict[str, Array]:
     """Variance of each term's values, with tracking's own bias; the offset is that of the first row read."""
-    floor = {**FLOOR_STD, "readout_time": READOUT_FLOOR * abs(fit.profile.shutter.readout_time_s)}
-    grown = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX
-    found = {term.name: fit.std(term.name) ** 2 + (grown * floor[term.name]) ** 2 for term in fit.terms}
+    readout_s = fit.profile.shutter.readout_time_s
+    found = {
+        term.name: fit.std(term.name) ** 2 + np.array(bias_std(term.name, noise_px, readout_s)) ** 2
+        for term in fit.terms
+    }
+    found["imu_rotation"] = found["imu_rotation"] + (0.5 * drift[0]) ** 2
+    found["gyro_bias"] = found["gyro_bias"] + (drift[0] / drift[1]) ** 2
     if "readout_time" in found:
         cross = fit.covariance[fit.slices["time_offset"], fit.slices["readout_time"]][0]
         first_row = found["time_offset"] + 0.25 * found["readout_time"] - cross
@@ -446,6 +458,8 @@ def _value(
         std = std * after
     if name in ("gyro_scale", "exposure_time") and isinstance(after, float):
         std = std * after
+    if name == "readout_time" and determined[name]:
+        after = profile.shutter.readout_time_s
     shown = [float(s) for s in std]
     return CalibratedValue(field, before, after, shown if len(shown) > 1 else shown[0], determined[name])
 

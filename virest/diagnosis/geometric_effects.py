@@ -38,8 +38,6 @@ class GeometricEffect:
     """For people; {} is filled with the values."""
     starts: tuple[tuple[float, ...], ...] = ()
     """Changes of the term's values to begin from, besides none."""
-    floor_std: tuple[float, ...] = ()
-    """(k,) smallest believable deviations: tracking's own bias."""
     words: tuple[str, ...] = ()
     with_word: Callable[[CameraProfile, str], CameraProfile] | None = None
 
@@ -102,7 +100,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         _one("time_offset_s"),
         "the inertial clock runs {time_offset_s} s off the camera's",
         tuple((0.02 * k,) for k in (-3, -2, -1, 1, 2, 3)),
-        (4e-5,),
     ),
     GeometricEffect(
         "clock_skew",
@@ -111,7 +108,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         _one("clock_skew"),
         "the two clocks drift apart by {clock_skew} s a second",
         ((-0.003,), (0.003,)),
-        (2e-5,),
     ),
     GeometricEffect(
         "readout_time",
@@ -120,7 +116,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         _one("readout_time_s"),
         "the rows are read within {readout_time_s} s",
         ((0.008,), (-0.008,)),
-        (8e-5,),
     ),
     GeometricEffect(
         "readout_direction",
@@ -146,7 +141,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         lambda p: {"gyro_bias_rad_s": list(p.gyro_bias_rad_s)},
         _many("gyro_bias_rad_s"),
         "the gyroscope reads {gyro_bias_rad_s} rad/s at rest",
-        floor_std=(3e-4,) * 3,
     ),
     GeometricEffect(
         "gyro_scale",
@@ -154,7 +148,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         lambda p: {"gyro_scale": float(np.mean(p.gyro_scale))},
         _scaled("gyro_scale", lambda p: {"gyro_scale": float(np.mean(p.gyro_scale))}),
         "the gyroscope's rates are {gyro_scale} times the true ones",
-        floor_std=(1.2e-3,),
     ),
     GeometricEffect(
         "imu_rotation",
@@ -162,7 +155,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         lambda p: {"rotation_rad": [0.0, 0.0, 0.0]},
         _many("rotation_rad"),
         "the inertial sensor sits turned by {rotation_rad} rad against the camera",
-        floor_std=(5e-4,) * 3,
     ),
     GeometricEffect(
         "focal_length",
@@ -170,7 +162,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         lambda p: {"focal_scale": 1.0 if p.intrinsics is None else p.intrinsics.fx_px},
         _one("focal_scale"),
         "the focal length is {focal_scale} times the profile's",
-        floor_std=(1.2e-3,),
     ),
     GeometricEffect(
         "focal_drift",
@@ -178,7 +169,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         lambda p: {"focal_drift_per_s": p.extensions.focal_drift_per_s},
         _one("focal_drift_per_s"),
         "the focal length changes by {focal_drift_per_s} of itself a second (refocusing)",
-        floor_std=(6e-4,),
     ),
     GeometricEffect(
         "radial_distortion",
@@ -186,7 +176,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         _k1,
         _one("k1"),
         "the lens bends rays by k1 = {k1}",
-        floor_std=(1.5e-3,),
     ),
     GeometricEffect(
         "principal_point",
@@ -194,7 +183,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         lambda p: {"offset_px": [0.0, 0.0]},
         _many("offset_px"),
         "the optical axis meets the picture {offset_px} px from where the profile says",
-        floor_std=(0.4, 0.4),
     ),
     GeometricEffect(
         "stabilisation",
@@ -203,7 +191,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         lambda p, s: {"fraction": float(s[0]), "cutoff_hz": float(s[1]) * p.extensions.stabilisation_cutoff_hz},
         "the lens is moved against the shake: it cancels {fraction} of what is faster than {cutoff_hz} Hz",
         ((0.5, 0.0), (0.5, 1.2), (0.5, -1.2)),
-        (0.006, 0.05),
     ),
 )
 

@@ -148,4 +148,5 @@ def _depth_std(fitted: TrackFit, world: Array, window: int) -> float:
     part = fitted.covariance[first : first + 3, first : first + 3]
     assert isinstance(fitted.scene, InertialMotion)
     inverse = float(fitted.scene.plane_per_m[int(window)] @ world)
-    return float(np.sqrt(max(world @ part @ world, 0.0))) / max(inverse, MIN_SWAY_DEPTH_PER_M) ** 2
+    variance = float(world @ part @ world)
+    return float(np.sqrt(max(variance, 0.0))) / max(inverse, MIN_SWAY_DEPTH_PER_M) ** 2

@@ -31,6 +31,7 @@ from virest.diagnosis.geometric_evidence import (
 )
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable
+from virest.motion.tracking_bias import bias_std
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +89,9 @@ class GeometricVerdict:
     nominal_rms_px: float
     final_rms_px: float
     noise_px: float
+    """What tracking alone makes, as an rms like the two above."""
+    step_noise_px: float
+    """Typical standard deviation of a tracked step, per coordinate."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -280,15 +284,18 @@ def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile
     elif candidate.effect is None or candidate.effect.term is None:
         p_value = SURE
     else:
-        p_value = p_of(fitted, candidate.effect, model.profile, before)
+        p_value = p_of(fitted, candidate.effect, model.profile, before, evidence.typical_px)
     return (model if p_value < MAX_P else None), p_value
 
 
-def p_of(fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile) -> float:
+def p_of(
+    fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile, noise_px: float
+) -> float:
     """Probability of so large a change by chance: a chi-square of the change, deviations with tracking's own bias."""
     change = total_change(effect, before, found)
+    floor = bias_std(effect.name, noise_px, found.shutter.readout_time_s)
     part = fitted.slices[effect.name]
-    covariance = fitted.covariance[part, part] + np.diag(np.array(effect.floor_std) ** 2)
+    covariance = fitted.covariance[part, part] + np.diag(np.array(floor) ** 2)
     if effect.name == "stabilisation":
         return float(stats.chi2.sf(change[0] ** 2 / covariance[0, 0], 1))
     return float(stats.chi2.sf(change @ np.linalg.solve(covariance, change), len(change)))
@@ -318,7 +325,7 @@ def _conclude(
             for entry in accepted
             if entry.effect is not None
             and entry.effect.term is not None
-            and p_of(fitted, entry.effect, model.profile, nominal_model.profile) > MAX_P
+            and p_of(fitted, entry.effect, model.profile, nominal_model.profile, evidence.typical_px) > MAX_P
         ]
         if not weak:
             break
@@ -331,7 +338,7 @@ def _conclude(
     typical = evidence.typical_px
     return GeometricVerdict(
         model, fitted, table, accepted, rungs, nominal_model, nominal_fit,
-        capped_rms(nominal_fit.distance) * typical, capped_rms(fitted.distance) * typical, evidence.noise_px,
+        capped_rms(nominal_fit.distance) * typical, capped_rms(fitted.distance) * typical, evidence.noise_px, typical,
     )  # fmt: skip
 
 
@@ -412,7 +419,8 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
     if effect.term is None:
         return effect.changes(nominal, found, None)
     part = verdict.fit.slices[effect.term.name]
-    std = np.sqrt(np.diag(verdict.fit.covariance)[part] + np.array(effect.floor_std) ** 2)
+    floor = bias_std(effect.name, verdict.step_noise_px, verdict.fit.profile.shutter.readout_time_s)
+    std = np.sqrt(np.diag(verdict.fit.covariance)[part] + np.array(floor) ** 2)
     changes = effect.changes(nominal, found, std)
     match effect.name:
         case "imu_rotation":

@@ -59,7 +59,9 @@ TRACKING_BIAS_PX = 0.02
 SCALE_EXCESS = 1.25
 """Differences this many times their noise, measured without the model, are not all noise."""
 STRAY_DISTANCE, STRAY_PART = 6.0, 0.1
-PHOTOMETRIC_STRUCTURE = 2.0
+CALM = 40.0
+"""Brightness this many typical deviations off counts half: a band of the sensor is evidence, a passer-by is not."""
+PHOTOMETRIC_STRUCTURE = 1.5
 """Grey levels."""
 
 
@@ -98,11 +100,16 @@ def diagnose_capture(
     frames = _at_model_times(capture, geometric)
     trajectory = integrate_gyro(capture.imu, found)
     say("brightness", 0.55)
-    photometric = climb_photometry(capture, frames, found, trajectory, pictures, gray)
+    moves_right = not _points_left(geometric).significant
+    photometric = climb_photometry(capture, frames, found, trajectory, pictures, gray if moves_right else None)
     say("blur", 0.8)
-    shown = replace(capture, frames=tuple(frames))
     hypothesis = _exposure_hypothesis(findings, observed.exposure_s)
-    blurred, is_exposure = climb_blur(shown, photometric.profile, trajectory, gray, hypothesis)
+    blurred, is_exposure = picture_ladder.PictureVerdict(photometric.profile), False
+    if moves_right:
+        shown = replace(capture, frames=tuple(frames))
+        blurred, is_exposure = climb_blur(shown, photometric.profile, trajectory, gray, hypothesis)
+    else:
+        notes.append("points do not go where the model says: blur, and what it does to the curve, were not judged")
     if is_exposure and hypothesis is not None:
         findings = _as_exposure(evidence, geometric, findings, hypothesis, float(np.median(observed.exposure_s)))
         blurred = _one_exposure(blurred)
@@ -165,7 +172,7 @@ def _is_constant(exposure_s: Array) -> bool:
 
 
 def _stamped(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
-    """At constant exposure an offset of just half or one exposure is another meaning of the stamp; rivals in any case."""
+    """At constant exposure an offset of just half or one exposure is another meaning of the stamp."""
     if not _is_constant(exposure_s) or float(np.median(exposure_s)) <= 0:
         return findings
     nominal = geometric.nominal.profile
@@ -380,7 +387,7 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
         for name, values in observations.covariates(photometric.profile).items()
         if name in ("row", "radius", "brightness", "row_fraction", "x_px", "y_px")
     }
-    weight = 1.0 / (1.0 + (left / (2.5 * max(float(np.median(np.abs(left))) / 0.6745, 1e-6))) ** 2)
+    weight = 1.0 / (1.0 + (left / (CALM * max(float(np.median(np.abs(left))) / 0.6745, 1.0))) ** 2)
     found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)
     strongest = max(found, key=lambda s: s.size)
     log.debug("light left: %s", found)

@@ -74,9 +74,17 @@ class PictureVerdict:
 
 
 def climb_photometry(
-    capture: Capture, frames: Sequence[Frame], profile: CameraProfile, trajectory: Trajectory, rgb: Reader, gray: Reader
+    capture: Capture,
+    frames: Sequence[Frame],
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    rgb: Reader,
+    gray: Reader | None,
 ) -> PictureVerdict:
-    """Find what changes the brightness of patches; frames at their true times."""
+    """Find what changes the brightness of patches; frames at their true times.
+
+    gray: for the curve at constant exposure, which needs blur paths that are right; None: left out.
+    """
     verdict = PictureVerdict(profile)
     by_index = {frame.index: frame for frame in frames}
     pictures = ((by_index[k], picture) for k, picture in rgb([frame.index for frame in frames]))
@@ -85,7 +93,8 @@ def climb_photometry(
         verdict.notes.append("too few flat patches are seen again: brightness not judged")
     else:
         _climb(verdict, observations, len(capture.frames))
-    _mixing(verdict, frames, trajectory, gray)
+    if gray is not None:
+        _mixing(verdict, frames, trajectory, gray)
     return verdict
 
 

@@ -5,7 +5,9 @@ the extended one.  Two neighbours are two independent witnesses of one scene:
 
 - *sharpness*: the gradient that both show.  One picture is laid on the other by a homography through tracked points,
   and the product of their gradients is averaged: noise and the ringing of a wrong kernel differ between the two and
-  cancel, the scene's own detail stays.  No model of the camera enters, and none is favoured.
+  cancel, the scene's own detail stays.  Neighbours move alike, though, and so do their wrong kernels: the mean product
+  is weighted by its part of the two pictures' own gradient energies, which ringing lowers.  No model of the camera
+  enters, and none is favoured.
 - *disagreement*: the model says where a point of one restored picture lies in the other, from the gyroscope alone (and
   the translation, where it is known); the distance to where it is found is what geometry, clocks and rows get wrong.
 - *brightness*: the light along the same points, which flicker left in one picture and not in the other changes.
@@ -39,7 +41,7 @@ Picture = NDArray[np.uint8]
 Rectangle = tuple[int, int, int, int]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
-PAIRS = 3
+PAIRS = 4
 MIN_TRACKS = 16
 """Fewer points than this lay no picture on another."""
 HOMOGRAPHY_PX = 2.0
@@ -55,7 +57,7 @@ class RestorationGain:
     """``before`` with the profile as given, ``after`` with the extended one; NaN where it could not be measured."""
 
     sharpness_recorded: float
-    """Grey levels per pixel: root of the mean gradient product of neighbours, of the pictures as recorded."""
+    """Grey levels per pixel: root of the gradient energy that neighbours share, of the pictures as recorded."""
     sharpness_before: float
     """The same, restored; all three over the area that is real in both restorations."""
     sharpness_after: float
@@ -97,15 +99,17 @@ class _Restoration:
 
     def predicted(self, points_px: Array, first: int) -> Array:
         """Where points (n, 2) of the restored frame ``first`` lie in the next one, by the model."""
-        assert self.trajectory is not None and self.lens is not None
+        assert self.trajectory is not None
+        assert self.lens is not None
         from_s, to_s = (self._reference_s(first + step) for step in (0, 1))
         rays = self.lens.rays(points_px, from_s)
         turn = self.trajectory.orientation(to_s).T @ self.trajectory.orientation(from_s)
         moved = rays @ turn.T
         translation = (self.plan.translations or {}).get(first)
         if translation is not None:
-            nearness = np.maximum(rays @ translation.inverse_depth_plane, 0.0)
-            moved = moved - nearness[:, None] * (turn @ translation.position_m(to_s - from_s))
+            nearness = np.maximum(rays @ np.asarray(translation.inverse_depth_plane, float), 0.0)
+            shift = turn @ translation.position_m(np.array(to_s - from_s))
+            moved = moved - np.outer(nearness, shift)
         return self.lens.project(moved, to_s)
 
     def _reference_s(self, number: int) -> float:
@@ -145,9 +149,13 @@ def measure_restoration_gain(
             apart[name].append(_distances(restoration, pairs[name], first))
             light[name].append(_light_ratios(restoration.plan.profile, pairs[name]))
     return RestorationGain(
-        *(_root_mean(sharp[name]) for name in ("recorded", "before", "after")),
-        *(_median(apart[name]) for name in ("before", "after")),
-        *(_spread(light[name]) for name in ("before", "after")),
+        sharpness_recorded=_root_mean(sharp["recorded"]),
+        sharpness_before=_root_mean(sharp["before"]),
+        sharpness_after=_root_mean(sharp["after"]),
+        disagreement_before_px=_median(apart["before"]),
+        disagreement_after_px=_median(apart["after"]),
+        brightness_disagreement_before=_spread(light["before"]),
+        brightness_disagreement_after=_spread(light["after"]),
         frames=tuple(numbers),
     )
 
@@ -171,9 +179,9 @@ def chosen_pairs(capture: Capture, profile: CameraProfile) -> list[int]:
 def shared_gradient(
     pictures: tuple[Picture, Picture], valid_px: tuple[Rectangle, Rectangle], tracks: TrackPair | None
 ) -> float:
-    """Mean product of the gradients of two pictures of one scene, (grey levels per pixel)²; NaN without a common area.
+    """Gradient energy that two pictures of one scene share, (grey levels per pixel)²; NaN without a common area.
 
-    The second is laid on the first by a homography through the tracks.
+    ⟨∇a·∇b⟩² / √(⟨|∇a|²⟩⟨|∇b|²⟩), not below 0, with b laid on a by a homography through the tracks.
     """
     place = _homography(tracks)
     if place is None:
@@ -187,8 +195,9 @@ def shared_gradient(
     common = cv2.erode(real[0] & there, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8), borderValue=0) > 0
     if not common.any():
         return np.nan
-    product = sum(_slope(first, *way) * _slope(laid, *way) for way in ((1, 0), (0, 1)))
-    return float(np.mean(np.asarray(product)[common]))
+    a, b = (np.stack([_slope(p, 1, 0)[common], _slope(p, 0, 1)[common]]) for p in (first, laid))
+    product, own = float(np.vdot(a, b)), float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
+    return max(product, 0.0) ** 2 / max(own, 1e-9) / int(common.sum())
 
 
 # ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -300,7 +309,7 @@ def _patch_light(picture: Picture, curve: ResponseCurve, points_px: Array) -> Ar
 
 def _root_mean(energies: list[float]) -> float:
     known = [energy for energy in energies if np.isfinite(energy)]
-    return float(np.sqrt(max(np.mean(known), 0.0))) if known else float("nan")
+    return float(np.sqrt(max(float(np.mean(known)), 0.0))) if known else float("nan")
 
 
 def _median(lengths: list[Array]) -> float:

@@ -93,7 +93,7 @@ def align_coarsely(
 def align_with_skew(
     turns: PictureTurns, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
 ) -> tuple[CoarseAlignment, float] | None:
-    """Align coarsely at several clock skews about the profile's; the profile's stays unless another fits much better."""
+    """Align coarsely at several clock skews; the profile's stays unless another fits much better."""
     best = align_coarsely(turns, imu, profile, search_s)
     skew = profile.clock_skew
     for change in SKEWS:

@@ -17,6 +17,7 @@ from virest.capture.imu import ImuSamples
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+FIFTH_DIFFERENCES = 252**0.5
 MIN_FINITE = 0.98
 """Least part of the rows with an acceleration; the holes are bridged by straight lines."""
 
@@ -57,6 +58,18 @@ class Displacement:
         if not self.arm_cam_m.any():
             return np.zeros(3)
         return -np.squeeze(self.trajectory.orientation(time_s) @ self.arm_cam_m[:, None], -1)
+
+
+def drift_std_m(imu: ImuSamples, span_s: float) -> float:
+    """Standard deviation of the displacement after span_s that the accelerometer's white noise alone makes.
+
+    σ √Δt T^1.5 / √3; σ from fifth differences, which a hand's motion hardly reaches.  Inf without an accelerometer.
+    """
+    force = imu.accel_m_s2[np.isfinite(imu.accel_m_s2).all(axis=1)]
+    if len(force) < 12:
+        return float("inf")
+    noise = float(np.median(np.std(np.diff(force, n=5, axis=0), axis=0))) / FIFTH_DIFFERENCES
+    return noise * float(np.sqrt(np.median(np.diff(imu.time_s)) / 3)) * span_s**1.5
 
 
 def integrate_accelerometer(imu: ImuSamples, profile: CameraProfile, trajectory: Trajectory) -> Displacement | None:

@@ -79,6 +79,8 @@ class TrackFit:
     """(n,) Cauchy weights, 0 to 1."""
     distance: Array
     """(n,) whitened length of each difference, in standard deviations."""
+    stretches: Array
+    """(k,) on how many blocks of time each value of the terms rests: (Σ share)² / Σ share² of its information."""
     cost: float
     """Σ of the robust loss over the points, whitened: comparable between fits of one table."""
     ground: Ground
@@ -315,13 +317,15 @@ def _cost(system: _System, scale: float) -> float:
 def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system: _System, blocks: int) -> TrackFit:
     inverse = system.inverse()
     covariance = _block_covariance(table, system, inverse, blocks)
+    stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
     place, slices = 0, {}
     for term in terms:
         slices[term.name] = slice(place, place + len(term))
         place += len(term)
     return TrackFit(
         state.known.profile, state.scene, terms, state.change, covariance, inverse, system.scale,
-        system.depth_spread, system.difference, system.weight, np.sqrt(system.squared), _cost(system, 1.0), state.known,
+        system.depth_spread, system.difference, system.weight, np.sqrt(system.squared), stretches,
+        _cost(system, 1.0), state.known,
         system.prediction.second_s, slices,
     )  # fmt: skip
 
@@ -342,6 +346,18 @@ def _block_covariance(table: TrackTable, system: _System, inverse: Array, blocks
     total = sandwich + prior_part
     raised = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(total), 1e-300), 1.0))
     return total * np.outer(raised, raised)
+
+
+def _stretches(table: TrackTable, system: _System, inverse: Array, blocks: int) -> Array:
+    """Effective number of blocks that inform each parameter, (k,): about one where a single moment decides."""
+    count = min(blocks, table.n_pairs)
+    if not inverse.size:
+        return np.zeros(0)
+    block = table.pair * count // max(table.n_pairs, 1)
+    seen = system.rows @ inverse
+    information = (seen**2).sum(axis=1) * system.weight[:, None]
+    share = np.stack([np.bincount(block, column, count) for column in information.T], axis=-1)
+    return np.asarray(share.sum(axis=0) ** 2 / np.maximum((share**2).sum(axis=0), 1e-300))
 
 
 def _solved(matrix: Array, right: Array) -> Array:

@@ -44,6 +44,8 @@ MAX_SPREAD = 0.6
 """Spread of inverse depths about the plane, as part of its inverse depth."""
 GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
 MAX_ITERATIONS = 30
+STILL_ITERATIONS = 8
+"""Rotation alone is there to be compared with; it does not matter to the last digit."""
 CAUCHY, RAYLEIGH_MEDIAN = 2.4, 1.1774
 OFFSET_PRIOR_S, ROTATION_PRIOR_RAD, READOUT_PRIOR_S = 0.03, 0.03, 0.03
 """How far a profile that states a value may be wrong: these are fitted along so that they do not pass for parallax."""
@@ -359,7 +361,7 @@ def _fit_stretch(
     first, last = (float(profile.imu_time_s(t)) for t in (table.first_stamp_s.min(), table.second_stamp_s.max()))
     imu = imu.between(first - IMU_MARGIN_S - settling_time_s(profile), last + IMU_MARGIN_S)
     terms = nuisance_terms(profile)
-    still = fit_tracks(imu, table, profile, terms)
+    still = fit_tracks(imu, table, profile, terms, max_iterations=STILL_ITERATIONS)
     known = ground(imu, profile, translation=True)
     if known.displacement is None:
         return None

@@ -14,10 +14,9 @@ from virest.calibration.response_curve import CurveFit
 FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
 DPI = 110
-COVARIATES = ("row", "time", "radius", "rate")
-"""Drawn first, in this order; others follow, up to MAX_COVARIATES."""
+COVARIATES = {"row": "part of the readout", "time": "time, s", "radius": "radius, px", "rate": "rate, rad/s"}
+"""What residuals are drawn over, and how the axes are called."""
 RESIDUALS = ("x_px", "y_px")
-MAX_COVARIATES = 6
 BINS, MIN_IN_BIN = 24, 8
 
 Array = NDArray[np.float64]
@@ -127,12 +126,11 @@ def comparison_figure(
 def residual_figure(
     before: Mapping[str, Any], after: Mapping[str, Any], title: str = "", image_format: str = "png"
 ) -> bytes:
-    """Residuals along x and y over every covariate, before and after: medians of equal shares, and their middle 68 %.
+    """Residuals along x and y over row, time, radius and rate: medians of equal shares, and their middle 68 %.
 
     before, after: covariate name → (n,), and ``x_px``, ``y_px`` (n,).
     """
-    names = [name for name in (*COVARIATES, *before) if name in before and name not in RESIDUALS]
-    names = list(dict.fromkeys(names))[:MAX_COVARIATES]
+    names = [name for name in COVARIATES if name in before or name in after]
     figure = _canvas(3.4 * max(len(names), 1), 5.6)
     axes = figure.subplots(2, max(len(names), 1), squeeze=False, sharey="row")
     for line, component in zip(axes, RESIDUALS, strict=True):
@@ -141,9 +139,9 @@ def residual_figure(
                 if name in data and component in data:
                     _draw_binned(place, np.asarray(data[name]), np.asarray(data[component]), label, colour)
             place.axhline(0, color="0.7", lw=0.8, zorder=0)
-            place.set_xlabel(_literal(name))
+            place.set_xlabel(COVARIATES[name])
         line[0].set_ylabel(f"residual along {component[0]}, px")
-    if names:
+    if axes[0][0].get_legend_handles_labels()[0]:
         axes[0][0].legend(loc="upper right", fontsize=8)
     figure.suptitle(_literal(title))
     return _as_file(figure, image_format)

@@ -102,6 +102,15 @@ def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
     return (near & cv2.LUT(channel, curve.clipped_table(PULLED_DOWN_LEVELS).astype(np.uint8))).astype(np.float32)
 
 
+def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.uint8] | None:
+    """1 where any channel of a picture (height, width, 3) is clipped; None: nowhere."""
+    table = curve.clipped_table(CLIPPED_LEVELS)
+    brightest = cv2.max(cv2.max(*cv2.split(picture)[:2]), cv2.extractChannel(picture, 2))
+    if not table[int(brightest.max())]:
+        return None
+    return np.asarray(cv2.LUT(brightest, table.astype(np.uint8)), np.uint8)
+
+
 def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
     """The sharp picture's light, channel by channel, at the kernels' anchor."""
     methods: dict[str, Callable[[BlurredPicture, RestorationSettings], list[Image]]] = {
@@ -118,17 +127,23 @@ def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image
 
 
 def _with_unseen_kept(sharp: list[Image], blurred: BlurredPicture) -> list[Image]:
-    """The recorded light where nothing says more: a censored pixel with all its neighbours along the path censored."""
+    """The recorded light where nothing says more."""
+    for plane, light, unseen in zip(sharp, blurred.light, unseen_masks(blurred), strict=True):
+        if unseen is not None:
+            cv2.copyTo(light, unseen, plane)
+    return sharp
+
+
+def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
+    """1 where a channel's light is censored, dark or clipped, with all its neighbours along the path; None: nowhere."""
     if all(mask is None for mask in (*blurred.dark, *blurred.clipped)):
-        return sharp
+        return [None] * len(blurred.light)
     reach = _path_reach(blurred)
-    kept = []
-    for plane, light, *masks in zip(sharp, blurred.light, blurred.dark, blurred.clipped, strict=True):
-        for mask in masks:
-            if mask is not None:
-                cv2.copyTo(light, cv2.erode(mask, reach).astype(np.uint8), plane)
-        kept.append(plane)
-    return kept
+    masks: list[NDArray[np.uint8] | None] = []
+    for pair in zip(blurred.dark, blurred.clipped, strict=True):
+        eroded = [cv2.erode(mask.astype(np.uint8), reach) for mask in pair if mask is not None]
+        masks.append(np.maximum.reduce(eroded) if eroded else None)
+    return masks
 
 
 # ── tile by tile ─────────────────────────────────────────────────────────────────────────────────────────────────
@@ -232,19 +247,21 @@ def _small_differences(blurred: BlurredPicture, grid: TileGrid) -> list[Image]:
     if holes is None:
         return differences
     known = 1 - cv2.resize(cv2.dilate(holes, np.ones((3, 3), np.uint8)), size, interpolation=cv2.INTER_AREA)
-    return [_filled_in(plane, known) for plane in differences]
+    return _filled_in(differences, known)
 
 
-def _filled_in(plane: Image, known: Image) -> Image:
+def _filled_in(planes: list[Image], known: Image) -> list[Image]:
     """Weighted means of what is known, over wider and wider neighbourhoods."""
-    weight, filled = known, plane * known
+    weight, filled = known, [cv2.multiply(plane, known) for plane in planes]
     for side in (3, 9, 27, 81):
         near = cv2.blur(weight, (side, side))
         reached = near > 1e-2
-        mean = np.where(reached, cv2.blur(filled, (side, side)) / np.maximum(near, 1e-2), 0)
-        filled = filled + (1 - weight) * mean
+        share = np.where(reached, (1 - weight) / np.maximum(near, 1e-2), np.float32(0))
+        filled = [cv2.add(plane, cv2.multiply(cv2.blur(plane, (side, side)), share)) for plane in filled]
         weight = np.where(reached, np.float32(1), weight)
-    return np.asarray(filled, np.float32)
+        if weight.min() == 1:
+            break
+    return filled
 
 
 # ── clipped light ────────────────────────────────────────────────────────────────────────────────────────────────
@@ -254,6 +271,17 @@ def _holes(blurred: BlurredPicture) -> Image | None:
     """1.0 where any channel is clipped: what is recorded there is no measurement."""
     masks = [mask for mask in blurred.clipped if mask is not None]
     return np.maximum.reduce(masks) if masks else None
+
+
+def near_clipped(blurred: BlurredPicture) -> Image | None:
+    """1 where the blur path touches clipped light, falling to 0 over a path's length beyond; None: nothing clipped."""
+    holes = _holes(blurred)
+    if holes is None:
+        return None
+    touched = cv2.dilate(holes.astype(np.uint8), _path_reach(blurred))
+    side = 2 * int(np.ceil(blurred.longest_px / 2 + CODEC_REACH_PX)) + 1
+    around = cv2.dilate(touched, np.ones((side, side), np.uint8)).astype(np.float32)
+    return cv2.blur(around, (side, side))
 
 
 def _measured_part(holes: Image) -> Image:

@@ -20,7 +20,7 @@ from virest.degradation.light import FrameLight, equivalent_length_px, frame_lig
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
-from virest.restoration.deblur import BlurredPicture, blurred_picture, deblur
+from virest.restoration.deblur import BAND_ROWS, BlurredPicture, blurred_picture, clipped_anywhere, deblur, near_clipped, unseen_masks
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics import PictureStatistics, measure_picture
@@ -41,8 +41,6 @@ FULL_TRUST_NOISE = 1.8
 """Up to this multiple of the gradients' scale, noise does not lessen the trust."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
-MANY_CLIPPED = 0.003
-"""With a larger part of clipped pixels the expected gain says nothing: they are no linear blur."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,13 +201,38 @@ def unknown_parameters(profile: CameraProfile) -> dict[str, Any]:
 
 
 def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> NDArray[np.uint8]:
-    """Linear light of the channels to a stored picture (height, width, 3), through a table over the root of light."""
+    """Linear light of the channels to a stored picture (height, width, 3), through a table over the root of light.
+
+    Band by band: what is worked on stays in the cache.
+    """
     low, high = curve.light_range
-    part = cv2.merge(light)
-    if (low, high) != (0.0, 1.0):
-        part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
-    root = cv2.sqrt(cv2.max(part, 0.0))
-    return cv2.LUT(cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U), _encoding_table(curve))
+    table = _encoding_table(curve)
+    picture = np.empty((*light[0].shape, len(light)), np.uint8)
+    for top in range(0, len(picture), BAND_ROWS):
+        part = cv2.merge([plane[top : top + BAND_ROWS] for plane in light])
+        if (low, high) != (0.0, 1.0):
+            part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
+        root = cv2.sqrt(cv2.max(part, 0.0))
+        steps = cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U)
+        cv2.LUT(steps, table, picture[top : top + BAND_ROWS])
+    return picture
+
+
+def _beyond_the_curve_kept(
+    restored: NDArray[np.uint8], picture: NDArray[np.uint8], blurred: BlurredPicture, curve: ResponseCurve
+) -> NDArray[np.uint8]:
+    """Grey levels that no light gives, as noise and codec leave them beyond the curve's ends: kept where unseen."""
+    table = _encoding_table(curve)
+    low, high = curve.light_range
+    part = np.clip((curve.linear_table().ravel() - low) / (high - low), 0, 1)
+    returned = table[np.rint(65535 * np.sqrt(part)).astype(int)] == np.arange(256)
+    levels = np.flatnonzero(~returned)
+    if not len(levels) or not (picture.max() >= levels.max() or picture.min() <= levels.min()):
+        return restored
+    for channel, unseen in enumerate(unseen_masks(blurred)):
+        if unseen is not None:
+            cv2.copyTo(picture[..., channel], unseen, restored[..., channel])
+    return restored
 
 
 @lru_cache(maxsize=8)
@@ -253,10 +276,9 @@ def _deblurred(
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
-    luma, chroma = _measured(picture, samples)
-    clipped = bool(np.mean(cv2.LUT(picture, curve.clipped_table().astype(np.uint8))) > MANY_CLIPPED)
-    share = 1.0 if clipped or anchor != 0.5 else _trusted_share(luma, settings.deblur)
-    why_not = _too_little_to_gain(luma, clipped, share)
+    luma, chroma = _measured(picture, samples, clipped_anywhere(picture, curve))
+    share = 1.0 if anchor != 0.5 else _trusted_share(luma, settings.deblur)
+    why_not = _too_little_to_gain(luma, share)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(
@@ -266,10 +288,12 @@ def _deblurred(
         blurred = _evened(blurred, light)
     sharp = deblur(blurred, settings)
     if anchor == 0.5:
-        part = np.float32(share) * _blurred_part(motion, settings.min_blur_px)
+        part = _blurred_part(motion, settings.min_blur_px) * _share_map(blurred, share)
         if part.min() < 1.0:
             sharp = [plane + part * (s - plane) for s, plane in zip(sharp, blurred.light, strict=True)]
     restored = encode_picture(sharp if light is None else [plane * light.kept for plane in sharp], curve)
+    if light is None:
+        restored = _beyond_the_curve_kept(restored, picture, blurred, curve)
     details = {
         "method": settings.deblur,
         "preset": settings.preset,
@@ -284,12 +308,14 @@ def _deblurred(
     return restored, details, ()
 
 
-def _measured(picture: NDArray[np.uint8], field: KernelField) -> tuple[PictureStatistics, PictureStatistics]:
+def _measured(
+    picture: NDArray[np.uint8], field: KernelField, clipped: NDArray[np.uint8] | None
+) -> tuple[PictureStatistics, PictureStatistics]:
     """Statistics of luma and chroma. Noise shows where the paths cancel; a Gaussian, the same all round, hides it.
 
     So the paths alone are fitted, which measures the noise and the defocused picture, and that is focused afterwards.
     """
-    luma, chroma = measure_picture(picture, replace(field, defocus_sigma_px=0.0))
+    luma, chroma = measure_picture(picture, replace(field, defocus_sigma_px=0.0), clipped)
     return _focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px)
 
 
@@ -322,11 +348,11 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
 
 
-def _too_little_to_gain(luma: PictureStatistics, clipped: bool, share: float) -> str:
+def _too_little_to_gain(luma: PictureStatistics, share: float) -> str:
     """Why the picture is better left as it was recorded; empty: it is not."""
     if not luma.measured:
         return "picture too small for its blur to be measured, left alone"
-    if luma.expected_gain_db < MIN_GAIN_DB and not clipped:
+    if luma.expected_gain_db < MIN_GAIN_DB:
         return f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
     if share < MIN_SHARE:
         return f"noise of {luma.noise_levels:.1f} grey levels drowns the detail, left alone"
@@ -341,6 +367,15 @@ def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32]:
     length_px = equivalent_length_px(motion.profile, length_px)
     part = np.clip(length_px / min_blur_px - 1.0, 0.0, 1.0).astype(np.float32)
     return cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _share_map(blurred: BlurredPicture, share: float) -> NDArray[np.float32] | np.float32:
+    """How much to take of each pixel: all along the streaks of clipped light, where what is gained is not the texture.
+
+    (height, width), or one number for all.
+    """
+    near = near_clipped(blurred) if share < 1.0 else None
+    return np.float32(share) if near is None else np.float32(share) + np.float32(1.0 - share) * near
 
 
 def _trusted_share(luma: PictureStatistics, method: str) -> float:

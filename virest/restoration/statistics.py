@@ -16,7 +16,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import rfft2
 
 from virest.degradation.kernels import KernelField
 
@@ -34,9 +33,11 @@ _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _NOISE_SLOPE = 0.7
 """Towards low frequencies the power of a coded movie's error grows about like f^−0.7."""
-_NEAR_CLIPPING = 250
 _MAX_CLIPPED = 0.002
-"""Tiles with a larger part of clipped pixels are no linear blur and tell nothing of the noise."""
+"""Tiles with a larger part of clipped pixels are taken only where there are none better."""
+_ON_PATH = 2e-3
+"""Kernels are larger than this where the path goes."""
+_FILLING_PX = (5, 15, 45, 135)
 _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 
@@ -88,29 +89,49 @@ class PictureStatistics:
         return float(10 * np.log10(left / restored))
 
 
-def measure_picture(picture: NDArray[np.uint8], field: KernelField) -> tuple[PictureStatistics, PictureStatistics]:
+def measure_picture(
+    picture: NDArray[np.uint8], field: KernelField, clipped: NDArray[np.uint8] | None = None
+) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
-    picture: (height, width, 3) RGB.  Returns the statistics of luma and of chroma, both colour differences together.
+    picture: (height, width, 3) RGB.  clipped: (height, width), 1 where light was too much to be measured; it and what a
+    path reaches from it are left out.  Returns the statistics of luma and of chroma, both colour differences together.
     """
     luma, red, blue = cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb))
     corners = _corners(field, luma.shape)
     if not corners or field.radius_px >= _SIDE // 2:
         return _unknown_picture(), _unknown_picture()
-    clipped = np.array([np.count_nonzero(_cut(luma, corner) >= _NEAR_CLIPPING) for corner in corners]) / _SIDE**2
-    chosen = np.flatnonzero(clipped <= max(_MAX_CLIPPED, float(np.quantile(clipped, 0.25))))
-    chosen = chosen[:: int(np.ceil(len(chosen) / _MAX_TILES))]
-    passed = np.stack([_passed(kernel) for kernel in field.chosen(chosen).arrays()])
+    chosen = _least_clipped(clipped, corners)
+    kernels = field.chosen(chosen).arrays()
+    passed = np.stack([_passed(kernel) for kernel in kernels])
+    known = [None if clipped is None else _known(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)]
 
-    def observed(plane: NDArray[np.uint8], where: NDArray[np.intp]) -> NDArray[np.float32]:
-        return np.stack([_windowed_power(_cut(plane, corners[i])) for i in where])
+    def observed(plane: NDArray[np.uint8], every: int) -> NDArray[np.float32]:
+        tiles = zip(chosen[::every], known[::every], strict=True)
+        return np.stack([_windowed_power(_cut(plane, corners[i]), seen) for i, seen in tiles])
 
-    fewer = chosen[::2]
-    both = (
-        np.concatenate([observed(red, fewer), observed(blue, fewer)]),
-        np.concatenate([passed[::2], passed[::2]]),
-    )
-    return _fit_rings(observed(luma, chosen), passed, white_noise(luma)), _fit_rings(*both, white_noise(red))
+    both = (np.concatenate([observed(red, 2), observed(blue, 2)]), np.concatenate([passed[::2], passed[::2]]))
+    return _fit_rings(observed(luma, 1), passed, white_noise(luma)), _fit_rings(*both, white_noise(red))
+
+
+def _least_clipped(clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]]) -> NDArray[np.intp]:
+    """Numbers of the tiles to measure: a dozen, evenly over those with the least clipped light."""
+    chosen = np.arange(len(corners))
+    if clipped is not None:
+        parts = np.array([np.count_nonzero(_cut(clipped, corner)) for corner in corners]) / _SIDE**2
+        chosen = np.flatnonzero(parts <= max(_MAX_CLIPPED, float(np.quantile(parts, 0.25))))
+    return chosen[:: int(np.ceil(len(chosen) / _MAX_TILES))]
+
+
+def _known(
+    clipped: NDArray[np.uint8], corner: tuple[int, int], kernel: NDArray[np.float32]
+) -> NDArray[np.float32] | None:
+    """1.0 where a tile shows no light that a path reaches from clipped light; None: everywhere."""
+    tile = _cut(clipped, corner)
+    if not tile.any():
+        return None
+    reach = (kernel + kernel[::-1, ::-1] > _ON_PATH).astype(np.uint8)
+    return np.float32(1) - cv2.dilate(cv2.dilate(tile, reach), np.ones((3, 3), np.uint8))
 
 
 def white_noise(plane: NDArray[np.uint8]) -> float:
@@ -139,10 +160,29 @@ def _cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]
     return plane[corner[0] : corner[0] + _SIDE, corner[1] : corner[1] + _SIDE]
 
 
-def _windowed_power(tile: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Power of a tile less its mean under a Hann window; white noise of variance σ² gives σ² everywhere."""
-    mean = np.float32(np.vdot(tile.astype(np.float32), _WINDOW) / _WINDOW_SUM)
-    return _power((tile - mean) * _WINDOW) / _WINDOW_POWER
+def _windowed_power(tile: NDArray[np.uint8], known: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    """Power of a tile less its mean under a Hann window; white noise of variance σ² gives σ² everywhere.
+
+    What is not known (0 in ``known``) is filled in smoothly and adds no power.
+    """
+    values, power = tile.astype(np.float32), float(_WINDOW_POWER)
+    if known is not None:
+        values, power = _smoothly_filled(values, known), max(float(np.vdot(_WINDOW**2, known)), 1.0)
+    mean = np.float32(np.vdot(values, _WINDOW) / _WINDOW_SUM)
+    return _power((values - mean) * _WINDOW) / np.float32(power)
+
+
+def _smoothly_filled(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of what is known around each unknown place, over the smallest neighbourhood that knows any."""
+    filled, left = values * known, known == 0
+    for side in _FILLING_PX:
+        near = cv2.blur(known, (side, side))
+        here = left & (near > 0.1)
+        filled[here] = (cv2.blur(values * known, (side, side))[here]) / near[here]
+        left &= ~here
+    if left.any():
+        filled[left] = filled[~left].mean() if not left.all() else 0.0
+    return filled
 
 
 def _passed(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -153,15 +193,16 @@ def _passed(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _power(tile: NDArray[np.float32]) -> NDArray[np.float32]:
-    """|F|² over the half plane of the transform, (side, side / 2 + 1)."""
-    spectrum = rfft2(tile)
-    return (spectrum.real**2 + spectrum.imag**2).astype(np.float32)
+    """|F|² at the horizontal frequencies 1 ... side / 2 − 1 of the transform, (side, side / 2 − 1)."""
+    packed = cv2.dft(tile)[:, 1:-1]
+    squares = packed * packed
+    return squares[:, ::2] + squares[:, 1::2]
 
 
 @lru_cache(maxsize=8)
 def _ring_index(side: int) -> NDArray[np.intp]:
-    """Ring of each place of the half plane; RINGS for those beyond half a cycle per pixel, and for the lowest."""
-    fy, fx = np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :]
+    """Ring of each place of :func:`_power`; RINGS for those beyond half a cycle per pixel, and for the lowest."""
+    fy, fx = np.fft.fftfreq(side)[:, None], np.arange(1, side // 2)[None, :] / side
     radius = np.hypot(fx, fy)
     ring = (radius / 0.5 * RINGS).astype(np.intp)
     return np.where(

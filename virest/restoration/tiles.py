@@ -121,8 +121,7 @@ class TileDeconvolution:
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, spectra, strict=True):
             cv2.idft(spectrum, tile, flags=cv2.DFT_SCALE)
             inner = tile[margin : margin + side, margin : margin + side]
-            inner *= window
-            result[top : top + side, left : left + side] += inner
+            cv2.accumulateProduct(inner, window, result[top : top + side, left : left + side])
         return result[: grid.height, : grid.width]
 
     def padded(self, channel: Image, border: int = cv2.BORDER_REPLICATE) -> Image:

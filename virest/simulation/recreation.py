@@ -45,6 +45,8 @@ class ScenePicture:
     """(h, w, 3) RGB, of the profile's lens, vignetting and curve."""
     frame: int
     """Movie index of the frame; the picture shows the start of its first row's exposure."""
+    valid_px: tuple[int, int, int, int]
+    """x0, y0, x1, y1, the last two one past the end: what of it is real."""
 
 
 def known_frames(frames: Sequence[Frame]) -> tuple[Frame, ...]:
@@ -92,7 +94,7 @@ def recreate_session(
     motion = recorded_motion(sample_s, imu.gyro_rad_s, true, seen_s)
     view = make_view(true, motion, rest_s=session.imu_span_s[0])
     _require_ahead(motion, true, session, shows)
-    chart = _scene(scene.picture, view, motion, seen_s, _slot_gain(true, shows, slot), settings.oversampling)
+    chart = _scene(scene, view, motion, seen_s, _slot_gain(true, shows, slot), settings.oversampling)
     return dataclasses.replace(session, scene=chart, motion=motion, view=view)
 
 
@@ -197,13 +199,13 @@ def _require_ahead(motion: HandMotion, true: CameraProfile, session: Session, sh
 
 
 def _scene(
-    picture: NDArray[np.uint8], view: View, motion: HandMotion, seen_s: float, gain: float, oversampling: float
+    scene: ScenePicture, view: View, motion: HandMotion, seen_s: float, gain: float, oversampling: float
 ) -> Scene:
-    """The picture's light as a chart at infinity, where the camera looked at ``seen_s``; mirrored past its edges."""
+    """The picture's light as a chart at infinity, where the camera looked at ``seen_s``; mirrored past what is real."""
     profile = view.profile
     curve = profile.response or ResponseCurve("srgb")
     left = sensor_light(np.ones((profile.height, profile.width, 1), np.float32), profile, gain, defocus=False)
-    light = curve.linearise(picture.astype(np.float32) / 255).astype(np.float32) / np.maximum(left, _DARKEST)
+    light = curve.linearise(scene.picture.astype(np.float32) / 255).astype(np.float32) / np.maximum(left, _DARKEST)
     x, y = view.rays(seen_s, slice(None), slice(None))
     reach = [_CHART_MARGIN * float(np.abs(plane).max()) for plane in (x, y)]
     lens = profile.intrinsics
@@ -213,8 +215,10 @@ def _scene(
     width, height = (2 * int(np.ceil(extent * focal)) for extent in reach)
     u, v = np.meshgrid((np.arange(width) - (width - 1) / 2) / focal, (np.arange(height) - (height - 1) / 2) / focal)
     rays = np.stack([u, v, np.ones_like(u)], -1) @ motion.rotation(np.array([seen_s])).as_matrix()[0]
-    source = _pixels(view, rays, seen_s).astype(np.float32)
-    chart = cv2.remap(light, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    x0, y0, x1, y1 = scene.valid_px if scene.valid_px[2] > scene.valid_px[0] else (0, 0, profile.width, profile.height)
+    source = (_pixels(view, rays, seen_s) - [x0, y0]).astype(np.float32)
+    real = np.ascontiguousarray(light[y0:y1, x0:x1])
+    chart = cv2.remap(real, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     return Scene(np.maximum(chart, 0.0), focal)
 
 

@@ -1,0 +1,236 @@
+"""``virest diagnose``: its files, its table, its exit codes, over diagnoses that are given."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from virest.app import cli, diagnose
+from virest.camera.profile import parse_profile, read_profile
+from virest.diagnosis.findings import (
+    Diagnosis,
+    Finding,
+    HeldOutGain,
+    Nominal,
+    ParameterChange,
+    Remaining,
+    Rival,
+    Rung,
+)
+from virest.errors import CalibrationError, OutputError
+
+CAUSE_KEYS = {"name", "parameters", "held_out", "rivals", "p_value", "figures"}
+TOP_KEYS = {"schema", "verdict", "nominal", "causes", "unexplained", "restoration_gain", "extended_profile"}
+NOMINAL_KEYS = {"geometry_rms_px", "geometry_noise_px", "photometric_rms", "blur_rms_px", "tracks", "frames"}
+Say = Callable[[str, float], None]
+
+
+def offset_cause() -> Finding:
+    """A time offset with a rival."""
+    change = ParameterChange(0.0, 0.0042, 0.00011)
+    rivals = (Rival("timestamp_reference", 0.23),)
+    gain = HeldOutGain("geometry_rms_px", 1.4, 0.22, 0.2)
+    return Finding("time_offset", {"time_offset_s": change}, gain, rivals, 1e-9, "the clocks are\n 4 ms apart")
+
+
+def odd_cause() -> Finding:
+    """A cause with a list, a word, an infinity and no deviation."""
+    changes = {
+        "gyro_bias_rad_s": ParameterChange([0.0, 0.0, 0.0], [0.01, -0.02, 0.03], [0.001, 0.002, float("nan")]),
+        "depth_m": ParameterChange(None, float("inf"), None),
+        "timestamp": ParameterChange("exposure_start", "exposure_end", None),
+    }
+    return Finding("gyro_bias", changes, HeldOutGain("geometry_rms_px", 0.3, 0.22, 0.2), (), 0.01, "drifts")
+
+
+def diagnosis(source: diagnose._Source, verdict: str, causes: tuple[Finding, ...]) -> Diagnosis:
+    """A diagnosis of the tiny capture."""
+    rng = np.random.default_rng(3)
+    nominal = source.profile
+    extended = dataclasses.replace(nominal, time_offset_s=0.0042) if causes else nominal
+    some = {name: rng.normal(size=200) for name in ("row", "time", "radius", "rate", "x_px", "y_px")}
+    tried = {"time_offset": 0.22, "readout_time": 0.9}
+    rungs = (Rung("time_offset", tried, 1.4, "geometry_rms_px"), Rung(None, {"gyro_bias": 0.23}, 0.22, "geometry_rms_px"))
+    left = Remaining(0.4, "radius", 0.01, "geometry_rms_px", verdict == "unexplained", "something goes on along radius")
+    return Diagnosis(
+        verdict, Nominal(1.4, 0.2, None, float("nan"), 1234, 24), causes, left, nominal, extended, rungs,
+        {"before": some, "after": some}, ("blur was not judged: too little of it",),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Let the ladder come to a given verdict."""
+
+    def give(verdict: str = "explained", *causes: Finding, error: Exception | None = None) -> None:
+        def climb(source: diagnose._Source, progress: Say) -> Diagnosis:
+            progress("points", 0.5)
+            assert [number for number, _ in source.pictures([7, 3, 4])] == [3, 4, 7]
+            assert next(source.gray([5]))[1].shape == (120, 160)  # type: ignore[union-attr]
+            if error is not None:
+                raise error
+            return diagnosis(source, verdict, causes)
+
+        monkeypatch.setattr(diagnose, "climb", climb)
+
+    return give
+
+
+def run(*arguments: object) -> int:
+    """The command, in this process."""
+    return cli.run(["diagnose", *map(str, arguments)])
+
+
+def files_in(folder: Path) -> list[str]:
+    """All files below a folder."""
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def test_the_account_has_the_agreed_keys_and_no_others(tiny: Path, tmp_path: Path, ladder) -> None:
+    """diagnosis.json: keys, gain, null for what is no number, "inf" for infinity; figures that exist."""
+    ladder("explained", offset_cause(), odd_cause())
+    assert run(tiny, "--out", tmp_path / "out") == 0
+    folder = tmp_path / "out/tiny"
+    text = (folder / "diagnosis.json").read_text()
+    facts = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert set(facts) == TOP_KEYS
+    assert facts["schema"] == "virest/diagnosis/1"
+    assert set(facts["nominal"]) == NOMINAL_KEYS
+    assert facts["nominal"]["photometric_rms"] is None is facts["nominal"]["blur_rms_px"]
+    assert set(facts["unexplained"]) == {"p_value", "strongest_along"}
+    assert {"sharpness_before", "sharpness_after"} <= set(facts["restoration_gain"])
+    first, second = facts["causes"]
+    assert set(first) == set(second) == CAUSE_KEYS
+    assert first["parameters"] == {"time_offset_s": {"nominal": 0.0, "estimate": 0.0042, "std": 0.00011}}
+    assert first["rivals"] == [{"name": "timestamp_reference", "held_out_after": 0.23}]
+    held_out = first["held_out"]
+    assert set(held_out) == {"quantity", "before", "after", "gain"}
+    assert held_out["gain"] == pytest.approx(1 - (0.22**2 - 0.2**2) / (1.4**2 - 0.2**2))
+    assert second["parameters"]["depth_m"] == {"nominal": None, "estimate": "inf", "std": None}
+    assert second["parameters"]["gyro_bias_rad_s"]["std"] == [0.001, 0.002, None]
+    for figure in {path for cause in facts["causes"] for path in cause["figures"]}:
+        assert (folder / figure).read_bytes().startswith(b"\x89PNG")
+    assert first["figures"][0] == "figures/01_time_offset.png"
+    assert set(files_in(folder)) >= {"diagnosis.json", facts["extended_profile"], "figures/pictures.png"}
+
+
+def test_the_extended_profile_can_be_used(tiny: Path, tmp_path: Path, ladder) -> None:
+    """extended.yaml reads as a profile with the causes in it, and says how well they are known."""
+    ladder("explained", offset_cause(), odd_cause())
+    assert run(tiny, "--out", tmp_path / "out") == 0
+    path = tmp_path / "out/tiny/extended.yaml"
+    profile = read_profile(path)
+    assert profile.time_offset_s == 0.0042
+    assert parse_profile(yaml.safe_load(path.read_text())) == profile
+    assert profile.estimates["time_offset_s"].std == pytest.approx(0.00011)
+    assert profile.estimates["gyro_bias_rad_s"].std is None
+
+
+def test_the_table_reads_from_cause_to_verdict(tiny: Path, tmp_path: Path, ladder, capfd) -> None:
+    """Cause, value ± deviation, before and after, gain, rivals; the sentence; what remains; the verdict last."""
+    ladder("unexplained", offset_cause(), odd_cause())
+    assert run(tiny, "--out", tmp_path / "out") == 0
+    lines = capfd.readouterr().out.splitlines()
+    row = next(line for line in lines if line.startswith("time_offset "))
+    for part in ("0.0042", "0.00011", "1.4", "0.22", "geometry_rms_px", "timestamp_reference (0.23)"):
+        assert part in row
+    assert "time_offset: the clocks are 4 ms apart" in lines
+    assert any("gyro_bias_rad_s[1]" in line and "-0.02" in line for line in lines)
+    assert "unexplained: something goes on along radius" in lines
+    assert "note: blur was not judged: too little of it" in lines
+    assert lines[-1] == "verdict: unexplained"
+
+
+def test_json_is_one_line_with_the_account(tiny: Path, tmp_path: Path, ladder, capfd) -> None:
+    """Standard output holds the content of diagnosis.json and nothing else."""
+    ladder("explained", offset_cause())
+    assert run(tiny, "--out", tmp_path / "out", "--json") == 0
+    out = capfd.readouterr().out
+    assert len(out.splitlines()) == 1
+    assert json.loads(out) == json.loads((tmp_path / "out/tiny/diagnosis.json").read_text())
+
+
+@pytest.mark.parametrize(("verdict", "code"), [("consistent", 0), ("explained", 10), ("unexplained", 10)])
+def test_check_fails_unless_consistent(tiny: Path, tmp_path: Path, ladder, verdict: str, code: int) -> None:
+    """--check: 10 for anything but consistent; the files are written all the same."""
+    ladder(verdict, *([offset_cause()] if verdict == "explained" else []))
+    assert run(tiny, "--out", tmp_path / "out", "--check") == code
+    facts = json.loads((tmp_path / "out/tiny/diagnosis.json").read_text())
+    assert facts["verdict"] == verdict
+    assert len(facts["causes"]) == (verdict == "explained")
+
+
+def test_a_diagnosis_is_not_replaced_unasked(tiny: Path, tmp_path: Path, ladder) -> None:
+    """Exit 8 before any work; --overwrite replaces it, and figures of causes that are gone go too."""
+    ladder("explained", offset_cause())
+    out = tmp_path / "out"
+    assert run(tiny, "--out", out) == 0
+    (out / "tiny/figures/mine.png").write_bytes(b"mine")
+    before = (out / "tiny/diagnosis.json").read_bytes()
+    ladder(error=AssertionError("no work is done"))
+    assert run(tiny, "--out", out) == 8
+    assert (out / "tiny/diagnosis.json").read_bytes() == before
+    ladder("consistent")
+    assert run(tiny, "--out", out, "--overwrite") == 0
+    assert json.loads((out / "tiny/diagnosis.json").read_text())["verdict"] == "consistent"
+    assert "figures/01_time_offset.png" not in files_in(out / "tiny")
+    assert "figures/mine.png" in files_in(out / "tiny")
+
+
+def test_a_run_of_the_same_name_is_no_obstacle(tiny: Path, tmp_path: Path, ladder) -> None:
+    """The diagnosis goes beside the pictures of `process`, which stay."""
+    out = tmp_path / "out"
+    assert cli.run(["process", str(tiny), "--out", str(out), "--frames", "2:4", "--jobs", "1", "-q"]) == 0
+    before = {name: (out / "tiny" / name).read_bytes() for name in files_in(out / "tiny")}
+    ladder("consistent")
+    assert run(tiny, "--out", out) == 0
+    assert before == {name: (out / "tiny" / name).read_bytes() for name in before}
+    assert "diagnosis.json" in files_in(out / "tiny")
+
+
+def test_nothing_half_written_stays(tiny: Path, tmp_path: Path, ladder, monkeypatch) -> None:
+    """A disk that fills up at the last file leaves neither figures nor folders; exit 8."""
+    ladder("explained", offset_cause())
+    write = diagnose.write_whole
+
+    def fill_up(path: Path, data: bytes) -> None:
+        if path.name == "diagnosis.json":
+            raise OutputError("no space left")
+        write(path, data)
+
+    monkeypatch.setattr(diagnose, "write_whole", fill_up)
+    out = tmp_path / "out"
+    out.mkdir()
+    assert run(tiny, "--out", out) == 8
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(CalibrationError("too little motion"), 6), (OutputError("locked"), 8), (ValueError("ours"), 1)]
+)
+def test_a_ladder_that_fails_gives_its_own_code(tiny: Path, tmp_path: Path, ladder, error, code: int, capfd) -> None:
+    """One line for a known error, and no file."""
+    ladder(error=error)
+    assert run(tiny, "--out", tmp_path / "out") == code
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert "error" in captured.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_read_is_said(tiny: Path, tmp_path: Path, ladder) -> None:
+    """No such capture: 4; a profile of another size: 3; an output that is a file: 8; no argument: 2."""
+    ladder("consistent")
+    assert run(tmp_path / "nowhere", "--out", tmp_path / "out") == 4
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text((tiny / "camera.yaml").read_text().replace("width: 160", "width: 320"))
+    assert run(tiny, "--config", wrong, "--out", tmp_path / "out") == 3
+    assert run(tiny, "--config", tmp_path / "none.yaml", "--out", tmp_path / "out") == 3
+    (tmp_path / "file").write_text("x")
+    assert run(tiny, "--out", tmp_path / "file") == 8
+    assert run() == 2
+    assert not (tmp_path / "out").exists()

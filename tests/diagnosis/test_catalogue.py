@@ -1,0 +1,36 @@
+"""Every cause that can be hidden can be found."""
+
+from __future__ import annotations
+
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.catalogue import CATALOGUE
+from virest.diagnosis.findings import BLUR, GEOMETRY, PHOTOMETRY
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
+from virest.diagnosis.local_blur_fit import Defocus, ExposureTime
+from virest.diagnosis.photometry_effects import BlackLevel, Flicker, ResponseGamma, Vignetting
+from virest.simulation.effects import effect_names
+
+SPECIAL = {"scene_depth", "frame_lag"}
+"""Judged with the points, without being a term of their fit: a plane, and other stamps."""
+
+
+def test_the_simulator_hides_what_the_catalogue_names_and_nothing_else() -> None:
+    """22 effects on both sides."""
+    assert set(effect_names()) == set(CATALOGUE)
+    assert len(CATALOGUE) == 22
+
+
+def test_every_named_cause_has_somebody_who_looks_for_it() -> None:
+    """Points, brightness and blur share the catalogue between them."""
+    points = {effect.name for effect in GEOMETRIC_EFFECTS} | SPECIAL
+    light = {effect().name for effect in (ResponseGamma, BlackLevel, Vignetting, Flicker)} | {"gain_drift"}
+    blur = {effect().name for effect in (ExposureTime, Defocus)}
+    for quantity, seekers in ((GEOMETRY, points), (PHOTOMETRY, light), (BLUR, blur)):
+        assert {name for name, cause in CATALOGUE.items() if cause.shows_in == quantity} == seekers
+
+
+def test_a_geometric_cause_reads_the_parameters_that_the_catalogue_lists() -> None:
+    """Names in findings are the contract's."""
+    profile = CameraProfile(640, 480, time_offset_s=0.0)
+    for effect in GEOMETRIC_EFFECTS:
+        assert tuple(effect.read(profile)) == CATALOGUE[effect.name].parameters, effect.name

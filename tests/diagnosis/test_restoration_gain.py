@@ -1,0 +1,109 @@
+"""What a better model does for restored pictures, without truth."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from virest.app.simulate import simulate_command
+from virest.camera.profile import read_profile
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.video import probe_movie, read_frames, read_gray
+from virest.diagnosis.restoration_gain import chosen_pairs, measure_restoration_gain, shared_gradient
+from virest.motion.tracking import track_pairs
+
+WHOLE = (0, 0, 320, 240)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Captures of a readout that is too long in the profile, and of a defocus that it does not know."""
+
+    def read(name, effect):
+        folder: Path = tmp_path_factory.mktemp("gain") / name
+        size = {"width": 320, "height": 240, "frames": 14, "exposure_ms": 14.0, "readout_ms": 24.0}
+        simulate_command(folder, **size, rate_rad_s=1.6, seed=8, effects=[effect], crf=14.0)
+        capture = read_capture(folder)
+        return capture, resolve_profile(capture)[0], read_profile(folder / "truth/camera.yaml")
+
+    return {"readout": read("readout", "readout_time=0.010"), "defocus": read("defocus", "defocus=1.6")}
+
+
+def readers(capture):
+    """Colour and luma of the frames asked for."""
+    index = probe_movie(capture.movie)
+    colour = lambda numbers: (p for n in numbers for p in read_frames(capture.movie, index, n, n))  # noqa: E731
+    return colour, lambda numbers: read_gray(capture.movie, index, numbers)
+
+
+def textured(rng, sigma=1.2):
+    """A picture of blobs, (240, 320, 3)."""
+    noise = cv2.GaussianBlur(rng.normal(size=(240, 320)), (0, 0), sigma)
+    grey = np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def shared(first, second):
+    """Shared gradient energy of two whole pictures."""
+    tracks = track_pairs([(4, first[..., 0].copy()), (5, second[..., 0].copy())])[0]
+    return shared_gradient((first, second), (WHOLE, WHOLE), tracks)
+
+
+def test_noise_is_no_sharpness(rng):
+    """Noise of its own in each picture raises the plain gradient energy by a fifth and more, the shared one never."""
+    clean = textured(rng, 4.0)
+    pair = clean, np.roll(clean, (1, 2), (0, 1))
+    noise = [rng.normal(0, 10, (240, 320, 1)) for _ in pair]
+    noisy = [np.clip(p + n, 0, 255).astype(np.uint8) for p, n in zip(pair, noise, strict=True)]
+    own = [float(np.mean(cv2.Sobel(p[..., 0], cv2.CV_32F, 1, 0, scale=1 / 8) ** 2)) for p in (clean, noisy[0])]
+    assert own[1] > 1.2 * own[0]
+    assert 0.5 * shared(*pair) < shared(*noisy) < shared(*pair)
+
+
+def test_blur_lowers_what_is_shared(rng):
+    """A Gaussian of 1.5 px on both pictures costs more than half of it."""
+    sharp = textured(rng)
+    moved = np.roll(sharp, (3, -2), (0, 1))
+    soft = [cv2.GaussianBlur(picture, (0, 0), 1.5) for picture in (sharp, moved)]
+    assert shared(*soft) < 0.5 * shared(sharp, moved)
+
+
+def test_pictures_that_cannot_be_laid_on_each_other_share_nothing_known(rng):
+    """Without tracks or without a common area the answer is NaN."""
+    picture = textured(rng)
+    assert np.isnan(shared_gradient((picture, picture), (WHOLE, WHOLE), None))
+    tracks = track_pairs([(4, picture[..., 0].copy()), (5, np.roll(picture[..., 0], 1, 1).copy())])[0]
+    assert np.isnan(shared_gradient((picture, picture), ((0, 0, 100, 240), (200, 0, 320, 240)), tracks))
+
+
+def test_pairs_do_not_overlap_and_have_both_frames(simulated):
+    """Each frame belongs to one pair, repeats to none, and a known start-up gives a pair."""
+    capture, profile, _ = simulated["readout"]
+    firsts = chosen_pairs(capture, profile)
+    assert len(firsts) >= 3
+    assert all(b - a >= 2 for a, b in zip(firsts, firsts[1:], strict=False))
+    assert max(firsts) + 1 < len(capture.frames)
+    early = dataclasses.replace(capture, repeats=(firsts[0] + 1,))
+    assert firsts[0] not in chosen_pairs(early, profile)
+
+
+def test_the_right_readout_makes_neighbours_agree(simulated):
+    """The model's own places of points in the next picture come to tracking's noise; it does so for no other reason."""
+    capture, nominal, true = simulated["readout"]
+    gain = measure_restoration_gain(capture, nominal, true, *readers(capture))
+    assert gain.disagreement_before_px > 0.6
+    assert gain.disagreement_after_px < 0.35
+    assert gain.sharpness_after > gain.sharpness_recorded
+    assert len(gain.frames) == len(set(gain.frames)) >= 6
+
+
+def test_the_right_blur_makes_pictures_sharper(simulated):
+    """Undoing the defocus too shows more than undoing the motion alone, and that more than the recorded pictures."""
+    capture, nominal, true = simulated["defocus"]
+    gain = measure_restoration_gain(capture, nominal, true, *readers(capture))
+    assert gain.sharpness_before > gain.sharpness_recorded
+    assert gain.sharpness_after > 1.08 * gain.sharpness_before
+    same = measure_restoration_gain(capture, nominal, nominal, *readers(capture))
+    assert (same.sharpness_before, same.disagreement_before_px) == (same.sharpness_after, same.disagreement_after_px)

@@ -1,0 +1,301 @@
+"""A phone in a hand, without pictures: tracked points and inertial samples of a motion known in closed form.
+
+Orientation is three angles, position a straight line, both with waves on top: rates and accelerations are derivatives
+by hand.  A point's blurred image is the mean of its path over the exposure (Gauss' three nodes), and its row's time is
+found by fixed-point iteration.  Of the code under test only the records are used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.shutter import Shutter
+from virest.capture.imu import ImuSamples
+from virest.motion.observed_tracks import ObservedTracks
+from virest.motion.scene_motion import InertialMotion
+from virest.motion.track_model import TrackTable, track_table
+from virest.motion.tracking import TrackPair
+from virest.motion.turns import PictureTurns
+
+Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
+GRAVITY_M_S2 = np.array([1.2, 9.7, -0.8]) * 9.81 / np.linalg.norm([1.2, 9.7, -0.8])
+NODES, SHARES = np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6), np.array([5.0, 8.0, 5.0]) / 18
+R_CAM_IMU = Rotation.from_euler("ZYX", [1.61, 0.06, -3.05]).as_matrix()
+"""No axis map: about a quarter turn, and some degrees more."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is recorded, and how."""
+
+    seed: int = 1
+    rate_rad_s: float = 0.6
+    """Typical rate about each axis."""
+    about: Triple = (1.0, 1.0, 1.0)
+    """Part of that rate in yaw (about z), pitch (about y), roll (about x)."""
+    sway_m: float = 0.0
+    velocity_m_s: Triple = (0.0, 0.0, 0.0)
+    plane_per_m: Triple | None = None
+    """m of the wall m · X = 1, seen from the camera's place at the middle; None: no wall."""
+    inverse_depth_per_m: tuple[float, float] = (0.0, 0.0)
+    """Without a wall: each point's lies anywhere between; 0 is infinitely far."""
+    width: int = 480
+    height: int = 640
+    focal_px: float = 520.0
+    centre_px: tuple[float, float] = (233.0, 326.0)
+    k1: float = 0.0
+    focal_drift_per_s: float = 0.0
+    stabilised: tuple[float, float] = (0.0, 1.0)
+    """Fraction and cutoff in Hz of the lens's stabiliser."""
+    time_offset_s: float = 0.013
+    clock_skew: float = 0.0
+    gyro_bias_rad_s: Triple = (0.004, -0.006, 0.003)
+    gyro_scale: float = 1.0
+    r_cam_imu: tuple[Triple, ...] = tuple(map(tuple, R_CAM_IMU.tolist()))  # type: ignore[assignment]
+    arm_m: Triple = (0.0, 0.0, 0.0)
+    accel_bias_m_s2: Triple = (0.05, -0.08, 0.03)
+    accel_delay_s: float = 0.0
+    accelerometer: bool = True
+    gyro_noise_rad_s: float = 0.0
+    readout_time_s: float = 0.0207
+    readout_direction: str = "right_to_left"
+    timestamp: str = "exposure_start"
+    exposure_s: float = 0.008
+    exposure_swing: float = 0.3
+    """Exposures vary by this part of themselves."""
+    frames: int = 30
+    points: int = 40
+    noise_px: float = 0.1
+    outliers: float = 0.0
+    """Part of the points on an object that moves by itself."""
+
+
+@dataclass(frozen=True)
+class Waves:
+    """A sum of sines for each of three coordinates, and its derivatives."""
+
+    amplitude: Array
+    """(m, 3)."""
+    omega: Array
+    """(m, 3) rad/s."""
+    phase: Array
+    """(m, 3)."""
+
+    def at(self, time_s: Array, order: int = 0) -> Array:
+        """(..., 3) at times (...)."""
+        angle = np.asarray(time_s, float)[..., None, None] * self.omega + self.phase + order * np.pi / 2
+        return (self.amplitude * self.omega**order * np.sin(angle)).sum(axis=-2)
+
+
+class Recording:
+    """The truth, and what an estimator is given."""
+
+    def __init__(self, setup: Setup) -> None:
+        self.setup = setup
+        rng = np.random.default_rng(setup.seed)
+        omega = 2 * np.pi * rng.uniform(0.5, 4.5, (5, 3))
+        rates = rng.uniform(0.5, 1.0, (5, 3))
+        rates *= np.array(setup.about) * setup.rate_rad_s / np.sqrt(0.5 * (rates**2).sum(axis=0))
+        self._angles = Waves(rates / omega, omega, rng.uniform(0, 2 * np.pi, (5, 3)))
+        omega = 2 * np.pi * rng.uniform(0.4, 2.2, (4, 3))
+        lengths = 1 / omega
+        lengths *= setup.sway_m / np.sqrt(0.5 * (lengths**2).sum())
+        self._places = Waves(lengths, omega, rng.uniform(0, 2 * np.pi, (4, 3)))
+        self.stamp_s = np.arange(setup.frames) / 29.7
+        self.exposure_s = setup.exposure_s * (1 + setup.exposure_swing * np.sin(0.9 * np.arange(setup.frames)))
+        self._rng = rng
+
+    # ── the motion, IMU clock ──
+
+    def orientation(self, time_s: Array) -> Rotation:
+        """R_world_cam."""
+        return Rotation.from_euler("ZYX", self._angles.at(time_s).reshape(-1, 3))
+
+    def rate(self, time_s: Array) -> Array:
+        """(n, 3) rad/s, camera axes: the classical rates of yaw, pitch and roll."""
+        (_, b, c), (da, db, dc) = self._angles.at(time_s).T, self._angles.at(time_s, 1).T
+        return np.stack(
+            [
+                dc - da * np.sin(b),
+                db * np.cos(c) + da * np.cos(b) * np.sin(c),
+                da * np.cos(b) * np.cos(c) - db * np.sin(c),
+            ],
+            axis=-1,
+        )
+
+    def position(self, time_s: Array, order: int = 0) -> Array:
+        """Camera's centre (n, 3) or its derivative, world axes."""
+        steady = np.array(self.setup.velocity_m_s)
+        straight = (np.asarray(time_s)[..., None] * steady, steady, 0.0 * steady)[order]
+        return self._places.at(time_s, order) + straight
+
+    def specific_force(self, time_s: Array) -> Array:
+        """What an accelerometer without faults feels (n, 3), camera axes."""
+        arm, rate, step = np.array(self.setup.arm_m), self.rate(time_s), 1e-4
+        turning = (self.rate(time_s + step) - self.rate(time_s - step)) / (2 * step)
+        force = self.orientation(time_s).inv().apply(self.position(time_s, 2) - GRAVITY_M_S2)
+        return force + np.cross(turning, arm) + np.cross(rate, np.cross(rate, arm))
+
+    # ── the recording ──
+
+    @cached_property
+    def imu(self) -> ImuSamples:
+        """Gyroscope and accelerometer at 210 Hz, from a second before the first stamp to one after the last."""
+        setup, to_imu = self.setup, np.array(self.setup.r_cam_imu)
+        time_s = np.arange(-1.0, self.stamp_s[-1] + 1.0, 1 / 210) + setup.time_offset_s
+        gyro = setup.gyro_scale * self.rate(time_s) @ to_imu + np.array(setup.gyro_bias_rad_s)
+        gyro = gyro + np.random.default_rng(setup.seed + 90).normal(0, 1, gyro.shape) * setup.gyro_noise_rad_s
+        force = self.specific_force(time_s - setup.accel_delay_s) @ to_imu + np.array(setup.accel_bias_m_s2)
+        return ImuSamples(time_s, gyro, force if setup.accelerometer else np.full_like(force, np.nan))
+
+    @cached_property
+    def profile(self) -> CameraProfile:
+        """All that is true of the phone."""
+        s = self.setup
+        lens = Intrinsics(s.width, s.height, s.focal_px, s.focal_px, *s.centre_px)
+        if s.k1:
+            lens = Intrinsics(
+                s.width, s.height, s.focal_px, s.focal_px, *s.centre_px, "radtan", (s.k1, 0.0, 0.0, 0.0, 0.0)
+            )
+        return CameraProfile(
+            s.width,
+            s.height,
+            intrinsics=lens,
+            shutter=Shutter(s.readout_time_s, s.readout_direction, s.timestamp),
+            r_cam_imu=s.r_cam_imu,
+            p_cam_imu_m=s.arm_m,
+            time_offset_s=s.time_offset_s,
+            clock_skew=s.clock_skew,
+            gyro_bias_rad_s=s.gyro_bias_rad_s,
+            gyro_scale=(s.gyro_scale,) * 3,
+            depth_m=np.inf,
+            extensions=Extensions(s.focal_drift_per_s, *s.stabilised),
+        )
+
+    @cached_property
+    def pairs(self) -> list[TrackPair]:
+        """Points of every two consecutive frames."""
+        s, size = self.setup, np.array([self.setup.width, self.setup.height])
+        first = np.repeat(np.arange(s.frames - 1), s.points)
+        guess_px = self._rng.uniform((10, 10), size - 10, (len(first), 2))
+        time_s = self.seen_s(guess_px, first)
+        plane_ray = (guess_px - s.centre_px) / s.focal_px
+        way = self.orientation(time_s).apply(np.concatenate([plane_ray, np.ones((len(first), 1))], axis=1))
+        start = self.position(time_s)
+        inverse = self._inverse_depth(way, start)
+        first_px, second_px = (self._seen_px(way, start, inverse, frame, guess_px) for frame in (first, first + 1))
+        moving = np.arange(len(first)) % s.points < s.outliers * s.points
+        second_px = second_px + moving[:, None] * np.array([6.0, -4.0]) * np.sin(0.7 * first + 1)[:, None]
+        noisy_px = second_px + self._rng.normal(0, 1, second_px.shape) * s.noise_px
+        inside = np.ones(len(first), bool)
+        for points_px in (first_px, second_px):
+            inside &= (points_px > 0).all(axis=1) & (points_px < size - 1).all(axis=1)
+        rows = [inside & (first == k) for k in range(s.frames - 1)]
+        return [TrackPair(k, k + 1, first_px[use], noisy_px[use]) for k, use in enumerate(rows)]
+
+    @property
+    def observed(self) -> ObservedTracks:
+        """What an estimator's front makes of the pairs."""
+        assert self.profile.intrinsics is not None
+        noise_px = np.full(len(self.pairs), max(self.setup.noise_px, 0.02))
+        return ObservedTracks(tuple(self.pairs), self.stamp_s, self.exposure_s, True, noise_px, self.profile.intrinsics)
+
+    def table(self, windows: list[list[int]] | None = None) -> TrackTable:
+        """All points."""
+        return track_table(self.pairs, self.stamp_s, self.exposure_s, self.observed.noise_px, windows)
+
+    def scene(self, table: TrackTable) -> InertialMotion:
+        """The true motion and wall, in the axes of the gyroscope's trajectory."""
+        origin_s = np.asarray(self.profile.imu_time_s(table.origin_s))
+        arm = np.cross(self.rate(origin_s), self.setup.arm_m)
+        velocity = self.position(origin_s, 1) + self.orientation(origin_s).apply(arm)
+        plane = np.array(self.setup.plane_per_m or (0.0, 0.0, 0.0))
+        moved = (self.position(origin_s) - self._middle) @ plane
+        return InertialMotion(
+            self.in_trajectory_axes(velocity),
+            self.in_trajectory_axes(GRAVITY_M_S2),
+            np.array(self.setup.accel_bias_m_s2),
+            self.setup.accel_delay_s,
+            self.in_trajectory_axes(plane / (1 - moved[:, None])),
+        )
+
+    def turns(self, offset_s: float = 0.0) -> PictureTurns:
+        """Rotation of every pair at its middle row, stamps counted from another zero, without looking at points."""
+        s = self.setup
+        middle = np.array([[(s.width - 1) / 2, (s.height - 1) / 2]])
+        seen = np.concatenate([self.seen_s(middle, np.array([k])) for k in range(s.frames)])
+        after, before = self.orientation(seen[1:]), self.orientation(seen[:-1])
+        camera_s = (seen - s.time_offset_s) / (1 + s.clock_skew) + offset_s
+        return PictureTurns(camera_s[:-1], camera_s[1:], (after.inv() * before).as_rotvec())
+
+    def in_trajectory_axes(self, vectors: Array) -> Array:
+        """Turn world vectors into the camera's axes at the first inertial sample."""
+        return self.orientation(self.imu.time_s[:1])[0].inv().apply(vectors)
+
+    def seen_s(self, points_px: Array, frame: NDArray[np.intp]) -> Array:
+        """IMU clock of the middle of the exposure of the rows through the points (n, 2) of frames (n,)."""
+        s = self.setup
+        along = {
+            "top_to_bottom": points_px[:, 1] / s.height,
+            "bottom_to_top": 1 - (points_px[:, 1] + 1) / s.height,
+            "left_to_right": points_px[:, 0] / s.width,
+            "right_to_left": 1 - (points_px[:, 0] + 1) / s.width,
+        }[s.readout_direction]
+        before = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}[s.timestamp]
+        camera_s = self.stamp_s[frame] + along * s.readout_time_s + (0.5 - before) * self.exposure_s[frame]
+        return camera_s * (1 + s.clock_skew) + s.time_offset_s
+
+    @cached_property
+    def _shift(self) -> tuple[Array, Array]:
+        """The stabiliser's shift (m, 2) in units of the focal length: a high-pass in steps of 0.2 ms."""
+        fraction, cutoff_hz = self.setup.stabilised
+        time_s = np.arange(self.imu.time_s[0], self.imu.time_s[-1], 2e-4)
+        decay = np.exp(-2 * np.pi * cutoff_hz * 2e-4)
+        theta = lfilter([2e-4 * np.sqrt(decay)], [1.0, -decay], self.rate(time_s + 1e-4), axis=0)
+        return time_s + 2e-4, fraction * theta[:, [1, 0]] * (1.0, -1.0)
+
+    @property
+    def _middle(self) -> Array:
+        middle_s = np.array([0.5 * (self.stamp_s[0] + self.stamp_s[-1])])
+        return self.position(middle_s * (1 + self.setup.clock_skew) + self.setup.time_offset_s)[0]
+
+    def _inverse_depth(self, way: Array, start: Array) -> Array:
+        if self.setup.plane_per_m is None:
+            return self._rng.uniform(*self.setup.inverse_depth_per_m, len(way))
+        plane = np.array(self.setup.plane_per_m)
+        return (way @ plane) / (1 - (start - self._middle) @ plane)
+
+    def _seen_px(self, way: Array, start: Array, inverse: Array, frame: NDArray[np.intp], guess_px: Array) -> Array:
+        points_px = guess_px
+        for _ in range(7):
+            middle_s = self.seen_s(points_px, frame)
+            times = [middle_s + node * self.exposure_s[frame] for node in NODES]
+            points_px = sum(  # type: ignore[assignment]
+                share * self._project(way, start, inverse, time_s) for share, time_s in zip(SHARES, times, strict=True)
+            )
+        return points_px
+
+    def _project(self, way: Array, start: Array, inverse: Array, time_s: Array) -> Array:
+        s = self.setup
+        local = self.orientation(time_s).inv().apply(way + (start - self.position(time_s)) * inverse[:, None])
+        plane = local[:, :2] / local[:, 2:]
+        if s.stabilised[0]:
+            plane = plane + np.stack([np.interp(time_s, self._shift[0], way) for way in self._shift[1].T], axis=-1)
+        bent = plane * (1 + s.k1 * (plane**2).sum(axis=1, keepdims=True))
+        focal_px = s.focal_px * (1 + s.focal_drift_per_s * time_s[:, None])
+        return bent * focal_px + s.centre_px
+
+
+@lru_cache(maxsize=16)
+def recorded(setup: Setup) -> Recording:
+    """Make each recording once."""
+    return Recording(setup)

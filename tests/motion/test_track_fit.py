@@ -1,0 +1,225 @@
+"""Terms recovered from noisy tracks, deviations that hold, outliers, priors, walls, windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_tracks import Recording, Setup, recorded
+
+from virest.camera.profile import CameraProfile
+from virest.errors import ImuError
+from virest.motion import profile_terms as terms_of
+from virest.motion.scene_motion import InertialMotion
+from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
+from virest.motion.track_model import ground
+
+Array = np.ndarray
+BASIC = (terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS)
+ASIDE = {
+    "time_offset": (0.0063,),
+    "readout_time": (-0.0042,),
+    "imu_rotation": (0.012, -0.021, 0.016),
+    "gyro_bias": (0.013, 0.021, -0.008),
+    "gyro_scale": (0.021,),
+    "focal_length": (-0.034,),
+    "radial_distortion": (0.027,),
+    "principal_point": (5.0, -8.0),
+    "clock_skew": (0.0011,),
+    "exposure_time": (0.21,),
+    "focal_drift": (0.012,),
+    "stabilisation": (-0.16, 0.22),
+}
+"""How far each term of a spoilt profile lies from the truth."""
+PORTRAIT = Setup(seed=11, gyro_noise_rad_s=0.001, frames=40)
+LANDSCAPE = Setup(
+    seed=12, width=640, height=480, centre_px=(331.0, 226.0), readout_direction="top_to_bottom", frames=40,
+    timestamp="exposure_end", gyro_noise_rad_s=0.001, k1=0.04, gyro_scale=0.98, clock_skew=0.0013, exposure_swing=0.6,
+)  # fmt: skip
+FLIPPED = Setup(seed=13, readout_direction="bottom_to_top", focal_drift_per_s=0.03, stabilised=(0.5, 0.8), frames=40)
+WALL = Setup(
+    seed=14, sway_m=0.06, plane_per_m=(0.1, -0.15, 0.5), velocity_m_s=(0.1, -0.2, 0.15), gyro_noise_rad_s=0.001,
+    readout_direction="left_to_right", frames=45, arm_m=(0.03, -0.05, 0.01), points=30,
+)  # fmt: skip
+
+
+def spoilt(profile: CameraProfile, terms: Sequence[Term]) -> CameraProfile:
+    """The true profile with each term put aside."""
+    for term in terms:
+        profile = term.change(profile, np.array(ASIDE[term.name]))
+    return profile
+
+
+def errors(fitted: TrackFit) -> Array:
+    """Fitted changes less those that lead back to the truth."""
+    return fitted.change + np.concatenate([ASIDE[term.name] for term in fitted.terms])
+
+
+def deviations(fitted: TrackFit) -> Array:
+    """Standard deviations of all terms' values."""
+    return np.concatenate([fitted.std(term.name) for term in fitted.terms])
+
+
+def fitted_from(recording: Recording, terms: Sequence[Term]) -> TrackFit:
+    """Fit turning only, from a spoilt profile."""
+    return fit_tracks(recording.imu, recording.table(), spoilt(recording.profile, terms), terms)
+
+
+def fitted_wall(recording: Recording, terms: Sequence[Term], windows: list[list[int]] | None = None) -> TrackFit:
+    """Fit with the accelerometer's path, from a spoilt profile and a scene that knows nothing."""
+    profile, table = spoilt(recording.profile, terms), recording.table(windows)
+    scene = start_scene(recording.imu, ground(recording.imu, profile, translation=True), table, 0.7)
+    return fit_tracks(recording.imu, table, profile, terms, scene)
+
+
+# ── terms ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("setup", "terms"),
+    [
+        (PORTRAIT, (*BASIC, terms_of.FOCAL)),
+        (PORTRAIT, (terms_of.PRINCIPAL_POINT, terms_of.READOUT, terms_of.TIME_OFFSET)),
+        (LANDSCAPE, (*BASIC, terms_of.K1, terms_of.CLOCK_SKEW)),
+        (LANDSCAPE, (terms_of.GYRO_SCALE, terms_of.EXPOSURE_SCALE)),
+        (FLIPPED, (terms_of.TIME_OFFSET, terms_of.GYRO_BIAS, terms_of.FOCAL_DRIFT, terms_of.STABILISATION)),
+    ],
+    ids=lambda value: "-".join(t.name for t in value) if isinstance(value, tuple) else "",
+)
+def test_every_term_is_found(setup: Setup, terms: tuple[Term, ...]) -> None:
+    """Each value within four deviations of the truth, a small part of what it was put aside by, nothing left over."""
+    fitted = fitted_from(recorded(setup), terms)
+    assert fitted.scale == pytest.approx(1.0, abs=0.08)
+    assert (np.abs(errors(fitted)) < 4 * deviations(fitted) + 1e-9).all()
+    assert (deviations(fitted) < 0.2 * np.abs(errors(fitted) - fitted.change)).all()
+    assert set(fitted.slices) == {term.name for term in terms}
+
+
+def test_a_readout_of_the_wrong_sense_is_found_through_nought() -> None:
+    """Begun as a global shutter read upwards, a picture read downwards ends with a readout below nought."""
+    recording = recorded(replace(LANDSCAPE, clock_skew=0.0))
+    shutter = replace(recording.profile.shutter, readout_time_s=0.0, readout_direction="bottom_to_top")
+    start = replace(recording.profile, shutter=shutter)
+    fitted = fit_tracks(recording.imu, recording.table(), start, (terms_of.TIME_OFFSET, terms_of.READOUT))
+    assert fitted.profile.shutter.readout_time_s == pytest.approx(-LANDSCAPE.readout_time_s, abs=2e-4)
+    assert fitted.scale == pytest.approx(1.0, abs=0.08)
+
+
+def test_deviations_hold() -> None:
+    """Over 20 hands and noises the errors are about as large as the deviations say, none many times larger."""
+    scores = []
+    for seed in range(200, 220):
+        fitted = fitted_from(Recording(Setup(seed=seed, frames=25, points=20, gyro_noise_rad_s=0.0005)), BASIC)
+        scores.append(errors(fitted) / deviations(fitted))
+    score = np.array(scores)
+    assert score.shape == (20, 8)
+    assert 0.7 < np.sqrt(np.mean(score**2)) < 1.45
+    assert np.mean(np.abs(score) < 2) > 0.85
+    assert (np.abs(score) < 5).all()
+
+
+def test_a_third_of_the_points_on_something_else_does_no_harm() -> None:
+    """Values stay within five deviations, and the weights tell which points moved by themselves."""
+    recording = recorded(replace(PORTRAIT, outliers=1 / 3))
+    fitted = fitted_from(recording, BASIC)
+    assert (np.abs(errors(fitted)) < 5 * deviations(fitted)).all()
+    clean = recorded(PORTRAIT)
+    honest = fitted_from(clean, BASIC)
+    assert (deviations(fitted) < 4 * deviations(honest)).all()
+    step = np.linalg.norm(fitted.difference_px, axis=1)
+    assert np.mean(step > 2) > 0.2
+    assert fitted.weight[step > 2].max() < 0.1
+    assert np.median(fitted.weight[step < 0.3]) > 0.7
+
+
+def test_a_prior_holds_a_term_to_where_it_began() -> None:
+    """A prior as sharp as the data goes half way; one much sharper stays; one much wider goes all the way."""
+    recording = recorded(PORTRAIT)
+    start = terms_of.shift_offset(recording.profile, np.array([0.0002]))
+    free = fit_tracks(recording.imu, recording.table(), start, (terms_of.TIME_OFFSET,))
+    alone = float(np.sqrt(free.curvature[0, 0]))
+    way = float(free.change[0])
+    for std, part in ((alone, 0.5), (0.05 * alone, 1 / 401), (3 * alone, 0.9)):
+        term = replace(terms_of.TIME_OFFSET, prior_std=(std,))
+        held = fit_tracks(recording.imu, recording.table(), start, (term,))
+        assert held.change[0] == pytest.approx(part * way, abs=0.04 * abs(way))
+
+
+def test_nothing_to_fit_changes_nothing() -> None:
+    """Without terms the profile is judged as it is: the differences of a wrong offset stay."""
+    recording = recorded(PORTRAIT)
+    wrong = terms_of.shift_offset(recording.profile, np.array([0.01]))
+    judged = fit_tracks(recording.imu, recording.table(), wrong, (), max_iterations=0)
+    truth = fit_tracks(recording.imu, recording.table(), recording.profile, (), max_iterations=0)
+    assert judged.profile == wrong
+    assert judged.scale > 10 * truth.scale
+    assert judged.cost > 5 * truth.cost
+    np.testing.assert_allclose(judged.distance, np.linalg.norm(judged.difference_px, axis=1) / PORTRAIT.noise_px)
+
+
+# ── walls ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_path_before_a_wall_is_found_with_the_profile() -> None:
+    """Swaying before a wall: turning alone leaves much, the accelerometer's path nothing; both are found."""
+    recording = recorded(WALL)
+    plain = fitted_from(recording, BASIC)
+    fitted = fitted_wall(recording, BASIC)
+    assert plain.scale > 2
+    assert fitted.scale == pytest.approx(1.0, abs=0.08)
+    assert (np.abs(errors(fitted)) < 4 * deviations(fitted)).all()
+    truth = recording.scene(recording.table())
+    assert isinstance(fitted.scene, InertialMotion)
+    spread = np.sqrt(np.diag(fitted.covariance))[8:]
+    assert (np.abs(fitted.scene.vector() - truth.vector()) < 4.5 * spread).all()
+    assert spread[7:10].max() < 0.3
+    assert np.linalg.norm(fitted.scene.plane_per_m[0] - truth.plane_per_m[0]) < 0.2
+
+
+def test_two_windows_have_a_velocity_and_a_plane_each() -> None:
+    """The same wall seen from two places, found for each window as the truth of that window."""
+    recording = recorded(WALL)
+    windows = [list(range(20)), list(range(20, 44))]
+    fitted = fitted_wall(recording, BASIC[:1], windows)
+    truth = recording.scene(recording.table(windows))
+    assert isinstance(fitted.scene, InertialMotion)
+    assert fitted.scene.windows == 2
+    assert np.abs(np.diff(truth.velocity_m_s, axis=0)).max() > 0.05
+    spread = np.sqrt(np.diag(fitted.covariance))[1:]
+    assert (np.abs(fitted.scene.vector() - truth.vector()) < 4.5 * spread).all()
+    assert fitted.scale == pytest.approx(1.0, abs=0.08)
+
+
+def test_points_off_the_wall_widen_the_depths_and_not_the_errors() -> None:
+    """Points strewn between 1/0.3 and 1/0.7 m, sheared by no plane: a spread is measured, the offset still holds."""
+    setup = replace(WALL, plane_per_m=None, inverse_depth_per_m=(0.3, 0.7), sway_m=0.1)
+    fitted = fitted_wall(recorded(setup), BASIC[:1])
+    flat = fitted_wall(recorded(replace(WALL, sway_m=0.1)), BASIC[:1])
+    assert 0.05 < fitted.depth_spread_per_m < 0.25
+    assert flat.depth_spread_per_m < 0.03
+    assert abs(errors(fitted)[0]) < 4 * deviations(fitted)[0]
+
+
+def test_a_wall_needs_an_accelerometer() -> None:
+    """Without one there is no path to fit, and the message says what to do."""
+    recording = recorded(WALL)
+    table = recording.table()
+    blind = replace(recording.imu, accel_m_s2=np.full_like(recording.imu.accel_m_s2, np.nan))
+    with pytest.raises(ImuError, match="no accelerometer"):
+        fit_tracks(blind, table, recording.profile, BASIC[:1], recording.scene(table))
+
+
+def test_the_scene_begins_with_gravity_down() -> None:
+    """At rest, before a plane across the view, with gravity of 9.81 m/s² within ten degrees of the truth."""
+    recording = recorded(WALL)
+    table = recording.table()
+    scene = start_scene(recording.imu, ground(recording.imu, recording.profile, translation=True), table, 0.4)
+    truth = recording.scene(table)
+    assert np.linalg.norm(scene.gravity_m_s2) == pytest.approx(9.81)
+    assert scene.gravity_m_s2 @ truth.gravity_m_s2 / 9.81**2 > np.cos(np.radians(10))
+    assert not scene.velocity_m_s.any()
+    origin_s = np.asarray(recording.profile.imu_time_s(table.origin_s))
+    sight = recording.in_trajectory_axes(recording.orientation(origin_s).apply([0.0, 0.0, 0.4]))
+    np.testing.assert_allclose(scene.plane_per_m, sight, atol=1e-4)

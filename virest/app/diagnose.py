@@ -1,0 +1,401 @@
+"""``virest diagnose CAPTURE``: what the model gets wrong, why, what to add, and what that gains."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.app.console import table
+from virest.app.outputs import capture_name, output_error, plain, write_whole
+from virest.app.recreate import restored_scene
+from virest.camera.profile import CameraProfile, format_profile
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.records import Capture
+from virest.capture.video import probe_movie, read_frames, read_gray
+from virest.diagnosis.findings import CONSISTENT, Diagnosis, Finding, Remaining, Rung
+from virest.diagnosis.restoration_gain import RestorationGain, chosen_pairs, measure_restoration_gain
+from virest.errors import OutputError, VirestError
+from virest.report.figures import comparison_figure, ladder_figure, residual_figure
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.settings import PRESETS
+from virest.simulation.recreation import recreate_session
+from virest.simulation.session import SessionSettings, render_picture
+
+log = logging.getLogger(__name__)
+
+Json = dict[str, Any]
+Picture = NDArray[np.uint8]
+Progress = Callable[[str, float], None]
+Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
+
+SCHEMA = "virest/diagnosis/1"
+DIAGNOSIS, EXTENDED, FIGURES = "diagnosis.json", "extended.yaml", "figures"
+OWN_FIGURES = re.compile(r"(pictures|residuals|ladder|\d\d_[a-z_]+)\.png")
+NOT_CONSISTENT = 10
+LADDER_PART, GAIN_PART = 0.85, 0.95
+"""Where the ladder and the restorations end on the way from 0 to 1."""
+SHOWN_COMPONENTS = 4
+"""Longer lists are summed up."""
+MAX_RUNGS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisOptions:
+    """What one ``virest diagnose`` was asked for, beside the capture."""
+
+    out: Path
+    config: Path | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisOutcome:
+    """What came of it."""
+
+    facts: Json
+    """The content of diagnosis.json."""
+    text: str
+    """The same for people."""
+    verdict: str
+
+    @property
+    def check_code(self) -> int:
+        """Exit code with ``--check``."""
+        return 0 if self.verdict == CONSISTENT else NOT_CONSISTENT
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A capture that was read, and how to have its pictures."""
+
+    capture: Capture
+    profile: CameraProfile
+    pictures: Reader
+    gray: Reader
+
+
+def run_diagnosis(path: str, options: DiagnosisOptions, progress: Progress | None = None) -> DiagnosisOutcome:
+    """Diagnose one capture and write DIR/<capture>/diagnosis.json, extended.yaml and figures.
+
+    progress: told of each stage and of the part that is done.  Raises CaptureError, SettingsError, CalibrationError,
+    OutputError; nothing is written then.
+    """
+    say = progress or (lambda _stage, _part: None)
+    folder = Path(options.out) / capture_name(path)
+    require_free(folder, options.overwrite)
+    source = _open(Path(path), options.config)
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part))
+    say("restoring", LADDER_PART)
+    gain = measure_restoration_gain(
+        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray
+    )
+    say("figures", GAIN_PART)
+    files, drawn = draw_figures(source.capture, found)
+    facts = as_json(found, gain, drawn)
+    files[EXTENDED] = extended_text(source.capture.name, found).encode()
+    files[DIAGNOSIS] = (json.dumps(facts, allow_nan=False, indent=2) + "\n").encode()
+    _write_all(folder, files)
+    say("done", 1.0)
+    text = describe(source.capture.name, found, gain, folder)
+    return DiagnosisOutcome(facts, text, found.verdict)
+
+
+def climb(source: _Source, progress: Progress) -> Diagnosis:
+    """The ladder itself."""
+    from virest.diagnosis.ladder import diagnose_capture
+
+    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress)
+
+
+def require_free(folder: Path, overwrite: bool) -> None:
+    """Raise OutputError, before any work, for what stands in the way; a run of `process` does not."""
+    for place in (folder.parent, folder, folder / FIGURES):
+        if place.exists() and not place.is_dir():
+            raise OutputError(f"{place}: is a file", hint="choose another folder with --out")
+    if (folder / FIGURES).is_symlink():
+        raise OutputError(f"{folder / FIGURES}: is a link", hint="choose another folder with --out")
+    for name in (DIAGNOSIS, EXTENDED):
+        if (folder / name).is_dir():
+            raise OutputError(f"{folder / name}: is a folder", hint="choose another folder with --out")
+    if (folder / DIAGNOSIS).exists() and not overwrite:
+        raise OutputError(
+            f"{folder}: holds a diagnosis", hint="--overwrite replaces it, --out chooses another folder"
+        )  # fmt: skip
+
+
+def _open(path: Path, config: Path | None) -> _Source:
+    capture = read_capture(path)
+    for note in capture.notes:
+        log.log(logging.INFO if note.severity == "info" else logging.WARNING, "%s: %s", capture.name, note.text)
+    profile, origin = resolve_profile(capture, config)
+    log.info("%s: camera profile from %s", capture.name, origin)
+    index = probe_movie(capture.movie)
+
+    def pictures(numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
+        for first, last in _runs(numbers):
+            yield from read_frames(capture.movie, index, first, last)
+
+    def gray(numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
+        return read_gray(capture.movie, index, numbers)
+
+    return _Source(capture, profile, pictures, gray)
+
+
+def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers, rising."""
+    if not len(numbers):
+        return []
+    rising = np.unique(np.asarray(numbers))
+    parts = np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts]
+
+
+# ── diagnosis.json ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def as_json(found: Diagnosis, gain: RestorationGain, figures: Sequence[Sequence[str]]) -> Json:
+    """The content of diagnosis.json; figures: paths for each cause, relative to the file."""
+    nominal = found.nominal
+    content = {
+        "schema": SCHEMA,
+        "verdict": found.verdict,
+        "nominal": {
+            "geometry_rms_px": nominal.geometry_rms_px,
+            "geometry_noise_px": nominal.geometry_noise_px,
+            "photometric_rms": nominal.photometric_rms,
+            "blur_rms_px": nominal.blur_rms_px,
+            "tracks": nominal.tracks,
+            "frames": nominal.frames,
+        },
+        "causes": [_cause(cause, paths) for cause, paths in zip(found.causes, figures, strict=True)],
+        "unexplained": {
+            "p_value": found.unexplained.p_value,
+            "strongest_along": found.unexplained.strongest_along,
+        },
+        "restoration_gain": dataclasses.asdict(gain),
+        "extended_profile": EXTENDED,
+    }
+    facts: Json = plain(content)
+    return facts
+
+
+def _cause(cause: Finding, figures: Sequence[str]) -> Json:
+    held_out = cause.held_out
+    return {
+        "name": cause.name,
+        "parameters": {
+            name: {"nominal": change.nominal, "estimate": change.estimate, "std": change.std}
+            for name, change in cause.parameters.items()
+        },
+        "held_out": {
+            "quantity": held_out.quantity,
+            "before": held_out.before,
+            "after": held_out.after,
+            "gain": held_out.gain,
+        },
+        "rivals": [{"name": rival.name, "held_out_after": rival.held_out_after} for rival in cause.rivals],
+        "p_value": cause.p_value,
+        "figures": list(figures),
+    }
+
+
+# ── extended.yaml ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def extended_text(name: str, found: Diagnosis) -> str:
+    """The profile with every cause built in, each with its standard deviation among the estimates."""
+    profile = found.extended_profile
+    for cause in found.causes:
+        for parameter, change in cause.parameters.items():
+            if np.size(change.estimate) <= SHOWN_COMPONENTS:
+                estimate, std = plain(change.estimate), _plain_std(change.std)
+                profile = profile.with_estimate(parameter, estimate, std, f"virest diagnose, {cause.name}")
+    names = ", ".join(cause.name for cause in found.causes) or "nothing to add"
+    head = f"Camera profile by virest diagnose, from {name}: {found.verdict}: {names}"
+    return f"# {' '.join(head.split())}\n{format_profile(profile)}"
+
+
+def _plain_std(std: Any) -> Any:
+    """A standard deviation as the profile takes it; None where there is none."""
+    if std is None or not np.all(np.isfinite(np.asarray(std, float))):
+        return None
+    return plain(np.asarray(std, float))
+
+
+# ── figures ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def draw_figures(capture: Capture, found: Diagnosis) -> tuple[dict[str, bytes], list[list[str]]]:
+    """PNG files by their path below the capture's folder, and the paths that belong to each cause."""
+    files: dict[str, bytes] = {}
+    before, after = found.residuals.get("before"), found.residuals.get("after")
+    if before and after:
+        files[f"{FIGURES}/residuals.png"] = residual_figure(
+            before, after, f"{capture.name}: tracked − predicted points"
+        )
+    if found.ladder:
+        rungs = [_bars(rung) for rung in found.ladder[:MAX_RUNGS]]
+        files[f"{FIGURES}/ladder.png"] = ladder_figure(rungs, f"{capture.name}: what was tried")
+    pictures = _pictures_figure(capture, found)
+    if pictures is not None:
+        files[f"{FIGURES}/pictures.png"] = pictures
+    common = list(files)
+    drawn = []
+    for number, cause in enumerate(found.causes, start=1):
+        rung = next((rung for rung in found.ladder if rung.entered == cause.name), None)
+        own = f"{FIGURES}/{number:02d}_{cause.name}.png"
+        if rung is not None:
+            files[own] = ladder_figure([_bars(rung)], f"{capture.name}: {cause.name}")
+        drawn.append([*([own] if rung is not None else []), *common])
+    return files, drawn
+
+
+def _bars(rung: Rung) -> tuple[str, float, dict[str, float], str | None]:
+    return rung.quantity, rung.before, rung.tried, rung.entered
+
+
+def _pictures_figure(capture: Capture, found: Diagnosis) -> bytes | None:
+    """A lively frame against its simulation from its neighbour's restored picture, with either profile."""
+    firsts = chosen_pairs(capture, found.extended_profile)
+    if not firsts:
+        return None
+    number = firsts[len(firsts) // 2]
+    _, measured = next(read_frames(capture.movie, probe_movie(capture.movie), number, number), (number, None))
+    profiles = {"profile as given": found.nominal_profile}
+    if found.causes:
+        profiles["causes built in"] = found.extended_profile
+    rows = []
+    for label, profile in profiles.items():
+        simulated = simulated_frame(capture, profile, number)
+        if measured is not None and simulated is not None:
+            rows.append((label, measured, simulated))
+    return comparison_figure(rows, f"{capture.name}: frame {number}") if rows else None
+
+
+def simulated_frame(capture: Capture, profile: CameraProfile, number: int) -> Picture | None:
+    """Frame ``number`` as the simulator takes it before the restored next frame; None where that cannot be done."""
+    plan = RestorationPlan(profile, PRESETS["balanced"], imu_gaps_s=capture.imu_gaps_s)
+    try:
+        scene = restored_scene(capture, plan, number + 1)
+        if scene is None:
+            return None
+        frames = capture.frames[number : number + 2]
+        session = recreate_session(capture, frames, profile, profile, scene, SessionSettings(noise_levels=0.0))
+    except VirestError as error:
+        log.info("%s: frame %d was not simulated: %s", capture.name, number, error)
+        return None
+    return render_picture(session, 0)
+
+
+# ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _write_all(folder: Path, files: dict[str, bytes]) -> None:
+    """Write the files in order, the account last; where one cannot be written, what is new goes again."""
+    places = [folder, folder / FIGURES]
+    new_folders = [place for place in places if not place.exists()]
+    new_files = [folder / name for name in files if not (folder / name).exists()]
+    try:
+        for place in places:
+            place.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            write_whole(folder / name, data)
+        for old in (folder / FIGURES).iterdir():
+            if OWN_FIGURES.fullmatch(old.name) and f"{FIGURES}/{old.name}" not in files:
+                old.unlink()
+    except BaseException as error:
+        with suppress(OSError):
+            for file in new_files:
+                file.unlink(missing_ok=True)
+            for place in reversed(new_folders):
+                place.rmdir()
+        if isinstance(error, OSError):
+            raise output_error(folder, error) from error
+        raise
+
+
+# ── for people ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -> str:
+    """The causes as a table with a sentence each, what they do for restored frames, what remains, the verdict."""
+    nominal = found.nominal
+    lines = [
+        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, off by {_number(nominal.geometry_rms_px)} px, of "
+        f"which tracking makes {_number(nominal.geometry_noise_px)} px"
+    ]
+    if found.causes:
+        header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
+        lines.append(table(header, [row for cause in found.causes for row in _rows(cause)]))
+        lines += [f"{cause.name}: {_one_line(cause.sentence)}" for cause in found.causes]
+    lines += [_gain_line(gain), _remaining_line(found.unexplained)]
+    lines += [f"note: {_one_line(note)}" for note in found.notes]
+    lines.append(f"wrote {folder / DIAGNOSIS}, {EXTENDED} and figures")
+    return "\n".join([*lines, f"verdict: {found.verdict}"])
+
+
+def _rows(cause: Finding) -> list[list[str]]:
+    """A row for each number or word that changed; what the cause gains stands on its first."""
+    held_out = cause.held_out
+    judged = [_number(held_out.before), _number(held_out.after), f"{held_out.gain:.0%}", held_out.quantity]
+    rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals) or "-"
+    first = [cause.name, [*judged, rivals]]
+    values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
+    return [
+        [str(first[0]) if k == 0 else "", *value, *(first[1] if k == 0 else [""] * 5)]
+        for k, value in enumerate(values or [["-"] * 4])
+    ]
+
+
+def _values(parameter: str, change: Any) -> list[list[str]]:
+    """Name, given, found, ± of a parameter: a row for each component of a short list."""
+    found = change.estimate
+    if not isinstance(found, list | tuple | np.ndarray):
+        return [[parameter, *map(_number, (change.nominal, found, change.std))]]
+    count = len(found)
+    if count > SHOWN_COMPONENTS:
+        known = np.asarray(found, float)
+        return [[parameter, "-", f"{count} values, {_number(known.min())} to {_number(known.max())}", "-"]]
+    given, std = (_spread_out(values, count) for values in (change.nominal, change.std))
+    return [[f"{parameter}[{k}]", *map(_number, (given[k], found[k], std[k]))] for k in range(count)]
+
+
+def _spread_out(values: Any, count: int) -> list[Any]:
+    listed = isinstance(values, list | tuple | np.ndarray) and len(values) == count
+    return list(values) if listed else [values] * count
+
+
+def _number(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "-"
+    return value if isinstance(value, str) else f"{float(value):.4g}"
+
+
+def _gain_line(gain: RestorationGain) -> str:
+    return (
+        f"restored frames: sharpness {_number(gain.sharpness_recorded)} recorded, {_number(gain.sharpness_before)} as "
+        f"given, {_number(gain.sharpness_after)} with the causes; neighbours disagree by "
+        f"{_number(gain.disagreement_before_px)} -> {_number(gain.disagreement_after_px)} px"
+    )
+
+
+def _remaining_line(left: Remaining) -> str:
+    if left.significant:
+        return f"unexplained: {_one_line(left.sentence) or f'{_number(left.size)} along {left.strongest_along}'}"
+    unit = "px" if left.quantity.endswith("_px") else "levels"
+    return f"unexplained: nothing of size; {_number(left.size)} {unit} along {left.strongest_along}"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
