@@ -26,6 +26,7 @@ from virest.errors import CalibrationError, OutputError
 CAUSE_KEYS = {"name", "parameters", "held_out", "rivals", "p_value", "figures"}
 TOP_KEYS = {"schema", "verdict", "nominal", "causes", "unexplained", "restoration_gain", "extended_profile"}
 NOMINAL_KEYS = {"geometry_rms_px", "geometry_noise_px", "photometric_rms", "blur_rms_px", "tracks", "frames"}
+DRAW_FIGURES = diagnose.draw_figures
 Say = Callable[[str, float], None]
 
 
@@ -54,7 +55,10 @@ def diagnosis(source: diagnose._Source, verdict: str, causes: tuple[Finding, ...
     extended = dataclasses.replace(nominal, time_offset_s=0.0042) if causes else nominal
     some = {name: rng.normal(size=200) for name in ("row", "time", "radius", "rate", "x_px", "y_px")}
     tried = {"time_offset": 0.22, "readout_time": 0.9}
-    rungs = (Rung("time_offset", tried, 1.4, "geometry_rms_px"), Rung(None, {"gyro_bias": 0.23}, 0.22, "geometry_rms_px"))
+    rungs = (
+        Rung("time_offset", tried, 1.4, "geometry_rms_px"),
+        Rung(None, {"gyro_bias": 0.23}, 0.22, "geometry_rms_px"),
+    )
     left = Remaining(0.4, "radius", 0.01, "geometry_rms_px", verdict == "unexplained", "something goes on along radius")
     return Diagnosis(
         verdict, Nominal(1.4, 0.2, None, float("nan"), 1234, 24), causes, left, nominal, extended, rungs,
@@ -80,6 +84,17 @@ def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return give
 
 
+@pytest.fixture(autouse=True)
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blank files for figures: drawing takes most of the time."""
+
+    def blank(_capture: object, found: Diagnosis) -> tuple[dict[str, bytes], list[list[str]]]:
+        names = [f"figures/{number:02d}_{cause.name}.png" for number, cause in enumerate(found.causes, start=1)]
+        return dict.fromkeys(names, b"\x89PNG"), [[name] for name in names]
+
+    monkeypatch.setattr(diagnose, "draw_figures", blank)
+
+
 def run(*arguments: object) -> int:
     """The command, in this process."""
     return cli.run(["diagnose", *map(str, arguments)])
@@ -90,8 +105,9 @@ def files_in(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
-def test_the_account_has_the_agreed_keys_and_no_others(tiny: Path, tmp_path: Path, ladder) -> None:
+def test_the_account_has_the_agreed_keys_and_no_others(tiny: Path, tmp_path: Path, ladder, monkeypatch) -> None:
     """diagnosis.json: keys, gain, null for what is no number, "inf" for infinity; figures that exist."""
+    monkeypatch.setattr(diagnose, "draw_figures", DRAW_FIGURES)
     ladder("explained", offset_cause(), odd_cause())
     assert run(tiny, "--out", tmp_path / "out") == 0
     folder = tmp_path / "out/tiny"

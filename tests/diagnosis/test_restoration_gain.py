@@ -1,6 +1,7 @@
 """What a better model does for restored pictures, without truth."""
 
 import dataclasses
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -83,7 +84,7 @@ def test_pairs_do_not_overlap_and_have_both_frames(simulated):
     capture, profile, _ = simulated["readout"]
     firsts = chosen_pairs(capture, profile)
     assert len(firsts) >= 3
-    assert all(b - a >= 2 for a, b in zip(firsts, firsts[1:], strict=False))
+    assert all(b - a >= 2 for a, b in pairwise(firsts))
     assert max(firsts) + 1 < len(capture.frames)
     early = dataclasses.replace(capture, repeats=(firsts[0] + 1,))
     assert firsts[0] not in chosen_pairs(early, profile)

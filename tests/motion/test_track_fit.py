@@ -41,7 +41,7 @@ LANDSCAPE = Setup(
 FLIPPED = Setup(seed=13, readout_direction="bottom_to_top", focal_drift_per_s=0.03, stabilised=(0.5, 0.8), frames=40)
 WALL = Setup(
     seed=14, sway_m=0.06, plane_per_m=(0.1, -0.15, 0.5), velocity_m_s=(0.1, -0.2, 0.15), gyro_noise_rad_s=0.001,
-    readout_direction="left_to_right", frames=45, arm_m=(0.03, -0.05, 0.01), points=30,
+    readout_direction="left_to_right", frames=45, arm_m=(0.03, -0.05, 0.01), points=22,
 )  # fmt: skip
 
 
@@ -109,12 +109,12 @@ def test_a_readout_of_the_wrong_sense_is_found_through_nought() -> None:
 
 def test_deviations_hold() -> None:
     """Over 20 hands and noises the errors are about as large as the deviations say, none many times larger."""
-    scores = []
+    scores, terms = [], (terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.GYRO_BIAS)
     for seed in range(200, 220):
-        fitted = fitted_from(Recording(Setup(seed=seed, frames=25, points=20, gyro_noise_rad_s=0.0005)), BASIC)
+        fitted = fitted_from(Recording(Setup(seed=seed, frames=25, points=20)), terms)
         scores.append(errors(fitted) / deviations(fitted))
     score = np.array(scores)
-    assert score.shape == (20, 8)
+    assert score.shape == (20, 5)
     assert 0.7 < np.sqrt(np.mean(score**2)) < 1.45
     assert np.mean(np.abs(score) < 2) > 0.85
     assert (np.abs(score) < 5).all()
@@ -135,14 +135,18 @@ def test_a_third_of_the_points_on_something_else_does_no_harm() -> None:
 
 
 def test_a_prior_holds_a_term_to_where_it_began() -> None:
-    """A prior as sharp as the data goes half way; one much sharper stays; one much wider goes all the way."""
+    """A prior as sharp as the data shares the way with them; one much sharper stays, one much wider hardly holds.
+
+    Of a unit normal's information, Cauchy's loss at 2.4 has 0.81 of what its mean weight says.
+    """
     recording = recorded(PORTRAIT)
     start = terms_of.shift_offset(recording.profile, np.array([0.0002]))
     free = fit_tracks(recording.imu, recording.table(), start, (terms_of.TIME_OFFSET,))
     alone = float(np.sqrt(free.curvature[0, 0]))
     way = float(free.change[0])
-    for std, part in ((alone, 0.5), (0.05 * alone, 1 / 401), (3 * alone, 0.9)):
-        term = replace(terms_of.TIME_OFFSET, prior_std=(std,))
+    for sharpness in (1.0, 20.0, 1 / 3):
+        part = 0.81 / (0.81 + sharpness**2)
+        term = replace(terms_of.TIME_OFFSET, prior_std=(alone / sharpness,))
         held = fit_tracks(recording.imu, recording.table(), start, (term,))
         assert held.change[0] == pytest.approx(part * way, abs=0.04 * abs(way))
 

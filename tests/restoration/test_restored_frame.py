@@ -272,12 +272,11 @@ def test_the_log_holds_the_contracts_figures() -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("level", [0, 255])
 def test_what_is_censored_all_around_stays_as_it_was(preset: str, level: int) -> None:
-    """Inside an area at or beyond A or D, a blur length from its edge, the stored grey level comes back."""
+    """Inside an area beyond A or D, a blur length from its edge, the recorded grey level comes back."""
     turning = camera(reference="frame-middle")
     turning = replace(turning, profile=replace(turning.profile, response=CURVES["five_segment"]))
     picture = np.clip(record(turning).picture, 40, 220)
     picture[60:180, 90:250] = level
     settings = replace(PRESETS[preset], shutter="none", reference="frame-middle")
     restored = _picture(_restore(turning, picture, settings))
-    shown = CURVES["five_segment"].encode(CURVES["five_segment"].linearise(np.array(level / 255)))
-    np.testing.assert_array_equal(restored[85:155, 115:225], np.uint8(np.rint(255 * shown)))
+    np.testing.assert_array_equal(restored[85:155, 115:225], level)

@@ -107,3 +107,29 @@ def test_rings_are_spread_over_a_packed_spectrum() -> None:
     assert spread[0, 0] == 0
     assert spread[0, 2 * 30] == pytest.approx(1 + 30 / 96, rel=1e-3)
     assert spread[2 * 20, 0] == pytest.approx(1 + 20 / 96, rel=1e-3)
+
+
+def test_lamps_are_no_noise() -> None:
+    """Clipped streaks all over leave the measured noise within 15 per cent; taken for light, they would triple it."""
+    field = _field()
+    sharp = 255 * (0.2 + 0.6 * texture(HEIGHT, WIDTH, seed=5))
+    rng = np.random.default_rng(9)
+    for y, x in np.stack([rng.integers(5, HEIGHT - 9, 40), rng.integers(5, WIDTH - 9, 40)], -1):
+        sharp[y : y + 4, x : x + 3] = 6000.0
+    seen = cv2.filter2D(sharp, -1, field.arrays()[0].astype(float)) + rng.normal(0, 2.0, sharp.shape)
+    picture = np.repeat(np.clip(np.rint(seen), 0, 255).astype(np.uint8)[..., None], 3, -1)
+    clipped = (picture[..., 0] >= 254).astype(np.uint8)
+    assert 0.01 < clipped.mean() < 0.02
+    known, _ = measure_picture(picture, field, clipped)
+    assert known.noise_levels == pytest.approx(2.0, rel=0.15)
+    taken, _ = measure_picture(picture, field)
+    assert taken.noise_levels > 6.0
+
+
+def test_a_picture_clipped_all_over_gives_finite_statistics() -> None:
+    """White from edge to edge: nothing to measure, and no division by nothing."""
+    white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    luma, chroma = measure_picture(white, _field(), np.ones((HEIGHT, WIDTH), np.uint8))
+    for found in (luma, chroma):
+        assert np.isfinite(found.noise_levels)
+        assert np.isfinite(found.expected_gain_db)

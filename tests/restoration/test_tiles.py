@@ -145,24 +145,53 @@ def _lamp_behind_a_blur() -> tuple[NDArray[np.float32], NDArray[np.float32], NDA
     return sharp, cv2.filter2D(sharp, cv2.CV_32F, kernel), kernel
 
 
-def test_a_settled_tile_knows_a_clipped_lamp_from_its_streak() -> None:
-    """Where the streak was clipped, the lamp comes back and the dark beside it; other tiles are filtered as before."""
-    sharp, blurred, kernel = _lamp_behind_a_blur()
-    recorded = np.minimum(blurred, 1)
-    grid = tile_grid(*sharp.shape, 64, 16)
+def _with_lamp_tamed(recorded: NDArray[np.float32], kernel: NDArray[np.float32]) -> tuple[TileDeconvolution, list[int]]:
+    """Tiles of a picture clipped at 1, those that see clipped light tamed, and their numbers."""
+    grid = tile_grid(*recorded.shape, 64, 16)
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], len(grid.centres_px), 0), 16)
     holes = (recorded >= 1).astype(np.float32)
     numbers = deconvolution.touched(holes)
-    assert 0 < len(numbers) < len(grid.centres_px)
-    deconvolution.settle(numbers, np.repeat(kernel[None], len(numbers), 0), recorded, 1 - holes)
+    deconvolution.tame(numbers, np.repeat(kernel[None], len(numbers), 0), recorded, 1 - holes, 1.0)
+    return deconvolution, numbers
+
+
+def _filtered_with_lamps(deconvolution: TileDeconvolution, recorded: NDArray[np.float32]) -> NDArray[np.float32]:
     ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
-    restored = deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(recorded), ratio, ratio))
+    projected = deconvolution.back_projected(recorded)
+    return deconvolution.with_lamps(deconvolution.blend(deconvolution.solutions(projected, ratio, ratio)))
+
+
+def test_a_tamed_tile_knows_a_clipped_lamp_from_its_streak() -> None:
+    """Where the streak was clipped, the lamp comes back and the dark beside it; other tiles are filtered as before."""
+    sharp, blurred, kernel = _lamp_behind_a_blur()
+    recorded = np.minimum(blurred, 1)
+    deconvolution, numbers = _with_lamp_tamed(recorded, kernel)
+    assert 0 < len(numbers) < len(deconvolution.grid.centres_px)
+    restored = _filtered_with_lamps(deconvolution, recorded)
     near = np.s_[55:91, 85:125]
     before, after = (np.abs(np.minimum(p, 1) - np.minimum(sharp, 1))[near].mean() for p in (recorded, restored))
     assert after < 0.5 * before
     assert restored.min() > -0.05, "no dark ring beside the lamp"
     far = np.s_[20:130, 10:40]
     assert np.abs(restored - sharp)[far].mean() < np.abs(recorded - sharp)[far].mean()
+
+
+def test_a_lamp_leaves_the_rest_of_its_tiles_to_the_filter() -> None:
+    """Beyond the lamp's streak a tamed tile is as sharp as the filter makes it in the scene without a lamp."""
+    sharp, blurred, kernel = _lamp_behind_a_blur()
+    dim = np.minimum(sharp, 0.3)
+    without = cv2.filter2D(dim, cv2.CV_32F, kernel)
+    plain, none = _with_lamp_tamed(without, kernel)
+    assert none == []
+    expected = _filtered_with_lamps(plain, without)
+    recorded = np.minimum(blurred, 1)
+    tamed, _ = _with_lamp_tamed(recorded, kernel)
+    found = _filtered_with_lamps(tamed, recorded)
+    beside = np.ones(sharp.shape, bool)
+    beside[45:101, 75:135] = False
+    beside[:16], beside[-16:], beside[:, :16], beside[:, -16:] = False, False, False, False
+    with_lamp, without_lamp, before = (np.abs(p - sharp)[beside].mean() for p in (found, expected, recorded))
+    assert with_lamp < 1.05 * without_lamp < before
 
 
 def test_tiles_that_see_no_hole_are_not_touched() -> None:

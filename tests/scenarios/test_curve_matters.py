@@ -23,27 +23,35 @@ def test_the_right_curve_beats_none_by_far_at_gamma_2_2(work: Path):
 
 
 def test_the_right_knots_are_better_on_every_frame(work: Path):
-    """A fifth of the pixels in toe and shoulder: never below no curve or one with other knots."""
+    """A fifth of the pixels in toe and shoulder: above no curve and one with other knots, by 0.2 dB in the mean."""
     rows = {row["told"]: row for row in curve_rows(work, "toe and shoulder", SEEDS, FRAMES)}
     assert 0.1 < sum(rows["right"]["toe_and_shoulder"]) < 0.3
     for told in ("none (linear)", "other knots", "srgb"):
-        assert rows[told]["right_minus_this_db"] > 0.05
+        assert rows[told]["right_minus_this_db"] > 0.2
         assert rows[told]["least_right_minus_this_db"] > 0.0
 
 
 def test_lamps_do_no_harm_where_they_are_known_to_be_clipped(work: Path):
-    """3 % of the pixels several times too bright: 1 dB and more by the mask, of the whole and near the lamps."""
+    """3 % of the pixels several times too bright: 3 dB and more by the mask, near the lamps, elsewhere 1 dB."""
     rows = {row["told"]: row for row in clipping_rows(work, "lamps", SEEDS, FRAMES)}
     assert 0.02 < rows["without"]["clipped"] < 0.05
-    for part in ("near_db", "whole_db"):
-        assert rows["with the mask"][part] - rows["without"][part] >= 1.0
+    for part, least_db in (("near_db", 3.0), ("whole_db", 3.0), ("elsewhere_db", 1.0)):
+        assert rows["with the mask"][part] - rows["without"][part] >= least_db
+        assert rows["with the mask"][part] - rows["not deblurred"][part] >= least_db
+    assert rows["with the mask"]["elsewhere_db"] > rows["nothing clipped"]["elsewhere_db"] - 1.0
 
 
 def test_overexposed_areas_leave_the_rest_of_the_picture_alone(work: Path):
-    """3 % of the pixels a little too bright: elsewhere within 0.3 dB of the same scene in less light, in the mean."""
+    """3 % of the pixels a little too bright: elsewhere within 0.3 dB of the same scene in less light, in the mean.
+
+    The mask is worth half a decibel and more of the whole picture and of what is near; it costs nothing elsewhere.
+    """
     rows = {row["told"]: row for row in clipping_rows(work, "sunlit", (*SEEDS, 12), FRAMES)}
     assert rows["with the mask"]["clipped"] == pytest.approx(0.03, abs=0.005)
     assert rows["with the mask"]["elsewhere_db"] > rows["nothing clipped"]["elsewhere_db"] - 0.3
+    assert rows["with the mask"]["elsewhere_db"] > rows["without"]["elsewhere_db"] - 0.05
+    for part in ("near_db", "whole_db"):
+        assert rows["with the mask"][part] - rows["without"][part] >= 0.5
 
 
 def test_changing_exposure_is_light_and_not_grey(virest, work: Path):

@@ -383,9 +383,11 @@ def _number(value: Any) -> str:
 
 
 def _gain_line(gain: RestorationGain) -> str:
+    if math.isnan(gain.sharpness_after):
+        return "restored: no two neighbours could be laid on each other"
     return (
-        f"restored frames: sharpness {_number(gain.sharpness_recorded)} recorded, {_number(gain.sharpness_before)} as "
-        f"given, {_number(gain.sharpness_after)} with the causes; neighbours disagree by "
+        f"restored: sharpness {_number(gain.sharpness_recorded)} recorded, {_number(gain.sharpness_before)} as given, "
+        f"{_number(gain.sharpness_after)} extended; neighbours disagree by "
         f"{_number(gain.disagreement_before_px)} -> {_number(gain.disagreement_after_px)} px"
     )
 

@@ -58,10 +58,10 @@ def simulate_like(
     capture = read_capture(like)
     given, source = resolve_profile(capture, config)
     log.info("%s: camera profile from %s", capture.name, source)
+    kept = _kept(capture, frames)
     plan = scene_plan(capture, given)
     for warning in (*plan.warnings, *([plan.copy_reason] if plan.copy_reason else [])):
         log.warning("%s: %s", capture.name, warning)
-    kept = _kept(capture, frames)
     nominal = plan.profile
     scene = find_scene(capture, plan, kept)
     context = EffectContext(len(kept), _fps(kept), np.random.default_rng([seed, 5]))

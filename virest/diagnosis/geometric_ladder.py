@@ -29,6 +29,7 @@ from virest.diagnosis.geometric_evidence import (
     free_scene,
     loss,
 )
+from virest.diagnosis.start_up import Schedule
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable
 from virest.motion.tracking_bias import bias_std
@@ -48,6 +49,20 @@ MIN_GAIN = 0.004
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 MAX_RUNGS = 5
+PLAUSIBLE = {
+    "time_offset": 2.0,
+    "clock_skew": 0.03,
+    "readout_time": 0.06,
+    "gyro_bias": 0.5,
+    "gyro_scale": 0.4,
+    "imu_rotation": 1.0,
+    "focal_length": 0.5,
+    "focal_drift": 0.3,
+    "radial_distortion": 0.8,
+    "principal_point": 300.0,
+}
+"""Largest believable changes, in the units of the terms."""
+STABILISER_CUTOFF_HZ = (0.03, 15.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,12 +114,14 @@ def climb(
     evidence: Evidence,
     nominal: CameraProfile,
     null_terms: Sequence[Term],
-    lags: Sequence[tuple[float, int, tuple[float, ...]]],
+    lags: Sequence[Schedule],
+    far_off_s: float = 0.0,
     progress: Callable[[float], None] | None = None,
+    max_rungs: int = MAX_RUNGS,
 ) -> GeometricVerdict:
     """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
 
-    lags: (lag_s, frames, seconds of each frame) of the start-up schedules to try.
+    lags: the start-up schedules to try.  far_off_s: a change of the time offset at which turns were seen to agree.
     """
     say = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
@@ -114,8 +131,8 @@ def climb(
     accepted: list[Accepted] = []
     rungs: list[Rung] = []
     say(0.1)
-    for number in range(MAX_RUNGS):
-        best, rung = _rung(evidence, model, nominal, accepted, lags)
+    for number in range(max_rungs):
+        best, rung = _rung(evidence, model, accepted, lags, far_off_s)
         rungs.append(rung)
         say(0.1 + 0.8 * (number + 1) / MAX_RUNGS)
         if best is None:
@@ -148,12 +165,12 @@ class _Judged:
 def _rung(
     evidence: Evidence,
     model: Model,
-    nominal: CameraProfile,
     accepted: list[Accepted],
-    lags: Sequence[tuple[float, int, tuple[float, ...]]],
+    lags: Sequence[Schedule],
+    far_off_s: float,
 ) -> tuple[tuple[Model, Accepted] | None, Rung]:
     tried = {entry.name for entry in accepted}
-    candidates = _candidates(evidence, model, tried, lags)
+    candidates = _candidates(evidence, model, tried, lags, far_off_s)
     base = _screened(evidence, Candidate("", model, (), None))
     screened = _best_of_each([_screened(evidence, candidate) for candidate in candidates])
     promising = sorted(screened, key=lambda s: s[0])[:PROMISING]
@@ -188,7 +205,8 @@ def _candidates(
     evidence: Evidence,
     model: Model,
     tried: set[str],
-    lags: Sequence[tuple[float, int, tuple[float, ...]]],
+    lags: Sequence[Schedule],
+    far_off_s: float,
 ) -> list[Candidate]:
     in_terms = {term.name for term in model.terms}
     found: list[Candidate] = []
@@ -198,7 +216,8 @@ def _candidates(
         if effect.term is None:
             found += _words(effect, model)
             continue
-        for values in (None, *effect.starts):
+        far = ((far_off_s,),) if effect.name == "time_offset" and far_off_s else ()
+        for values in (None, *effect.starts, *far):
             profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
             found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
     found += _depths(evidence, model, tried)
@@ -283,9 +302,20 @@ def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile
         p_value = float(stats.chi2.sf((depth_m / max(std, 1e-9)) ** 2, 1))
     elif candidate.effect is None or candidate.effect.term is None:
         p_value = SURE
+    elif not is_plausible(candidate.effect, model.profile, total_change(candidate.effect, before, model.profile)):
+        return None, 1.0
     else:
         p_value = p_of(fitted, candidate.effect, model.profile, before, evidence.typical_px)
     return (model if p_value < MAX_P else None), p_value
+
+
+def is_plausible(effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
+    """Whether a phone can be like that: a cause beyond these bounds only stands in for another."""
+    if effect.name == "stabilisation":
+        low, high = STABILISER_CUTOFF_HZ
+        extensions = found.extensions
+        return 0 < extensions.stabilisation_fraction <= 1.1 and low < extensions.stabilisation_cutoff_hz < high
+    return bool(np.all(np.abs(change) <= PLAUSIBLE[effect.name]))
 
 
 def p_of(

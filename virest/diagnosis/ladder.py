@@ -32,7 +32,7 @@ from virest.diagnosis.findings import (
     Rival,
 )
 from virest.diagnosis.geometric_evidence import Evidence, make_evidence
-from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_of, refit
+from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, climb, findings_of, refit
 from virest.diagnosis.picture_ladder import Reader, climb_blur, climb_photometry
 from virest.diagnosis.start_up import lag_schedules
 from virest.diagnosis.structure import Structure, structures
@@ -48,8 +48,8 @@ from virest.motion.tracking import track_pairs
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-MIN_PAIRS = 12
-MIN_EXPLAINED = 0.3
+MIN_PAIRS = 6
+MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
 CONSTANT_EXPOSURE = 0.03
 COINCIDENCE_SIGMA = 3.5
 STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
@@ -74,17 +74,13 @@ def diagnose_capture(
 ) -> Diagnosis:
     """Climb the ladder on one capture; pictures gives (index, RGB), gray (index, luma) of the frames asked for.
 
-    Raises CaptureError where there is nothing to judge by: no focal length, too few points.
+    Raises CaptureError where there is nothing to judge by: too few points.
     """
     say = progress or (lambda _text, _part: None)
-    if profile.intrinsics is None:
-        raise CaptureError(
-            "the focal length is unknown", hint="give fx_px in camera.yaml, or run virest calibrate first"
-        )
     indices = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
     say("tracking", 0.02)
     observed = observe_tracks(capture, track_pairs(gray(indices)), profile)
-    start, null_terms, notes = _with_null_values(observed, capture, profile)
+    start, null_terms, notes, far_off_s, follows = _with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
         raise CaptureError(
@@ -94,7 +90,12 @@ def diagnose_capture(
     evidence = make_evidence(capture.imu, observed)
     say("points", 0.15)
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
-    geometric = climb(evidence, start, null_terms, schedules, lambda part: say("points", 0.15 + 0.4 * part))
+    rungs_allowed = MAX_RUNGS if follows else 0
+    if not follows:
+        notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
+    geometric = climb(
+        evidence, start, null_terms, schedules, far_off_s, lambda part: say("points", 0.15 + 0.4 * part), rungs_allowed
+    )
     findings = _stamped(geometric, findings_of(geometric), observed.exposure_s)
     found = geometric.model.profile
     frames = _at_model_times(capture, geometric)
@@ -136,21 +137,48 @@ def diagnose_capture(
 
 def _with_null_values(
     observed: ObservedTracks, capture: Capture, profile: CameraProfile
-) -> tuple[CameraProfile, list[Term], list[str]]:
-    """The profile with an unknown offset found coarsely, and the terms to be fitted on every rung."""
+) -> tuple[CameraProfile, list[Term], list[str], float, bool]:
+    """The profile with unknown values begun somewhere, the terms to fit on every rung, and a far-off time offset.
+
+    The last two: how far from the profile's offset the turns of pictures and gyroscope agree best, and whether they agree
+    at all, as far as the camera turns.
+    """
     terms: list[Term] = []
     notes: list[str] = []
-    if profile.time_offset_s is None and len(observed.pairs) >= MIN_PAIRS:
-        coarse = align_coarsely(observed.turns(profile), capture.imu, profile)
-        if coarse is not None and coarse.explained > MIN_EXPLAINED:
-            profile = replace(profile, time_offset_s=coarse.time_offset_s)
-            terms.append(terms_of.TIME_OFFSET)
-        else:
-            notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
-            profile = replace(profile, time_offset_s=0.0)
+    if profile.intrinsics is None:
+        profile = replace(profile, intrinsics=observed.lens)
+        terms.append(terms_of.FOCAL)
+        notes.append("focal length unknown: fitted on every rung, from a guess")
     if not profile.readout_known:
         terms.append(terms_of.READOUT)
-    return profile, terms, notes
+    far_off_s = _agrees_at(observed, capture, profile)
+    still = _hardly_turns(observed, profile)
+    if profile.time_offset_s is not None:
+        return profile, terms, notes, (0.0 if far_off_s is None else far_off_s), far_off_s is not None or still
+    if far_off_s is None:
+        notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
+    else:
+        terms.append(terms_of.TIME_OFFSET)
+    return replace(profile, time_offset_s=far_off_s or 0.0), terms, notes, 0.0, far_off_s is not None or still
+
+
+def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:
+    """Whether the pictures' turns are too small to be compared with a gyroscope's."""
+    if len(observed.pairs) < MIN_PAIRS:
+        return True
+    turns = observed.turns(profile)
+    changing = turns.detrended(turns.vector_rad)
+    return float(np.sqrt(np.mean((changing**2).sum(axis=-1)))) * observed.lens.fx_px < MIN_MOTION_PX
+
+
+def _agrees_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> float | None:
+    """By how much the offset at which turns agree best differs from the profile's; None where they agree nowhere."""
+    if len(observed.pairs) < MIN_PAIRS:
+        return None
+    coarse = align_coarsely(observed.turns(profile), capture.imu, profile)
+    if coarse is None or coarse.explained < MIN_EXPLAINED or coarse.at_end:
+        return None
+    return coarse.time_offset_s - (profile.time_offset_s or 0.0)
 
 
 def _at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]:

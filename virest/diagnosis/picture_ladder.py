@@ -86,6 +86,9 @@ def climb_photometry(
     gray: for the curve at constant exposure, which needs blur paths that are right; None: left out.
     """
     verdict = PictureVerdict(profile)
+    if not frames:
+        verdict.notes.append("no frame at a known time: brightness not judged")
+        return verdict
     by_index = {frame.index: frame for frame in frames}
     pictures = ((by_index[k], picture) for k, picture in rgb([frame.index for frame in frames]))
     observations = observe_photometry(pictures, trajectory, profile, intra_frames=capture.keyframes)

@@ -74,7 +74,7 @@ class TrackFit:
     depth_spread_per_m: float
     """Standard deviation of points' inverse depths about the plane."""
     difference_px: Array
-    """(n, 2) tracked minus predicted."""
+    """(n, 2) tracked minus predicted; of a directed motion the part across its parallax."""
     weight: Array
     """(n,) Cauchy weights, 0 to 1."""
     distance: Array
@@ -318,13 +318,16 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
     inverse = system.inverse()
     covariance = _block_covariance(table, system, inverse, blocks)
     stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
+    difference = system.difference
+    if isinstance(state.scene, DirectedMotion):
+        difference = system.left * table.noise_px[table.pair][:, None]
     place, slices = 0, {}
     for term in terms:
         slices[term.name] = slice(place, place + len(term))
         place += len(term)
     return TrackFit(
         state.known.profile, state.scene, terms, state.change, covariance, inverse, system.scale,
-        system.depth_spread, system.difference, system.weight, np.sqrt(system.squared), stretches,
+        system.depth_spread, difference, system.weight, np.sqrt(system.squared), stretches,
         _cost(system, 1.0), state.known,
         system.prediction.second_s, slices,
     )  # fmt: skip

@@ -244,16 +244,25 @@ def _moved_inertially(
     if not slopes:
         return _Moved(step, inverse_depth, None)
     since_1, since_2, each = first_s - origin_s, second_s - origin_s, np.eye(3)[None]
+    nearer = (inverse_depth / clearance)[:, None] * plane  # change of the inverse depth per metre of the first centre
     per_plane = world / clearance[:, None] + (inverse_depth / clearance)[:, None] * centre_1
-    shared = np.concatenate(
-        [each * (0.5 * (since_1**2 - since_2**2))[:, None, None], bias_2 - bias_1, (delay_1 - delay_2)[..., None]], -1
+    first, second = (
+        _shared_slopes(each, since, bias, delay)
+        for since, bias, delay in ((since_1, bias_1, delay_1), (since_2, bias_2, delay_2))
     )
+    shared = (first - second) * inverse_depth[:, None, None]
+    shared = shared + step[:, :, None] * np.einsum("ni,nik->nk", nearer, first)[:, None, :]
     own = np.zeros((len(world), 3, scene.windows, 6))
     rows = np.arange(len(world))
     own[rows, :, window, :3] = each * ((since_1 - since_2) * inverse_depth)[:, None, None]
+    own[rows, :, window, :3] += step[:, :, None] * (nearer * since_1[:, None])[:, None, :]
     own[rows, :, window, 3:] = step[:, :, None] * per_plane[:, None, :]
-    shared = shared * inverse_depth[:, None, None]
     return _Moved(step, inverse_depth, np.concatenate([shared, own.reshape(len(world), 3, -1)], axis=-1))
+
+
+def _shared_slopes(each: Array, since: Array, bias: Array, delay: Array) -> Array:
+    """Change (n, 3, 7) of the camera's centre per gravity, accelerometer bias and delay."""
+    return np.concatenate([each * (0.5 * since**2)[:, None, None], -bias, delay[..., None]], axis=-1)
 
 
 def centre(

@@ -43,10 +43,10 @@ MAX_LEFT = 0.15
 MAX_SPREAD = 0.6
 """Spread of inverse depths about the plane, as part of its inverse depth."""
 GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
-MAX_ITERATIONS = 30
+MAX_ITERATIONS = 15
 STILL_ITERATIONS = 8
 """Rotation alone is there to be compared with; it does not matter to the last digit."""
-CAUCHY, RAYLEIGH_MEDIAN = 2.4, 1.1774
+RAYLEIGH_MEDIAN = 1.1774
 OFFSET_PRIOR_S, ROTATION_PRIOR_RAD, READOUT_PRIOR_S = 0.03, 0.03, 0.03
 """How far a profile that states a value may be wrong: these are fitted along so that they do not pass for parallax."""
 STATED_DEPTH_STD = 0.02
@@ -425,9 +425,8 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
 
 
 def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
-    """Robust standard deviation per coordinate of a window's whitened differences, from their Cauchy weights."""
-    squared = np.maximum(1 / np.maximum(fit.weight[mine], 1e-9) - 1, 0.0) * (CAUCHY * fit.scale) ** 2
-    return float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN
+    """Robust standard deviation per coordinate of a window's whitened differences."""
+    return float(np.median(fit.distance[mine])) / RAYLEIGH_MEDIAN
 
 
 def _reason(found: Window, gravity_m_s2: float, spread: float, before: float) -> str:

@@ -172,7 +172,7 @@ def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> l
     projected = _projected_luma(blurred, deconvolution, settings)
     factors = _tile_factors(deconvolution, settings, blurred.statistics)
     sharp = deconvolution.blend(cv2.multiply(s, f) for s, f in zip(projected, factors, strict=True))
-    return _with_colour(blurred, sharp, settings)
+    return _with_colour(blurred, deconvolution.with_lamps(sharp), settings)
 
 
 def _tile_factors(
@@ -303,12 +303,12 @@ def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
 def _projected_luma(
     blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
 ) -> list[Image]:
-    """Spectrum of Kᵀ g of each tile; tiles with clipped light are settled."""
+    """Spectrum of Kᵀ g of each tile; tiles with clipped light are tamed."""
     luma, holes = _luma(blurred.light), _holes(blurred)
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
-        deconvolution.settle(numbers, kernels, luma, _measured_part(holes))
+        deconvolution.tame(numbers, kernels, luma, _measured_part(holes), float(luma.max()))
     return list(deconvolution.back_projected(luma))
 
 
@@ -335,7 +335,7 @@ def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings
         sharp = deconvolution.blend(deconvolution.solutions(pulled, inner, at_border))
     if settings.iterations > FEW_ITERATIONS:
         sharp += _returned_residual(deconvolution, projected, sharp, statistics)
-    return sharp
+    return deconvolution.with_lamps(sharp)
 
 
 def _border_noise(blurred: BlurredPicture) -> float:
@@ -358,7 +358,7 @@ def _returned_residual(
         cv2.subtract(back, cv2.multiply(power, spectrum))
         for back, power, spectrum in zip(projected, deconvolution.powers, deconvolution.spectra(sharp), strict=True)
     )
-    return deconvolution.blend(deconvolution.solutions(left, ratio, guarded, unless_settled=True))
+    return deconvolution.blend(deconvolution.solutions(left, ratio, guarded))
 
 
 def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:

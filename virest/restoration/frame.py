@@ -20,7 +20,15 @@ from virest.degradation.light import FrameLight, equivalent_length_px, frame_lig
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
-from virest.restoration.deblur import BAND_ROWS, BlurredPicture, blurred_picture, clipped_anywhere, deblur, near_clipped, unseen_masks
+from virest.restoration.deblur import (
+    BAND_ROWS,
+    BlurredPicture,
+    blurred_picture,
+    clipped_anywhere,
+    deblur,
+    near_clipped,
+    unseen_masks,
+)
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics import PictureStatistics, measure_picture
@@ -222,17 +230,20 @@ def _beyond_the_curve_kept(
     restored: NDArray[np.uint8], picture: NDArray[np.uint8], blurred: BlurredPicture, curve: ResponseCurve
 ) -> NDArray[np.uint8]:
     """Grey levels that no light gives, as noise and codec leave them beyond the curve's ends: kept where unseen."""
-    table = _encoding_table(curve)
-    low, high = curve.light_range
-    part = np.clip((curve.linear_table().ravel() - low) / (high - low), 0, 1)
-    returned = table[np.rint(65535 * np.sqrt(part)).astype(int)] == np.arange(256)
-    levels = np.flatnonzero(~returned)
-    if not len(levels) or not (picture.max() >= levels.max() or picture.min() <= levels.min()):
+    darkest, brightest = _returned_levels(curve)
+    if picture.min() >= darkest and picture.max() <= brightest:
         return restored
     for channel, unseen in enumerate(unseen_masks(blurred)):
         if unseen is not None:
-            cv2.copyTo(picture[..., channel], unseen, restored[..., channel])
+            np.copyto(restored[..., channel], picture[..., channel], where=unseen > 0)
     return restored
+
+
+@lru_cache(maxsize=8)
+def _returned_levels(curve: ResponseCurve) -> tuple[int, int]:
+    """The darkest and the brightest grey level that a curve's light comes back to."""
+    levels = _encoding_table(curve)
+    return int(levels.min()), int(levels.max())
 
 
 @lru_cache(maxsize=8)

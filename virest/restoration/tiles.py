@@ -20,6 +20,8 @@ LEAST_SIDE, LARGEST_SIDE = 0.8, 1.15
 """Tiles may be so much smaller or larger than asked for, where that makes their transforms quick."""
 SETTLING_ITERATIONS, SETTLING_RELAXATION = 6, 1.7
 """About as good as ten plain steps of Richardson-Lucy's."""
+LAMP_DOUBT = 0.02
+"""Lamp light in a streak, in units of the recorded range, from which on half of the light there is the steps' own."""
 Filter = Callable[[Image], Image]
 """Turns a kernel's power spectrum |K|² (packed, real parts doubled) into the real factor that follows conj(K)."""
 
@@ -46,8 +48,10 @@ class TileDeconvolution:
         self._bridge = _bridge(self.size - self.patch)
         self._tile = np.empty((self.size, self.size), np.float32)
         self.kernels = list(_kernel_spectra(kernels, self.size))
-        self.settled: dict[int, Image] = {}
-        """Spectra of tiles that are solved already, by their number."""
+        self._tamed: dict[int, Image] = {}
+        """Spectra of tiles as they were recorded but for their lamps, by number."""
+        self._lamps: dict[int, tuple[Image, Image]] = {}
+        """How much of the steps' own light to take in those tiles, and that light, (side, side) each."""
         self.powers = [doubled(cv2.mulSpectrums(k, k, 0, conjB=True)) for k in self.kernels]
 
     def filters(self, make: Filter, at_border: Filter | None = None) -> Iterator[Image]:
@@ -56,8 +60,14 @@ class TileDeconvolution:
             yield (at_border or make)(power) if border else make(power)
 
     def back_projected(self, channel: Image) -> Iterator[Image]:
-        """Spectrum of Kᵀ g for each tile; channel (height, width) is extended, never wrapped."""
-        for spectrum, kernel in zip(self.spectra(channel), self.kernels, strict=True):
+        """Spectrum of Kᵀ g for each tile; channel (height, width) is extended, never wrapped.
+
+        Of tamed tiles, g is what they would have recorded without their lamps.
+        """
+        padded = self.padded(channel)
+        for number, ((top, left), kernel) in enumerate(zip(self.grid.corners(), self.kernels, strict=True)):
+            tamed = self._tamed.get(number)
+            spectrum = cv2.dft(self.periodic(padded, top, left)) if tamed is None else tamed
             yield cv2.mulSpectrums(spectrum, kernel, 0, conjB=False)
 
     def touched(self, mask: Image) -> list[int]:
@@ -69,40 +79,61 @@ class TileDeconvolution:
             if cv2.hasNonZero(padded[top : top + patch, left : left + patch])
         ]
 
-    def settle(self, numbers: list[int], kernels: Image, channel: Image, weight: Image) -> None:
-        """Solve some tiles for good, by Richardson-Lucy with weights.
+    def tame(self, numbers: list[int], kernels: Image, channel: Image, weight: Image, top_light: float) -> None:
+        """Take the lamps out of some tiles: what is left is a picture of ordinary light, all of it recorded.
 
         Around a lamp a linear filter rings, since the light that is missing there is many times what was recorded;
-        multiplicative steps keep light positive and leave the dark beside it alone.  kernels: of these tiles,
-        nowhere negative.  channel, weight: (height, width); the bridges have no weight.
+        Richardson-Lucy's multiplicative steps keep light positive and leave the dark beside it alone.  They find the
+        light f; then f = lamp + rest, the lamp being what exceeds ``top_light``, and the blurred rest is g − K lamp
+        where that was measured, and K rest where it was not.  kernels: of these tiles, nowhere negative.  channel,
+        weight: (height, width); the bridges have no weight.
         """
         light, weights = self.padded(channel), self.padded(weight)
-        corners, patch = list(self.grid.corners()), self.patch
+        corners, patch, margin = list(self.grid.corners()), self.patch, self.margin
         for number, kernel in zip(numbers, _kernel_spectra(kernels, self.size), strict=True):
             top, left = corners[number]
             measured = np.zeros((self.size, self.size), np.float32)
             measured[:patch, :patch] = weights[top : top + patch, left : left + patch]
-            self.settled[number] = cv2.dft(_sharpened(self.periodic(light, top, left), kernel, measured))
+            recorded = self.periodic(light, top, left)
+            found = _sharpened(recorded, kernel, measured)
+            rest = cv2.min(found, top_light)
+            lamp = cv2.subtract(found, rest)
+            blurred_rest, blurred_lamp = (_through(part, self.kernels[number], True) for part in (rest, lamp))
+            left_over = recorded - blurred_lamp - blurred_rest
+            self._tamed[number] = cv2.dft(cv2.add(blurred_rest, cv2.multiply(measured, left_over)))
+            near = cv2.max(_through(blurred_lamp, self.kernels[number], False), 0.0)
+            share = near / (near + np.float32(LAMP_DOUBT * top_light))
+            inner = np.s_[margin : margin + self.grid.side, margin : margin + self.grid.side]
+            self._lamps[number] = share[inner].copy(), (lamp + share * rest)[inner]
+
+    def with_lamps(self, picture: Image) -> Image:
+        """A picture (height, width) restored from tamed tiles, with the lamps that were taken out of them.
+
+        Along a lamp's streak the steps' own light is taken: what the movie's codec got wrong there is a part of the
+        lamp's light, and a linear filter would carry it on.
+        """
+        if not self._lamps:
+            return picture
+        grid, side = self.grid, self.grid.side
+        shares, lamps = np.zeros((2, grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
+        corners = list(grid.corners())
+        for number, parts in self._lamps.items():
+            top, left = corners[number]
+            for part, whole in zip(parts, (shares, lamps), strict=True):
+                cv2.accumulateProduct(part, self._windows[number], whole[top : top + side, left : left + side])
+        shares, lamps = (whole[: grid.height, : grid.width] for whole in (shares, lamps))
+        return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), lamps)
 
     def spectra(self, channel: Image, border: int = cv2.BORDER_REPLICATE) -> Iterator[Image]:
-        """Spectrum of each tile of a channel (height, width); of settled tiles that of their solution."""
+        """Spectrum of each tile of a channel (height, width)."""
         padded = self.padded(channel, border)
-        for number, (top, left) in enumerate(self.grid.corners()):
-            known = self.settled.get(number)
-            yield cv2.dft(self.periodic(padded, top, left)) if known is None else known
+        for top, left in self.grid.corners():
+            yield cv2.dft(self.periodic(padded, top, left))
 
-    def solutions(
-        self, projected: Iterable[Image], inner: Image, at_border: Image, unless_settled: bool = False
-    ) -> Iterator[Image]:
-        """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border.
-
-        A settled tile's own spectrum, or with ``unless_settled``, nothing.
-        """
-        for number, (spectrum, power) in enumerate(zip(projected, self.powers, strict=True)):
-            if number in self.settled:
-                yield np.zeros_like(spectrum) if unless_settled else self.settled[number]
-            else:
-                yield cv2.divide(spectrum, cv2.add(power, at_border if self.at_border[number] else inner))
+    def solutions(self, projected: Iterable[Image], inner: Image, at_border: Image) -> Iterator[Image]:
+        """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border."""
+        for spectrum, power, border in zip(projected, self.powers, self.at_border, strict=True):
+            yield cv2.divide(spectrum, cv2.add(power, at_border if border else inner))
 
     def pulled(self, projected: Iterable[Image], pull: Image, inner: float, at_border: float) -> Iterator[Image]:
         """Each tile's spectrum plus that of a picture (height, width) times a factor, of tiles inside or at the border.
@@ -143,16 +174,18 @@ class TileDeconvolution:
 def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
     """Richardson-Lucy over a periodic tile."""
 
-    def through(picture: Image, forward: bool) -> Image:
-        return cv2.idft(cv2.mulSpectrums(cv2.dft(picture), kernel, 0, conjB=forward), flags=cv2.DFT_SCALE)
-
     def blur(sharp: Image) -> Image:
-        return through(sharp, True)
+        return _through(sharp, kernel, True)
 
     def unblur(seen: Image) -> Image:
-        return through(seen, False)
+        return _through(seen, kernel, False)
 
     return richardson_lucy(tile, blur, unblur, tile, weight, SETTLING_ITERATIONS, SETTLING_RELAXATION)
+
+
+def _through(picture: Image, kernel: Image, forward: bool) -> Image:
+    """A periodic tile blurred by a kernel's spectrum, or with ``forward`` False, by its transpose."""
+    return cv2.idft(cv2.mulSpectrums(cv2.dft(picture), kernel, 0, conjB=forward), flags=cv2.DFT_SCALE)
 
 
 def quick_grid(height: int, width: int, side: int, margin: int, overlap_parts: int) -> TileGrid:
