@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from virest.app import cli, diagnose
+from virest.app.simulate import simulate_command
 from virest.camera.profile import parse_profile, read_profile
 from virest.diagnosis.findings import (
     Diagnosis,
@@ -250,3 +251,23 @@ def test_what_cannot_be_read_is_said(tiny: Path, tmp_path: Path, ladder) -> None
     assert run(tiny, "--out", tmp_path / "file") == 8
     assert run() == 2
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.scenario
+def test_a_readout_that_is_half_as_long_is_found(tmp_path: Path, monkeypatch) -> None:
+    """From a simulated capture to the right cause, its size within its deviation, and neighbours that agree."""
+    monkeypatch.setattr(diagnose, "draw_figures", DRAW_FIGURES)
+    size = {"width": 256, "height": 192, "frames": 24, "readout_ms": 24.0, "rate_rad_s": 1.1, "noise_levels": 1.0}
+    simulate_command(tmp_path / "trip", **size, effects=["readout_time=0.012"], seed=3)  # type: ignore[arg-type]
+    assert run(tmp_path / "trip", "--out", tmp_path / "out", "--check", "-q") == 10
+    facts = json.loads((tmp_path / "out/trip/diagnosis.json").read_text())
+    assert facts["verdict"] == "explained"
+    cause = facts["causes"][0]
+    assert cause["name"] == "readout_time"
+    found = cause["parameters"]["readout_time_s"]
+    assert found["estimate"] == pytest.approx(0.012, abs=4 * found["std"])
+    assert cause["held_out"]["gain"] > 0.9
+    gain = facts["restoration_gain"]
+    assert gain["disagreement_after_px"] < 0.4 * gain["disagreement_before_px"]
+    assert all((tmp_path / "out/trip" / path).is_file() for path in cause["figures"])
+    assert read_profile(tmp_path / "out/trip/extended.yaml").shutter.readout_time_s == pytest.approx(found["estimate"])

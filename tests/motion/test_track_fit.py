@@ -111,7 +111,7 @@ def test_deviations_hold() -> None:
     """Over 20 hands and noises the errors are about as large as the deviations say, none many times larger."""
     scores, terms = [], (terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.GYRO_BIAS)
     for seed in range(200, 220):
-        fitted = fitted_from(Recording(Setup(seed=seed, frames=25, points=20)), terms)
+        fitted = fitted_from(Recording(Setup(seed=seed, frames=22, points=18)), terms)
         scores.append(errors(fitted) / deviations(fitted))
     score = np.array(scores)
     assert score.shape == (20, 5)

@@ -61,7 +61,9 @@ def test_points_far_away_are_predicted_to_a_hundredth_of_a_pixel(setup: Setup) -
 
 @pytest.mark.parametrize("windows", [None, WINDOWS], ids=["one window", "two windows"])
 @pytest.mark.parametrize("setup", NEAR.values(), ids=NEAR)
-def test_points_on_a_wall_are_predicted_to_a_hundredth_of_a_pixel(setup: Setup, windows: list[list[int]] | None) -> None:
+def test_points_on_a_wall_are_predicted_to_a_hundredth_of_a_pixel(
+    setup: Setup, windows: list[list[int]] | None
+) -> None:
     """Turning and swaying before a wall, with the true velocity, gravity, bias, delay and plane of each window."""
     recording, table = recorded(setup), recorded(setup).table(windows)
     known = ground(recording.imu, recording.profile, translation=True)

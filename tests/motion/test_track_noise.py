@@ -35,7 +35,9 @@ def test_each_pair_has_its_own_noise() -> None:
     """Pairs five times noisier are told as such, in their order."""
     rng = np.random.default_rng(7)
     pairs = [
-        replace(pair, points_second_px=pair.points_second_px + rng.normal(0, 1.0 if k % 3 == 0 else 0.0, (len(pair), 2)))
+        replace(
+            pair, points_second_px=pair.points_second_px + rng.normal(0, 1.0 if k % 3 == 0 else 0.0, (len(pair), 2))
+        )
         for k, pair in enumerate(recorded(HAND).pairs)
     ]
     found = step_noise_px(pairs)
@@ -73,4 +75,4 @@ def test_few_points_take_a_flow_of_lower_order(points: int) -> None:
 def test_perfect_tracks_have_a_least_noise() -> None:
     """Points that follow a flow exactly are still not trusted without end."""
     first = np.random.default_rng(3).uniform(0, 400, (60, 2))
-    assert step_noise_px([TrackPair(0, 1, first, first + (3.0, -2.0))]) == pytest.approx(0.01)
+    assert step_noise_px([TrackPair(0, 1, first, first + np.array([3.0, -2.0]))]) == pytest.approx(0.01)

@@ -9,6 +9,7 @@ import yaml
 from capture_files import SMALL, read_imu, read_movie, read_stamps
 from scipy.spatial.transform import Rotation
 
+from virest.app import cli
 from virest.app.recreate import simulate_like
 from virest.app.simulate import simulate_command
 from virest.camera.intrinsics import Intrinsics
@@ -169,3 +170,23 @@ def test_what_cannot_be_taken_again_is_said(lively, tmp_path):
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(content))
     facts = simulate_like(tmp_path / "a", lively, config=tmp_path / "camera.yaml", frames=slice(0, 2))
     assert facts["blur_px"] > 0
+
+
+def test_the_command_takes_the_camera_and_the_times_from_the_capture(lively, tmp_path, capfd):
+    """``--like``: --frames A:B chooses; what would be ignored is refused (2), what is no capture too (4)."""
+    again = tmp_path / "again"
+    assert cli.run(["simulate", str(again), "--like", str(lively), "--frames", "1:4", "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert (facts["frames"], facts["width"], facts["effects"]) == (3, 160, [])
+    assert cli.run(["simulate", str(again), "--like", str(lively)]) == 8
+    assert cli.run(["simulate", str(again), "--like", str(lively), "--frames", "2", "--overwrite"]) == 0
+    assert len(read_stamps(again)) == 2
+    for arguments, code in (
+        (["--like", str(lively), "--width", "320"], 2),
+        (["--like", str(tmp_path / "nowhere")], 4),
+        (["--frames", "1:4"], 2),
+        (["--like", str(lively), "--frames", "a:b"], 2),
+        (["--like", str(lively), "--effect", "flikker"], 3),
+    ):
+        assert cli.run(["simulate", str(tmp_path / "none"), *arguments]) == code, arguments
+    assert not (tmp_path / "none").exists()

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.outputs import RunFolder, json_line, write_picture, write_whole
+from virest.app.memory import keep_freed_memory
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.video import MovieIndex, read_frames
@@ -259,6 +260,7 @@ def prepare_worker() -> None:
     """One thread a process: the pool is the parallelism, and sums do not depend on the number of cores."""
     if os.getpid() not in _prepared:
         cv2.setNumThreads(1)
+    keep_freed_memory()
         _prepared.append(os.getpid())
 
 

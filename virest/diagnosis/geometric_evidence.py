@@ -24,6 +24,8 @@ RAYLEIGH_MEDIAN = 1.1774
 CAUCHY = 2.4
 BLOCK_LENGTHS = (7, 11, 8, 13, 9)
 """Pairs in a block of time, in turn: fixed lengths beat with periodic faults."""
+FULL_LENGTH_PAIRS = 60
+"""With fewer pairs blocks are shorter, so that there are some six of them."""
 TILT_STD_PER_M, KNOWN_DEPTH_STD = 0.3, 0.01
 START_INVERSE_DEPTH_PER_M = 0.5
 MIN_SWAY_DEPTH_PER_M = 1e-4
@@ -82,9 +84,9 @@ class Evidence:
 def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
     """Number the blocks of time."""
     sizes: list[int] = []
-    total = 0
+    total, part = 0, min(len(observed.pairs) / FULL_LENGTH_PAIRS, 1.0)
     while total < len(observed.pairs):
-        sizes.append(BLOCK_LENGTHS[len(sizes) % len(BLOCK_LENGTHS)])
+        sizes.append(max(round(part * BLOCK_LENGTHS[len(sizes) % len(BLOCK_LENGTHS)]), 1))
         total += sizes[-1]
     block = np.repeat(np.arange(len(sizes)), sizes)[: len(observed.pairs)]
     return Evidence(imu, observed, block)

@@ -33,7 +33,7 @@ from virest.diagnosis.findings import (
 )
 from virest.diagnosis.geometric_evidence import Evidence, make_evidence
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, climb, findings_of, refit
-from virest.diagnosis.picture_ladder import Reader, climb_blur, climb_photometry
+from virest.diagnosis.picture_ladder import Reader, climb_blur, climb_photometry, judge_curve
 from virest.diagnosis.start_up import lag_schedules
 from virest.diagnosis.structure import Structure, structures
 from virest.errors import CaptureError
@@ -90,8 +90,8 @@ def diagnose_capture(
     evidence = make_evidence(capture.imu, observed)
     say("points", 0.15)
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
-    rungs_allowed = MAX_RUNGS if follows else 0
-    if not follows:
+    rungs_allowed = MAX_RUNGS if follows or schedules else 0
+    if not rungs_allowed:
         notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
     geometric = climb(
         evidence, start, null_terms, schedules, far_off_s, lambda part: say("points", 0.15 + 0.4 * part), rungs_allowed
@@ -102,7 +102,7 @@ def diagnose_capture(
     trajectory = integrate_gyro(capture.imu, found)
     say("brightness", 0.55)
     moves_right = not _points_left(geometric).significant
-    photometric = climb_photometry(capture, frames, found, trajectory, pictures, gray if moves_right else None)
+    photometric = climb_photometry(capture, frames, found, trajectory, pictures)
     say("blur", 0.8)
     hypothesis = _exposure_hypothesis(findings, observed.exposure_s)
     blurred, is_exposure = picture_ladder.PictureVerdict(photometric.profile), False
@@ -114,9 +114,14 @@ def diagnose_capture(
     if is_exposure and hypothesis is not None:
         findings = _as_exposure(evidence, geometric, findings, hypothesis, float(np.median(observed.exposure_s)))
         blurred = _one_exposure(blurred)
-    say("what is left", 0.95)
-    extended = _merged(geometric.model.profile, photometric.profile, blurred.profile, is_exposure, hypothesis)
-    findings = [*findings, *photometric.findings, *blurred.findings]
+    extended = _merged(geometric.model.profile, photometric.profile, blurred.profile, is_exposure)
+    say("curve", 0.92)
+    curve = picture_ladder.PictureVerdict(extended)
+    if moves_right:
+        curve = judge_curve(extended, photometric.observations, frames, trajectory, gray)
+        extended = curve.profile
+    say("what is left", 0.97)
+    findings = [*findings, *photometric.findings, *blurred.findings, *curve.findings]
     findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
     remaining = _remaining(geometric, photometric)
     verdict = UNEXPLAINED if remaining.significant else EXPLAINED if findings else CONSISTENT
@@ -124,9 +129,9 @@ def diagnose_capture(
         geometric.nominal_rms_px, geometric.noise_px, photometric.photometric_rms, blurred.blur_rms_px,
         observed.tracks, len(indices),
     )  # fmt: skip
-    rungs = (*geometric.rungs, *photometric.rungs, *blurred.rungs)
+    rungs = (*geometric.rungs, *photometric.rungs, *blurred.rungs, *curve.rungs)
     residuals = {"before": _residuals(evidence, geometric, True), "after": _residuals(evidence, geometric, False)}
-    all_notes = (*notes, *geometric.notes, *photometric.notes, *blurred.notes)
+    all_notes = (*notes, *geometric.notes, *photometric.notes, *blurred.notes, *curve.notes)
     return Diagnosis(
         verdict, nominal, tuple(findings), remaining, geometric.nominal.profile, extended, rungs, residuals, all_notes
     )
@@ -140,8 +145,8 @@ def _with_null_values(
 ) -> tuple[CameraProfile, list[Term], list[str], float, bool]:
     """The profile with unknown values begun somewhere, the terms to fit on every rung, and a far-off time offset.
 
-    The last two: how far from the profile's offset the turns of pictures and gyroscope agree best, and whether they agree
-    at all, as far as the camera turns.
+    The last two: how far from the profile's offset the turns of pictures and gyroscope agree best, and whether they
+    agree at all, as far as the camera turns.
     """
     terms: list[Term] = []
     notes: list[str] = []
@@ -297,7 +302,6 @@ def _merged(
     lit: CameraProfile,
     blurred: CameraProfile,
     is_exposure: bool,
-    scale: float | None,
 ) -> CameraProfile:
     """Every cause in one profile: geometry from the first, light from the second, blur from the third."""
     light = lit.extensions

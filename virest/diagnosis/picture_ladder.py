@@ -79,12 +79,8 @@ def climb_photometry(
     profile: CameraProfile,
     trajectory: Trajectory,
     rgb: Reader,
-    gray: Reader | None,
 ) -> PictureVerdict:
-    """Find what changes the brightness of patches; frames at their true times.
-
-    gray: for the curve at constant exposure, which needs blur paths that are right; None: left out.
-    """
+    """Find what changes the brightness of patches; frames at their true times."""
     verdict = PictureVerdict(profile)
     if not frames:
         verdict.notes.append("no frame at a known time: brightness not judged")
@@ -96,8 +92,6 @@ def climb_photometry(
         verdict.notes.append("too few flat patches are seen again: brightness not judged")
     else:
         _climb(verdict, observations, len(capture.frames))
-    if gray is not None:
-        _mixing(verdict, frames, trajectory, gray)
     return verdict
 
 
@@ -212,9 +206,26 @@ def _shown(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def _mixing(verdict: PictureVerdict, frames: Sequence[Frame], trajectory: Trajectory, gray: Reader) -> None:
-    """Gamma or black level from how blur mixes light, where nothing else tells them."""
-    observations = verdict.observations
+def judge_curve(
+    profile: CameraProfile,
+    observations: PhotometricObservations | None,
+    frames: Sequence[Frame],
+    trajectory: Trajectory,
+    gray: Reader,
+) -> PictureVerdict:
+    """Gamma or black level from how blur mixes light, where nothing else tells them; paths must be right by now."""
+    verdict = PictureVerdict(profile)
+    _mixing(verdict, observations, frames, trajectory, gray)
+    return verdict
+
+
+def _mixing(
+    verdict: PictureVerdict,
+    observations: PhotometricObservations | None,
+    frames: Sequence[Frame],
+    trajectory: Trajectory,
+    gray: Reader,
+) -> None:
     if observations is not None and _light_spread(observations) >= VARIED_LIGHT:
         return
     usable = [frame for frame in frames if frame.exposure_s]

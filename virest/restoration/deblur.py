@@ -421,8 +421,11 @@ def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) 
 
 
 def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
-    """Hyper-Laplacian over the whole operator; censored pixels have no weight, but where all is clipped, as a bound."""
-    operator = _whole_operator(blurred)
+    """Hyper-Laplacian over the whole operator; censored pixels have no weight, but where all is clipped, as a bound.
+
+    Near clipped light the tiles' solution stays: its lamps were found with light held positive.
+    """
+    operator, near = _whole_operator(blurred), near_clipped(blurred)
     statistics = blurred.statistics
     first = _by_tile_hyper_laplacian(blurred, replace(settings, iterations=5))
     reach = _path_reach(blurred) if any(c is not None for c in blurred.clipped) else None
@@ -444,7 +447,8 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
             bound,
         )
         inner = _inner(result, operator.border)
-        sharp.append(inner if bound is None else np.where(bound > 0, np.maximum(inner, light), inner))
+        inner = inner if bound is None else np.where(bound > 0, np.maximum(inner, light), inner)
+        sharp.append(inner if near is None else inner + near * (start - inner))
     return sharp
 
 

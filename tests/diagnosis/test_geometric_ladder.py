@@ -1,0 +1,201 @@
+"""The geometric ladder on tracks made without pictures: it names what was hidden, with its size, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from motion.synthetic_tracks import Recording, Setup
+
+from virest.camera.profile import CameraProfile
+from virest.diagnosis import geometric_ladder
+from virest.diagnosis.findings import Finding, ParameterChange
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, effect_named
+from virest.diagnosis.geometric_evidence import (
+    BLOCK_LENGTHS,
+    Evidence,
+    Model,
+    base_scene,
+    capped_rms,
+    depth_of,
+    loss,
+    make_evidence,
+)
+from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_of, rotation_between, total_change
+from virest.motion import profile_terms as terms_of
+from virest.motion.scene_motion import DirectedMotion, InertialMotion
+
+HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
+WALL = Setup(seed=62, frames=49, points=20, sway_m=0.05, plane_per_m=(0.05, -0.1, 0.6), gyro_noise_rad_s=0.001)
+
+
+@lru_cache(maxsize=2)
+def recorded(setup: Setup) -> Recording:
+    """Make each recording once."""
+    return Recording(setup)
+
+
+def evidence(setup: Setup) -> Evidence:
+    """What the ladder is given of a recording; inertial samples cut short, for they take most of the time."""
+    camera = recorded(setup)
+    return make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), camera.observed)
+
+
+def climbed(setup: Setup, nominal: CameraProfile) -> tuple[GeometricVerdict, list[Finding]]:
+    """Climb from a nominal profile."""
+    verdict = climb(evidence(setup), nominal, (), ())
+    return verdict, findings_of(verdict)
+
+
+def assert_explained(verdict: GeometricVerdict, noise_px: float) -> None:
+    """Whatever the nominal profile left, nothing but noise is left at the end, and the last rung is empty."""
+    assert verdict.nominal_rms_px > 1.5 * noise_px
+    assert verdict.final_rms_px == pytest.approx(noise_px, rel=0.1)
+    assert verdict.rungs[-1].entered is None
+    assert [rung.entered for rung in verdict.rungs[:-1]] == [entry.name for entry in verdict.accepted]
+
+
+def assert_holds(change: ParameterChange, nominal: object, truth: object) -> None:
+    """The nominal value is told as given, and the truth lies within four deviations of the estimate."""
+    np.testing.assert_allclose(change.nominal, nominal)
+    assert (np.abs(np.subtract(change.estimate, truth)) < 4 * np.array(change.std)).all()
+    assert (np.array(change.std) < 0.3 * np.abs(np.subtract(nominal, truth)).max()).all()
+
+
+def test_a_true_profile_is_left_alone() -> None:
+    """Where nothing is hidden nothing is named, and both residuals are the noise."""
+    verdict, found = climbed(HAND, recorded(HAND).profile)
+    assert found == []
+    assert [rung.entered for rung in verdict.rungs] == [None]
+    assert verdict.nominal_rms_px == verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+    assert verdict.model.profile == recorded(HAND).profile
+
+
+def test_an_offset_and_a_bias_are_named_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """9 ms and 0.02 rad/s hidden at once, among the causes most like them: two rungs, two findings, both right."""
+    alike = ("time_offset", "timestamp_reference", "readout_time", "gyro_bias", "imu_rotation", "focal_length")
+    monkeypatch.setattr(geometric_ladder, "GEOMETRIC_EFFECTS", tuple(map(effect_named, alike)))
+    truth = recorded(HAND).profile
+    wrong_bias = (-0.011, 0.012, -0.009)
+    nominal = replace(truth, time_offset_s=0.022, gyro_bias_rad_s=wrong_bias)
+    verdict, found = climbed(HAND, nominal)
+    assert {finding.name for finding in found} == {"time_offset", "gyro_bias"}
+    assert_explained(verdict, HAND.noise_px)
+    named = {finding.name: finding for finding in found}
+    assert_holds(named["time_offset"].parameters["time_offset_s"], 0.022, truth.time_offset_s)
+    assert_holds(named["gyro_bias"].parameters["gyro_bias_rad_s"], wrong_bias, truth.gyro_bias_rad_s)
+    for finding in found:
+        assert finding.p_value < 1e-5
+        assert finding.held_out.after < finding.held_out.before
+        assert finding.sentence
+
+
+def test_a_readout_of_the_wrong_sense_is_named() -> None:
+    """Read downwards, told as upwards: the word is found, and no other cause with it."""
+    truth = recorded(HAND).profile
+    nominal = replace(truth, shutter=replace(truth.shutter, readout_direction="bottom_to_top"))
+    verdict, found = climbed(HAND, nominal)
+    assert [finding.name for finding in found] == ["readout_direction"]
+    change = found[0].parameters["readout_direction"]
+    assert (change.nominal, change.estimate, change.std) == ("bottom_to_top", "top_to_bottom", None)
+    assert_explained(verdict, HAND.noise_px)
+    assert verdict.model.profile.shutter == truth.shutter
+
+
+def test_a_depth_is_found_before_a_wall() -> None:
+    """The distance along the optical axis, the median over the frames, within four deviations of the truth."""
+    recording, given = recorded(WALL), evidence(WALL)
+    profile = replace(recording.profile, depth_m=None)
+    model = Model(profile, None, ())
+    table = given.table(model, 1500)
+    scene = base_scene(given, profile, table)
+    assert isinstance(scene, InertialMotion)
+    depth_m, std = depth_of(given.fit(replace(model, scene=scene), (), table), table)
+    middle_s = recording.stamp_s + recording.setup.time_offset_s + 0.014
+    sight = recording.orientation(middle_s).apply([0.0, 0.0, 1.0])
+    plane, moved = np.array(WALL.plane_per_m), recording.position(middle_s) - recording.position(middle_s[24:25])
+    truth = float(np.median((1 - moved @ plane) / (sight @ plane)))
+    assert abs(depth_m - truth) < 4 * std + 0.01
+    assert std < 0.15 * truth
+
+
+# ── the ladder's parts ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_scene_is_what_the_profile_allows() -> None:
+    """Infinitely far: none. A depth, or none given: a wall. Without an accelerometer: a direction a pair."""
+    given, profile = evidence(WALL), recorded(WALL).profile
+    table = given.table(Model(profile, None, ()), 500)
+    assert base_scene(given, replace(profile, depth_m=np.inf), table) is None
+    wall = base_scene(given, replace(profile, depth_m=2.5), table)
+    assert isinstance(wall, InertialMotion)
+    assert np.linalg.norm(wall.plane_per_m[0]) == pytest.approx(0.4)
+    assert wall.plane_std_per_m[2] < wall.plane_std_per_m[0]
+    blind = replace(given, imu=replace(given.imu, accel_m_s2=np.full_like(given.imu.accel_m_s2, np.nan)))
+    free = base_scene(blind, replace(profile, depth_m=None), table)
+    assert isinstance(free, DirectedMotion)
+    assert len(free.direction) == table.n_pairs
+
+
+def test_blocks_have_lengths_that_differ() -> None:
+    """Every pair has a block; blocks rise one by one and are as long as the list says, the last one cut."""
+    block = evidence(HAND).block
+    assert len(block) == len(recorded(HAND).pairs)
+    assert set(np.diff(block)) <= {0, 1}
+    counts = np.bincount(block)
+    np.testing.assert_array_equal(counts[:-1], [BLOCK_LENGTHS[k % 5] for k in range(len(counts) - 1)])
+    assert len(set(counts[:4])) == 4
+
+
+def test_a_lag_shows_later_captures_in_early_slots() -> None:
+    """The table's stamps are those of the pictures that the slots really show."""
+    given = evidence(HAND)
+    lag = (0.06, 0.06, 0.03, *[0.0] * 34)
+    plain, late = (given.table(Model(recorded(HAND).profile, None, (), lag=way), 10**6) for way in ((), lag))
+    np.testing.assert_allclose(late.first_stamp_s - plain.first_stamp_s, np.array(lag)[plain.first])
+    np.testing.assert_allclose(late.second_stamp_s - plain.second_stamp_s, np.array(lag)[plain.second])
+
+
+def test_a_fit_of_some_pairs_is_judged_on_all() -> None:
+    """Fitted on the even blocks, a wrong offset is put right on the odd ones too, and its distances are unit noise."""
+    given, profile = evidence(HAND), terms_of.shift_offset(recorded(HAND).profile, np.array([0.006]))
+    model = Model(profile, None, ())
+    table = given.table(model, 10**6)
+    fitted = given.fit(model, (terms_of.TIME_OFFSET,), table, given.block % 2 == 0)
+    distance = given.distances(fitted, table)
+    assert len(distance) == len(table) > len(fitted.distance)
+    odd = given.block[table.pair] % 2 == 1
+    assert capped_rms(distance[odd]) == pytest.approx(1.0, rel=0.1)
+    assert capped_rms(given.distances(given.fit(model, (), table), table)[odd]) > 2
+
+
+def test_lost_tracks_do_not_decide() -> None:
+    """Two tracks in a hundred a thousand deviations off raise the capped rms by a tenth and the loss by a fifth."""
+    distance = np.random.default_rng(3).rayleigh(1.0, 4000)
+    astray = np.where(np.arange(4000) % 50 == 0, 1000.0, distance)
+    assert capped_rms(distance) == pytest.approx(1.0, rel=0.03)
+    assert capped_rms(astray) < 1.15
+    assert loss(astray, 1.0).mean() - loss(distance, 1.0).mean() < 0.25
+    assert capped_rms(3 * distance) == pytest.approx(3 * capped_rms(distance))
+
+
+@pytest.mark.parametrize("effect", [e for e in GEOMETRIC_EFFECTS if e.term is not None], ids=lambda e: e.name)
+def test_the_total_change_is_what_a_term_changed(effect: object) -> None:
+    """Read back from two profiles, whatever the term: the values that were put in."""
+    entry = effect_named(effect.name)  # type: ignore[attr-defined]
+    assert entry.term is not None
+    profile = recorded(HAND).profile
+    step = np.array([0.004, -0.007, 0.011])[: len(entry.term)]
+    found = total_change(entry, profile, entry.term.change(profile, step))
+    # a stabiliser's cutoff has no nought to count from
+    known = slice(0, 1) if entry.name == "stabilisation" else slice(None)
+    np.testing.assert_allclose(found[known], step[known], atol=1e-9)
+
+
+def test_rotations_between_profiles_are_vectors() -> None:
+    """Up to a quarter turn, on the left of the nominal mounting."""
+    profile = recorded(HAND).profile
+    vector = np.array([0.3, -0.8, 0.5])
+    np.testing.assert_allclose(rotation_between(profile, terms_of.rotate_imu(profile, vector)), vector, atol=1e-9)

@@ -1,0 +1,47 @@
+"""Lag schedules of hand-made repeats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Capture, CaptureMetadata, Frame
+from virest.diagnosis.start_up import EXTRA_PERIODS, lag_schedules
+
+PERIOD_S = 0.04
+
+
+def capture(frames: int) -> Capture:
+    """A movie of 25 frames a second that drops one in the middle."""
+    stamp_s = PERIOD_S * (np.arange(frames) + (np.arange(frames) > frames // 2))
+    imu = ImuSamples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    records = tuple(Frame(k, 0, float(t)) for k, t in enumerate(stamp_s))
+    return Capture("c", Path("c"), Path("c"), 64, 48, records, imu, CaptureMetadata(), "REALTIME", 0)
+
+
+def test_without_repeats_there_is_nothing_to_try() -> None:
+    """No repeat, no schedule."""
+    assert lag_schedules(capture(30), []) == []
+
+
+def test_each_repeat_uses_up_a_period() -> None:
+    """Repeats at 2, 5 and 6 of thirty: three periods late at first, two from slot 2, one from 5, none from 6 on."""
+    ((lag_s, last, seconds),) = lag_schedules(capture(30), [5, 2, 6])
+    assert lag_s == pytest.approx(3 * PERIOD_S)
+    assert last == 6
+    expected = [3, 3, 2, 2, 2, 1, 0, *[0] * 23]
+    np.testing.assert_allclose(seconds, PERIOD_S * np.array(expected), atol=1e-12)
+    assert all(isinstance(value, float) for value in seconds)
+
+
+def test_a_recording_that_ends_while_it_lags_may_lag_longer() -> None:
+    """Repeats up to the movie's end leave open what was left: every schedule a constant above the first."""
+    found = lag_schedules(capture(12), [3, 10])
+    assert [entry[0] for entry in found] == pytest.approx([PERIOD_S * (2 + extra) for extra in EXTRA_PERIODS])
+    assert [entry[1] for entry in found] == [10] * len(EXTRA_PERIODS)
+    base = np.array([2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 0, 0])
+    for extra, (_, _, seconds) in zip(EXTRA_PERIODS, found, strict=True):
+        np.testing.assert_allclose(seconds, PERIOD_S * (base + extra), atol=1e-12)
