@@ -260,7 +260,7 @@ def prepare_worker() -> None:
     """One thread a process: the pool is the parallelism, and sums do not depend on the number of cores."""
     if os.getpid() not in _prepared:
         cv2.setNumThreads(1)
-    keep_freed_memory()
+        keep_freed_memory()
         _prepared.append(os.getpid())
 
 
