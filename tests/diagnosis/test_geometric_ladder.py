@@ -15,6 +15,7 @@ from virest.diagnosis.findings import Finding, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, effect_named
 from virest.diagnosis.geometric_evidence import (
     BLOCK_LENGTHS,
+    FULL_LENGTH_PAIRS,
     Evidence,
     Model,
     base_scene,
@@ -140,13 +141,14 @@ def test_the_scene_is_what_the_profile_allows() -> None:
 
 
 def test_blocks_have_lengths_that_differ() -> None:
-    """Every pair has a block; blocks rise one by one and are as long as the list says, the last one cut."""
+    """Every pair has a block; blocks rise one by one, as the list says but shorter for few pairs, the last one cut."""
     block = evidence(HAND).block
     assert len(block) == len(recorded(HAND).pairs)
     assert set(np.diff(block)) <= {0, 1}
     counts = np.bincount(block)
-    np.testing.assert_array_equal(counts[:-1], [BLOCK_LENGTHS[k % 5] for k in range(len(counts) - 1)])
-    assert len(set(counts[:4])) == 4
+    part = min(len(block) / FULL_LENGTH_PAIRS, 1.0)
+    np.testing.assert_array_equal(counts[:-1], [round(part * BLOCK_LENGTHS[k % 5]) for k in range(len(counts) - 1)])
+    assert len(set(counts[:4])) >= 3
 
 
 def test_a_lag_shows_later_captures_in_early_slots() -> None:

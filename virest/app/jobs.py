@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.outputs import RunFolder, json_line, write_picture, write_whole
 from virest.app.memory import keep_freed_memory
+from virest.app.outputs import RunFolder, json_line, write_picture, write_whole
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.video import MovieIndex, read_frames

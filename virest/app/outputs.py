@@ -33,6 +33,8 @@ from virest.errors import OutputError, RestorationError
 
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
 PART = re.compile(r".*\.[0-9a-f]{8}\.part")
+BESIDE = ("diagnosis.json", "extended.yaml", "figures")
+"""What `diagnose` writes into the same folder: no obstacle for a run, and none of its files."""
 REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs")
 SIGNIFICANT_DIGITS = 10
 
@@ -219,7 +221,8 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
         if old is not None:
             return found, old  # type: ignore[return-value]
     try:
-        foreign = [p.name for p in run.path.iterdir() if p != run.lock] if run.path.is_dir() else []
+        inside = run.path.iterdir() if run.path.is_dir() else ()
+        foreign = [p.name for p in inside if p != run.lock and p.name not in BESIDE]
     except OSError as error:
         raise output_error(run.path, error) from error
     if foreign:

@@ -101,6 +101,7 @@ class GeometricVerdict:
     rungs: list[Rung]
     nominal: Model
     nominal_fit: TrackFit
+    nominal_table: TrackTable
     nominal_rms_px: float
     final_rms_px: float
     noise_px: float
@@ -158,6 +159,8 @@ class _Judged:
     candidate: Candidate
     block_loss: Array
     """(blocks,) mean held-out loss a point."""
+    pair_loss: Array
+    """(pairs,) the same."""
     rms: float
     """Held-out, in units of the typical noise."""
 
@@ -182,6 +185,8 @@ def _rung(
     nothing = Rung(None, table, before.rms * evidence.typical_px, GEOMETRY)
     for best in sorted(judged, key=lambda j: float(j.block_loss.mean())):
         gain = before.block_loss - best.block_loss
+        if best.candidate.name == "frame_lag":
+            gain = _lagging_gain(evidence, before, best)
         if gain.mean() < MIN_GAIN * before.block_loss.mean() or _t(gain) < MIN_T:
             continue
         entered, p_value = _significant(evidence, best.candidate, model.profile)
@@ -283,7 +288,18 @@ def _judge(evidence: Evidence, candidate: Candidate, scale: float) -> _Judged:
         distance[held] = evidence.distances(fitted, table)[held]
     block = evidence.block[table.pair]
     counts = np.maximum(np.bincount(block), 1)
-    return _Judged(candidate, np.bincount(block, loss(distance, scale)) / counts, capped_rms(distance))
+    each = loss(distance, scale)
+    by_pair = np.bincount(table.pair, each) / np.maximum(np.bincount(table.pair), 1)
+    return _Judged(candidate, np.bincount(block, each) / counts, by_pair, capped_rms(distance))
+
+
+def _lagging_gain(evidence: Evidence, before: _Judged, after: _Judged) -> Array:
+    """Gain of the pairs that a start-up schedule moves; nothing of it was fitted, so each pair is a judge."""
+    last = after.candidate.model.profile.extensions.frame_lag_frames
+    moved = np.array([pair.first <= last for pair in evidence.observed.pairs])
+    both = min(len(before.pair_loss), len(after.pair_loss), len(moved))
+    gain: Array = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
+    return gain
 
 
 def _t(values: Array) -> float:
@@ -331,11 +347,6 @@ def p_of(
     return float(stats.chi2.sf(change @ np.linalg.solve(covariance, change), len(change)))
 
 
-def refit(evidence: Evidence, model: Model) -> TrackFit:
-    """The fit of a model's terms on many points."""
-    return _refitted(evidence, model, FINAL_POINTS)[1]
-
-
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -367,7 +378,7 @@ def _conclude(
     nominal_fit = evidence.fit(nominal_model, nominal_model.terms, nominal_table)
     typical = evidence.typical_px
     return GeometricVerdict(
-        model, fitted, table, accepted, rungs, nominal_model, nominal_fit,
+        model, fitted, table, accepted, rungs, nominal_model, nominal_fit, nominal_table,
         capped_rms(nominal_fit.distance) * typical, capped_rms(fitted.distance) * typical, evidence.noise_px, typical,
     )  # fmt: skip
 

@@ -7,16 +7,18 @@ they should be; then brightness, then blur.  What is left is tested for structur
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.records import NO_STAMP, Capture, Frame
+from virest.degradation.light import flicker
 from virest.diagnosis import picture_ladder
 from virest.diagnosis.findings import (
     CONSISTENT,
@@ -31,10 +33,10 @@ from virest.diagnosis.findings import (
     Remaining,
     Rival,
 )
-from virest.diagnosis.geometric_evidence import Evidence, make_evidence
-from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, climb, findings_of, refit
+from virest.diagnosis.geometric_evidence import make_evidence
+from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, climb, findings_of
 from virest.diagnosis.picture_ladder import Reader, climb_blur, climb_photometry, judge_curve
-from virest.diagnosis.start_up import lag_schedules
+from virest.diagnosis.start_up import Schedule, lag_schedules
 from virest.diagnosis.structure import Structure, structures
 from virest.errors import CaptureError
 from virest.motion import profile_terms as terms_of
@@ -87,38 +89,44 @@ def diagnose_capture(
             f"{len(observed.pairs)} pairs of frames have points to follow, {MIN_PAIRS} are needed",
             hint="a longer capture, or one with more texture",
         )
-    evidence = make_evidence(capture.imu, observed)
     say("points", 0.15)
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
     rungs_allowed = MAX_RUNGS if follows or schedules else 0
     if not rungs_allowed:
         notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
-    geometric = climb(
-        evidence, start, null_terms, schedules, far_off_s, lambda part: say("points", 0.15 + 0.4 * part), rungs_allowed
-    )
-    findings = _stamped(geometric, findings_of(geometric), observed.exposure_s)
-    found = geometric.model.profile
+    points = _Points(capture, observed, start, tuple(null_terms), schedules, far_off_s, rungs_allowed)
+    first = geometric = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
     frames = _at_model_times(capture, geometric)
-    trajectory = integrate_gyro(capture.imu, found)
-    say("brightness", 0.55)
+    trajectory = integrate_gyro(capture.imu, geometric.model.profile)
+    say("brightness", 0.5)
+    photometric = climb_photometry(capture, frames, geometric.model.profile, trajectory, pictures)
+    if _points_left(geometric).significant and _pulses(photometric.profile):
+        say("points again", 0.65)
+        even = _evened(gray, frames, photometric.profile)
+        again = observe_tracks(capture, track_pairs(even([frame.index for frame in frames])), profile)
+        points = replace(points, observed=again.covered(capture.imu, start))
+        geometric = points.climbed(lambda part: say("points again", 0.65 + 0.1 * part))
+    findings = _stamped(geometric, findings_of(geometric), observed.exposure_s)
     moves_right = not _points_left(geometric).significant
-    photometric = climb_photometry(capture, frames, found, trajectory, pictures)
-    say("blur", 0.8)
+    say("blur", 0.75)
     hypothesis = _exposure_hypothesis(findings, observed.exposure_s)
     blurred, is_exposure = picture_ladder.PictureVerdict(photometric.profile), False
     if moves_right:
         shown = replace(capture, frames=tuple(frames))
-        blurred, is_exposure = climb_blur(shown, photometric.profile, trajectory, gray, hypothesis)
+        lit = _merged(geometric.model.profile, photometric.profile, photometric.profile, False)
+        blurred, is_exposure = climb_blur(shown, lit, integrate_gyro(capture.imu, lit), gray, hypothesis)
     else:
         notes.append("points do not go where the model says: blur, and what it does to the curve, were not judged")
     if is_exposure and hypothesis is not None:
-        findings = _as_exposure(evidence, geometric, findings, hypothesis, float(np.median(observed.exposure_s)))
+        exposure = _as_exposure(findings, hypothesis, float(np.median(observed.exposure_s)))
+        geometric = replace(points, start=_exposed(start, hypothesis)).climbed(lambda part: say("points again", 0.8))
+        findings = [exposure, *_stamped(geometric, findings_of(geometric), observed.exposure_s)]
         blurred = _one_exposure(blurred)
     extended = _merged(geometric.model.profile, photometric.profile, blurred.profile, is_exposure)
     say("curve", 0.92)
     curve = picture_ladder.PictureVerdict(extended)
-    if moves_right:
-        curve = judge_curve(extended, photometric.observations, frames, trajectory, gray)
+    if moves_right and not _paths_uncertain(extended, geometric):
+        curve = judge_curve(extended, photometric.observations, frames, integrate_gyro(capture.imu, extended), gray)
         extended = curve.profile
     say("what is left", 0.97)
     findings = [*findings, *photometric.findings, *blurred.findings, *curve.findings]
@@ -126,15 +134,75 @@ def diagnose_capture(
     remaining = _remaining(geometric, photometric)
     verdict = UNEXPLAINED if remaining.significant else EXPLAINED if findings else CONSISTENT
     nominal = Nominal(
-        geometric.nominal_rms_px, geometric.noise_px, photometric.photometric_rms, blurred.blur_rms_px,
+        first.nominal_rms_px, first.noise_px, photometric.photometric_rms, blurred.blur_rms_px,
         observed.tracks, len(indices),
     )  # fmt: skip
     rungs = (*geometric.rungs, *photometric.rungs, *blurred.rungs, *curve.rungs)
-    residuals = {"before": _residuals(evidence, geometric, True), "after": _residuals(evidence, geometric, False)}
+    residuals = {"before": _residuals(first, True), "after": _residuals(geometric, False)}
     all_notes = (*notes, *geometric.notes, *photometric.notes, *blurred.notes, *curve.notes)
     return Diagnosis(
-        verdict, nominal, tuple(findings), remaining, geometric.nominal.profile, extended, rungs, residuals, all_notes
+        verdict, nominal, tuple(findings), remaining, first.nominal.profile, extended, rungs, residuals, all_notes
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """Tracked points and where their ladder begins."""
+
+    capture: Capture
+    observed: ObservedTracks
+    start: CameraProfile
+    null_terms: tuple[Term, ...]
+    schedules: Sequence[Schedule]
+    far_off_s: float
+    rungs_allowed: int
+
+    def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
+        """The ladder's end."""
+        evidence = make_evidence(self.capture.imu, self.observed)
+        return climb(
+            evidence, self.start, self.null_terms, self.schedules, self.far_off_s, progress, self.rungs_allowed
+        )
+
+
+def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> bool:
+    """Whether blur depends on more than turns: then what blur mixes says little about the curve."""
+    extensions = profile.extensions
+    return bool(extensions.stabilisation_fraction or extensions.defocus_sigma_px or geometric.model.scene is not None)
+
+
+def _exposed(profile: CameraProfile, scale: float) -> CameraProfile:
+    shutter = profile.shutter
+    return replace(profile, shutter=replace(shutter, exposure_scale=shutter.exposure_scale * scale))
+
+
+def _pulses(profile: CameraProfile) -> bool:
+    """Whether light changes between frames, which pulls at the points that are followed."""
+    return bool(profile.extensions.flicker_amplitude or profile.extensions.gain)
+
+
+def _evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Reader:
+    """The same pictures without flicker and gain, to follow points by."""
+    by_index = {frame.index: frame for frame in frames}
+    curve = profile.response or ResponseCurve("srgb")
+    height, width, shutter = profile.height, profile.width, profile.shutter
+    along = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    fraction = shutter.readout_fraction(along[:, :1] if not shutter.reads_columns else along[:1], width, height)
+
+    def even(wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        for index, picture in gray(wanted):
+            frame = by_index.get(index)
+            if picture is None or frame is None:
+                yield index, picture
+                continue
+            exposure_s = shutter.true_exposure_s(frame.exposure_s or 0.0)
+            start_s = profile.imu_time_s(shutter.first_row_start_s(frame.time_s, frame.exposure_s or 0.0))
+            light = flicker(profile, start_s + fraction * shutter.readout_time_s + 0.5 * exposure_s, exposure_s)
+            gain = profile.extensions.gain[index] if index < len(profile.extensions.gain) else 1.0
+            linear = curve.linear_table()[picture] / (light * gain)
+            yield index, np.clip(np.rint(255 * curve.encode(linear)), 0, 255).astype(np.uint8)
+
+    return even
 
 
 # ── what the profile leaves open ─────────────────────────────────────────────────────────────────────────────────
@@ -262,34 +330,17 @@ def _exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array) -> floa
     return None
 
 
-def _as_exposure(
-    evidence: Evidence, geometric: GeometricVerdict, findings: list[Finding], scale: float, exposure_s: float
-) -> list[Finding]:
+def _as_exposure(findings: Sequence[Finding], scale: float, exposure_s: float) -> Finding:
     """Put an offset down to the exposure: the points tell its size better than the blur."""
-    result = []
-    for finding in findings:
-        if finding.name != "time_offset":
-            result.append(finding)
-            continue
-        std = 2.0 * float(finding.parameters["time_offset_s"].std) / exposure_s
-        sentence = picture_ladder.SENTENCES["exposure_time"].format(exposure_scale=f"{scale:.3g}")
-        result.append(
-            replace(
-                finding,
-                name="exposure_time",
-                parameters={"exposure_scale": ParameterChange(1.0, scale, std)},
-                rivals=(Rival("time_offset", finding.held_out.after),),
-                sentence=sentence,
-            )
-        )
-    nominal = geometric.nominal.profile
-    shutter = replace(geometric.model.profile.shutter, exposure_scale=nominal.shutter.exposure_scale * scale)
-    geometric.model = replace(
-        geometric.model,
-        profile=replace(geometric.model.profile, time_offset_s=nominal.time_offset_s, shutter=shutter),
+    finding = next(f for f in findings if f.name == "time_offset")
+    std = 2.0 * float(finding.parameters["time_offset_s"].std) / exposure_s
+    return replace(
+        finding,
+        name="exposure_time",
+        parameters={"exposure_scale": ParameterChange(1.0, scale, std)},
+        rivals=(Rival("time_offset", finding.held_out.after),),
+        sentence=picture_ladder.SENTENCES["exposure_time"].format(exposure_scale=f"{scale:.3g}"),
     )
-    geometric.fit = refit(evidence, geometric.model)
-    return result
 
 
 def _one_exposure(blurred: picture_ladder.PictureVerdict) -> picture_ladder.PictureVerdict:
@@ -321,13 +372,10 @@ def _merged(
 # ── what is left ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _residuals(evidence: Evidence, geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
+def _residuals(geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
     """Differences (px) and what they may run along."""
-    model = geometric.nominal if nominal else geometric.model
     fitted = geometric.nominal_fit if nominal else geometric.fit
-    table = evidence.table(model, len(fitted.distance))
-    if len(table) != len(fitted.distance):
-        table = geometric.table
+    table = geometric.nominal_table if nominal else geometric.table
     profile, lens = fitted.profile, fitted.profile.intrinsics
     assert lens is not None
     centre = np.array([lens.cx_px, lens.cy_px])

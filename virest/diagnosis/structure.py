@@ -55,7 +55,8 @@ def _along(
                 continue
             spread = error**2 + floor**2
             excess += max(mean**2 - spread, 0.0)
-            chi2 += mean**2 / spread
+            tail = stats.t.sf(abs(mean) / np.sqrt(spread), count - 1)
+            chi2 += float(stats.norm.isf(max(float(tail), 1e-300))) ** 2
             freedom, bins = freedom + 1, bins + 1
     if not freedom:
         return Structure(name, 0.0, 1.0)

@@ -78,7 +78,9 @@ def align_coarsely(
     own = _explained(seen, gyro, inside, np.broadcast_to(profile.rotation_cam_imu, rotation.shape))
     free, own = np.where(covered, free, -np.inf), np.where(covered, own, -np.inf)
     best_own, best_free = int(np.argmax(own)), int(np.argmax(free))
-    keep = 1 - own[best_own] < max(KEEP_PROFILE * (1 - free[best_free]), 1e-3) or 1 - own[best_own] < MAX_PROFILE_LEFT
+    same = abs(offsets[best_own] - offsets[best_free]) <= SAME_VALLEY_S
+    keep = 1 - own[best_own] < max(KEEP_PROFILE * (1 - free[best_free]), 1e-3)
+    keep = keep or (same and 1 - own[best_own] < MAX_PROFILE_LEFT)
     explained, best = (own, best_own) if keep else (free, best_free)
     chosen = profile.rotation_cam_imu if keep else rotation[best]
     away = np.abs(offsets - offsets[best]) > SAME_VALLEY_S

@@ -344,11 +344,18 @@ def _block_covariance(table: TrackTable, system: _System, inverse: Array, blocks
     gradients = np.stack([np.bincount(block, column, count) for column in per_point.T], axis=-1)
     gradients -= gradients.mean(axis=0)
     moved = gradients @ inverse
-    sandwich = moved.T @ moved * count / (count - 1)
+    sandwich = moved.T @ moved * count / (count - 1) / _true_curvature(system) ** 2
     prior_part = inverse @ (system.prior[:, None] * inverse)
     total = sandwich + prior_part
     raised = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(total), 1e-300), 1.0))
     return total * np.outer(raised, raised)
+
+
+def _true_curvature(system: _System) -> float:
+    """Curvature of the Cauchy loss over that of its weights, which the normal equations take for it."""
+    ways = 2 if (system.scene is not None and isinstance(system.scene, DirectedMotion)) else 1
+    bent = ways * system.weight**2 * system.squared / (CAUCHY * system.scale) ** 2
+    return max(float((system.weight - bent).sum() / max(system.weight.sum(), 1e-12)), 0.3)
 
 
 def _stretches(table: TrackTable, system: _System, inverse: Array, blocks: int) -> Array:

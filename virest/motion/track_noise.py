@@ -15,6 +15,8 @@ CAUCHY = 2.4
 RAYLEIGH_MEDIAN = 1.1774
 POINTS_PER_TERM = 4
 """A cubic flow has 10 terms an axis; with fewer points than this many times the terms a lower order is taken."""
+ENOUGH_POINTS = 36
+"""With fewer points the flow that can be fitted does not follow a turning picture; other pairs speak for them."""
 ORDERS = (3, 2, 1)
 SMALLEST_NOISE_PX = 0.01
 
@@ -25,7 +27,9 @@ def step_noise_px(pairs: Sequence[TrackPair]) -> Array:
     Turns, a readout and a plane's parallax are smooth over a picture; tracking errors are not.  Depth steps and moving
     objects raise it a little: the scale is a median.
     """
-    return np.array([_pair_noise(pair) for pair in pairs])
+    noise = np.array([_pair_noise(pair) for pair in pairs])
+    enough = np.array([len(pair) >= ENOUGH_POINTS for pair in pairs], bool)
+    return np.where(enough, noise, np.median(noise[enough])) if enough.any() else noise
 
 
 def smooth_flow_residual(pair: TrackPair) -> Array:

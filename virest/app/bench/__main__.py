@@ -18,6 +18,7 @@ from typing import Any
 
 from virest import __version__
 from virest.app.bench.curves import curves_section
+from virest.app.bench.diagnosis import diagnosis_section
 from virest.app.bench.memory import memory_section
 from virest.app.bench.quality import quality_section
 from virest.app.bench.shutter import shutter_section
@@ -32,6 +33,7 @@ SECTIONS: dict[str, Section] = {
     "speed": speed_section,
     "memory": memory_section,
     "curves": curves_section,
+    "diagnosis": diagnosis_section,
 }
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image")
 

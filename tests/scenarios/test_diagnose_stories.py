@@ -1,0 +1,104 @@
+"""Hide something in a capture and find it: the diagnosis sees the folder only."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from virest.app.bench.diagnosis import diagnose_folder, errors_in_std
+from virest.app.simulate import simulate_command
+from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis
+
+pytestmark = pytest.mark.scenario
+
+LARGEST_SIGMA = 4.5
+HIDDEN = {
+    "gyro_bias": (0.031, -0.024, 0.042),
+    "readout_time": (0.0258,),
+    "stabilisation": (0.55, 0.9),
+    "scene_depth": (0.7,),
+    "vignetting": (0.42,),
+    "defocus": (1.5,),
+}
+"""One or two of each kind; the bench goes through all of them with several seeds."""
+
+
+def _capture(work: Path, name: str, effects: list[str], seed: int, **options: Any) -> Path:
+    upright = seed % 2
+    size = {"width": 480, "height": 640} if upright else {"width": 640, "height": 480}
+    simulate_command(
+        work / name, frames=75, seed=seed, effects=effects, exposure_ms=8, rate_rad_s=1.1, overwrite=True,
+        **{**size, **options},
+    )  # fmt: skip
+    return work / name
+
+
+def _names(found: Diagnosis) -> set[str]:
+    return {cause.name for cause in found.causes}
+
+
+@pytest.mark.parametrize("number, name", list(enumerate(HIDDEN)))
+def test_a_hidden_effect_is_named_with_its_size(work: Path, number: int, name: str) -> None:
+    """The cause, no other beside it, its size within its deviations, and a gain on frames that took no part."""
+    values = HIDDEN[name]
+    found = diagnose_folder(_capture(work, f"hidden_{name}", [f"{name}={','.join(map(str, values))}"], 410 + number))
+    assert found.verdict == EXPLAINED
+    assert _names(found) == {name}
+    cause = found.causes[0]
+    assert cause.held_out.after < cause.held_out.before
+    assert cause.held_out.gain > 0.5
+    keys = list(cause.parameters) if len(values) == len(cause.parameters) else ["x", "y", "z"]
+    errors = errors_in_std(found, name, dict(zip(keys, values, strict=False)))
+    assert errors, "no deviation stated"
+    assert max(errors) < LARGEST_SIGMA
+
+
+def test_nothing_hidden_is_consistent(work: Path) -> None:
+    """No false alarm."""
+    found = diagnose_folder(_capture(work, "nothing_hidden", [], 421))
+    assert found.verdict == CONSISTENT
+    assert not found.causes
+    assert not found.unexplained.significant
+
+
+def test_two_hidden_effects_are_both_named(work: Path) -> None:
+    """One moves points, the other takes light away."""
+    hidden = ["time_offset=-0.007", "flicker=0.25,120"]
+    found = diagnose_folder(_capture(work, "two_hidden", hidden, 422, exposure_ms=6))
+    assert _names(found) == {"time_offset", "flicker"}
+    assert found.verdict == EXPLAINED
+
+
+def test_a_fault_without_a_name_is_said_to_be_unexplained(work: Path) -> None:
+    """A gyroscope that clips is in no catalogue."""
+    folder = _capture(work, "clipping_gyroscope", [], 423)
+    log = folder / "gyro_accel.csv"
+    head, *rows = log.read_text(encoding="utf-8").splitlines()
+    clipped = [head]
+    for row in rows:
+        cells = row.split(",")
+        cells[1:4] = [f"{np.clip(float(cell), -0.6, 0.6):.7g}" for cell in cells[1:4]]
+        clipped.append(",".join(cells))
+    log.write_text("\n".join(clipped) + "\n", encoding="utf-8")
+    found = diagnose_folder(folder)
+    assert found.verdict == UNEXPLAINED
+    assert found.unexplained.significant
+
+
+def test_pictures_of_another_recording_are_no_confident_cause(work: Path) -> None:
+    """The gyroscope of another capture explains nothing, and nothing is put down to an offset."""
+    folder = _capture(work, "stranger", [], 424)
+    other = _capture(work, "stranger_source", [], 426)
+    rows = [path.joinpath("gyro_accel.csv").read_text(encoding="utf-8").splitlines() for path in (folder, other)]
+    swapped = [rows[0][0]]
+    for own, foreign in zip(rows[0][1:], rows[1][1:], strict=False):
+        swapped.append(",".join([own.split(",")[0], *foreign.split(",")[1:]]))
+    (folder / "gyro_accel.csv").write_text("\n".join(swapped) + "\n", encoding="utf-8")
+    found = diagnose_folder(folder)
+    assert found.verdict == UNEXPLAINED
+    assert "time_offset" not in _names(found)
+    shutil.rmtree(other)
