@@ -104,7 +104,7 @@ def diagnose_capture(
         say("points again", 0.65)
         even = _evened(gray, frames, photometric.profile)
         again = observe_tracks(capture, track_pairs(even([frame.index for frame in frames])), profile)
-        points = replace(points, observed=again.covered(capture.imu, start))
+        points = replace(points, observed=again.covered(capture.imu, start), start=_pulsing(start, photometric.profile))
         geometric = points.climbed(lambda part: say("points again", 0.65 + 0.1 * part))
     findings = _stamped(geometric, findings_of(geometric), observed.exposure_s)
     moves_right = not _points_left(geometric).significant
@@ -119,7 +119,9 @@ def diagnose_capture(
         notes.append("points do not go where the model says: blur, and what it does to the curve, were not judged")
     if is_exposure and hypothesis is not None:
         exposure = _as_exposure(findings, hypothesis, float(np.median(observed.exposure_s)))
-        geometric = replace(points, start=_exposed(start, hypothesis)).climbed(lambda part: say("points again", 0.8))
+        geometric = replace(points, start=_exposed(points.start, hypothesis)).climbed(
+            lambda part: say("points again", 0.8)
+        )
         findings = [exposure, *_stamped(geometric, findings_of(geometric), observed.exposure_s)]
         blurred = _one_exposure(blurred)
     extended = _merged(geometric.model.profile, photometric.profile, blurred.profile, is_exposure)
@@ -174,6 +176,18 @@ def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> boo
 def _exposed(profile: CameraProfile, scale: float) -> CameraProfile:
     shutter = profile.shutter
     return replace(profile, shutter=replace(shutter, exposure_scale=shutter.exposure_scale * scale))
+
+
+def _pulsing(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:
+    """The profile with the lamps' flicker: it moves the mean time of each row's light."""
+    light = lit.extensions
+    extensions = replace(
+        profile.extensions,
+        flicker_amplitude=light.flicker_amplitude,
+        flicker_frequency_hz=light.flicker_frequency_hz,
+        flicker_phase_rad=light.flicker_phase_rad,
+    )
+    return replace(profile, extensions=extensions)
 
 
 def _pulses(profile: CameraProfile) -> bool:

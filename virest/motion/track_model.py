@@ -170,11 +170,28 @@ def track_table(
 
 
 def seen_s(profile: CameraProfile, points_px: Array, stamp_s: Array, exposure_s: Array) -> Array:
-    """Middle of the exposure of the points' rows, IMU clock (n,)."""
+    """Middle of the exposure of the points' rows, IMU clock (n,); under pulsing lamps the mean time of the light."""
     shutter = profile.shutter
     fraction = shutter.readout_fraction(points_px, profile.width, profile.height)
     start_s = shutter.first_row_start_s(stamp_s, exposure_s) + fraction * shutter.readout_time_s
-    return np.asarray(profile.imu_time_s(start_s + 0.5 * shutter.true_exposure_s(exposure_s)))
+    middle_s = np.asarray(profile.imu_time_s(start_s + 0.5 * shutter.true_exposure_s(exposure_s)))
+    if not profile.extensions.flicker_amplitude:
+        return middle_s
+    return middle_s + pulse_delay_s(profile, middle_s, np.asarray(shutter.true_exposure_s(exposure_s)))
+
+
+def pulse_delay_s(profile: CameraProfile, middle_s: Array, exposure_s: Array) -> Array:
+    """How much later than its middle the light of an exposure arrives on the mean, (n,), under pulsing lamps.
+
+    Mean of τ over |τ| < E/2 weighted by 1 + a sin(ω(t + τ) + φ): a cos(ωt + φ) (sin x − x cos x) 2/ω² over the light,
+    E + a sin(ωt + φ) 2 sin(x)/ω, x = ωE/2.
+    """
+    extensions = profile.extensions
+    omega, amplitude = 2 * np.pi * extensions.flicker_frequency_hz, extensions.flicker_amplitude
+    angle, half = omega * middle_s + extensions.flicker_phase_rad, 0.5 * omega * exposure_s
+    moment = amplitude * np.cos(angle) * 2 * (np.sin(half) - half * np.cos(half)) / omega**2
+    light = exposure_s + amplitude * np.sin(angle) * 2 * np.sin(half) / omega
+    return np.asarray(moment / np.maximum(light, 1e-6))
 
 
 def predict(known: Ground, table: TrackTable, scene: Motion | None, *, slopes: bool = False) -> Prediction:
