@@ -25,7 +25,7 @@ demo: $(READY)
 	@echo "demo-out/<capture>/parameters.jsonl has one line a frame, run.json the account of the run."
 
 test: $(READY)
-	$(BIN)/python -m pytest -n $(JOBS)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS)
 
 bench: $(READY)
 	$(BIN)/python -m virest.app.bench

@@ -241,14 +241,6 @@ def test_the_readout_of_a_phone_in_a_car_is_found(virest: Any, realdata: Path, t
     assert facts["translation"] != "none"
 
 
-def test_a_camera_that_hardly_moves_does_not_tell_its_readout(virest: Any, realdata: Path, tmp_path: Path) -> None:
-    """A gimbal holds it still: the offset is known to some milliseconds, the readout is not."""
-    facts = calibrate(virest, realdata / "gopro_karma", tmp_path)
-    assert "readout_time_s" in facts["not_determined"]
-    offset = next(value for value in facts["values"] if value["name"] == "time_offset_s")
-    assert -0.035 < offset["value"] < -0.010
-
-
 def test_half_a_second_and_another_clock_rate_are_found(virest: Any, realdata: Path, tmp_path: Path) -> None:
     """A hand-shaken phone whose stamps are evenly made up: +0.42 s and +0.45 % of skew, both as measured otherwise."""
     facts = calibrate(virest, realdata / "nexus5_162941", tmp_path, "--with", "clock-skew")
