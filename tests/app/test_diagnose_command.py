@@ -49,7 +49,7 @@ def odd_cause() -> Finding:
     return Finding("gyro_bias", changes, HeldOutGain("geometry_rms_px", 0.3, 0.22, 0.2), (), 0.01, "drifts")
 
 
-def diagnosis(source: diagnose._Source, verdict: str, causes: tuple[Finding, ...]) -> Diagnosis:
+def diagnosis(source: diagnose.Source, verdict: str, causes: tuple[Finding, ...]) -> Diagnosis:
     """A diagnosis of the tiny capture."""
     rng = np.random.default_rng(3)
     nominal = source.profile
@@ -72,7 +72,7 @@ def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Let the ladder come to a given verdict."""
 
     def give(verdict: str = "explained", *causes: Finding, error: Exception | None = None) -> None:
-        def climb(source: diagnose._Source, progress: Say) -> Diagnosis:
+        def climb(source: diagnose.Source, progress: Say) -> Diagnosis:
             progress("points", 0.5)
             assert [number for number, _ in source.pictures([7, 3, 4])] == [3, 4, 7]
             assert next(source.gray([5]))[1].shape == (120, 160)  # type: ignore[union-attr]

@@ -12,7 +12,7 @@ from motion.synthetic_tracks import Recording, Setup
 from virest.camera.profile import CameraProfile
 from virest.diagnosis import geometric_ladder
 from virest.diagnosis.findings import Finding, ParameterChange
-from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, effect_named
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import (
     BLOCK_LENGTHS,
     FULL_LENGTH_PAIRS,
@@ -28,6 +28,7 @@ from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_
 from virest.motion import profile_terms as terms_of
 from virest.motion.scene_motion import DirectedMotion, InertialMotion
 
+EFFECT = {effect.name: effect for effect in GEOMETRIC_EFFECTS}
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
 WALL = Setup(seed=62, frames=49, points=20, sway_m=0.05, plane_per_m=(0.05, -0.1, 0.6), gyro_noise_rad_s=0.001)
 
@@ -77,7 +78,7 @@ def test_a_true_profile_is_left_alone() -> None:
 def test_an_offset_and_a_bias_are_named_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """9 ms and 0.02 rad/s hidden at once, among the causes most like them: two rungs, two findings, both right."""
     alike = ("time_offset", "timestamp_reference", "readout_time", "gyro_bias", "imu_rotation", "focal_length")
-    monkeypatch.setattr(geometric_ladder, "GEOMETRIC_EFFECTS", tuple(map(effect_named, alike)))
+    monkeypatch.setattr(geometric_ladder, "GEOMETRIC_EFFECTS", tuple(EFFECT[name] for name in alike))
     truth = recorded(HAND).profile
     wrong_bias = (-0.011, 0.012, -0.009)
     nominal = replace(truth, time_offset_s=0.022, gyro_bias_rad_s=wrong_bias)
@@ -186,7 +187,7 @@ def test_lost_tracks_do_not_decide() -> None:
 @pytest.mark.parametrize("effect", [e for e in GEOMETRIC_EFFECTS if e.term is not None], ids=lambda e: e.name)
 def test_the_total_change_is_what_a_term_changed(effect: object) -> None:
     """Read back from two profiles, whatever the term: the values that were put in."""
-    entry = effect_named(effect.name)  # type: ignore[attr-defined]
+    entry = EFFECT[effect.name]  # type: ignore[attr-defined]
     assert entry.term is not None
     profile = recorded(HAND).profile
     step = np.array([0.004, -0.007, 0.011])[: len(entry.term)]

@@ -76,7 +76,7 @@ class DiagnosisOutcome:
 
 
 @dataclass(frozen=True, slots=True)
-class _Source:
+class Source:
     """A capture that was read, and how to have its pictures."""
 
     capture: Capture
@@ -94,7 +94,7 @@ def run_diagnosis(path: str, options: DiagnosisOptions, progress: Progress | Non
     say = progress or (lambda _stage, _part: None)
     folder = Path(options.out) / capture_name(path)
     require_free(folder, options.overwrite)
-    source = _open(Path(path), options.config)
+    source = open_source(Path(path), options.config)
     found = climb(source, lambda stage, part: say(stage, LADDER_PART * part))
     say("restoring", LADDER_PART)
     gain = measure_restoration_gain(
@@ -111,7 +111,7 @@ def run_diagnosis(path: str, options: DiagnosisOptions, progress: Progress | Non
     return DiagnosisOutcome(facts, text, found.verdict)
 
 
-def climb(source: _Source, progress: Progress) -> Diagnosis:
+def climb(source: Source, progress: Progress) -> Diagnosis:
     """The ladder itself."""
     from virest.diagnosis.ladder import diagnose_capture
 
@@ -134,7 +134,8 @@ def require_free(folder: Path, overwrite: bool) -> None:
         )  # fmt: skip
 
 
-def _open(path: Path, config: Path | None) -> _Source:
+def open_source(path: Path, config: Path | None = None) -> Source:
+    """Read a capture with its profile; its pictures are decoded when they are asked for."""
     capture = read_capture(path)
     for note in capture.notes:
         log.log(logging.INFO if note.severity == "info" else logging.WARNING, "%s: %s", capture.name, note.text)
@@ -149,7 +150,7 @@ def _open(path: Path, config: Path | None) -> _Source:
     def gray(numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
         return read_gray(capture.movie, index, numbers)
 
-    return _Source(capture, profile, pictures, gray)
+    return Source(capture, profile, pictures, gray)
 
 
 def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:

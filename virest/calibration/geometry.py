@@ -55,12 +55,8 @@ ASTRAY_PASSES = 3
 MIN_STRETCHES = 2.5
 """A value that rests on fewer stretches of time is a single moment's, and nothing else bears it out."""
 MANY_OUTLIERS = 0.1
-STABILISER_SIGMA, STABILISER_FRACTION, STABILISER_GAIN = 6.0, 0.1, 0.9
 LARGE_CORRELATION = 0.9
-SHARED = 0.06
-"""Measured on simulated captures, H.264 at the recorder's bit rate: readouts come out 0.02 to 0.16 ms short."""
 
-BASIC = ("time_offset", "readout_time", "imu_rotation", "gyro_bias")
 OPTIONAL = {
     "focal": terms_of.FOCAL,
     "distortion": terms_of.K1,
@@ -361,24 +357,9 @@ def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
     return drift_std_m(imu, span_s) * nearness, max(span_s, 0.1)
 
 
-def _shared_error(fit: TrackFit, name: str) -> Array:
-    """What errors common to many points make of a value: no number of points tells better than some hundred would.
-
-    A part SHARED of each point's error goes along with the value's own pattern; Σw points told it to the curvature.
-    """
-    part = fit.slices[name]
-    return np.asarray(SHARED * np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[part]))
-
-
 def _variances(fit: TrackFit, noise_px: float, drift: tuple[float, float]) -> dict[str, Array]:
     """Variance of each term's values, with tracking's own bias; the offset is that of the first row read."""
-    readout_s = fit.profile.shutter.readout_time_s
-    found = {
-        term.name: fit.std(term.name) ** 2 + np.array(bias_std(term.name, noise_px, readout_s)) ** 2
-        for term in fit.terms
-    }
-    if "readout_time" in found:
-        found["readout_time"] = fit.std("readout_time") ** 2 + _shared_error(fit, "readout_time") ** 2
+    found = {term.name: fit.std(term.name) ** 2 + bias_std(fit, term.name, noise_px) ** 2 for term in fit.terms}
     found["imu_rotation"] = found["imu_rotation"] + (0.5 * drift[0]) ** 2
     found["gyro_bias"] = found["gyro_bias"] + (drift[0] / drift[1]) ** 2
     if "readout_time" in found:

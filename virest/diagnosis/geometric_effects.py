@@ -193,8 +193,3 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         ((0.5, 0.0), (0.5, 1.2), (0.5, -1.2)),
     ),
 )
-
-
-def effect_named(name: str) -> GeometricEffect:
-    """The geometric cause of that name."""
-    return next(effect for effect in GEOMETRIC_EFFECTS if effect.name == name)

@@ -339,9 +339,9 @@ def p_of(
 ) -> float:
     """Probability of so large a change by chance: a chi-square of the change, deviations with tracking's own bias."""
     change = total_change(effect, before, found)
-    floor = bias_std(effect.name, noise_px, found.shutter.readout_time_s)
+    floor = bias_std(fitted, effect.name, noise_px)
     part = fitted.slices[effect.name]
-    covariance = fitted.covariance[part, part] + np.diag(np.array(floor) ** 2)
+    covariance = fitted.covariance[part, part] + np.diag(floor**2)
     if effect.name == "stabilisation":
         return float(stats.chi2.sf(change[0] ** 2 / covariance[0, 0], 1))
     return float(stats.chi2.sf(change @ np.linalg.solve(covariance, change), len(change)))
@@ -460,9 +460,9 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
     if effect.term is None:
         return effect.changes(nominal, found, None)
     part = verdict.fit.slices[effect.term.name]
-    floor = bias_std(effect.name, verdict.step_noise_px, verdict.fit.profile.shutter.readout_time_s)
-    std = np.sqrt(np.diag(verdict.fit.covariance)[part] + np.array(floor) ** 2)
-    changes = effect.changes(nominal, found, std)
+    floor = bias_std(verdict.fit, effect.name, verdict.step_noise_px)
+    stds = np.sqrt(np.diag(verdict.fit.covariance)[part] + floor**2)
+    changes = effect.changes(nominal, found, stds)
     match effect.name:
         case "imu_rotation":
             changes = {
@@ -470,7 +470,7 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
             }
         case "focal_length":
             scale = float(np.exp(total_change(effect, nominal, found)[0]))
-            changes = {"focal_scale": ParameterChange(1.0, scale, float(std[0]) * scale)}
+            changes = {"focal_scale": ParameterChange(1.0, scale, float(stds[0]) * scale)}
         case "principal_point":
             moved = total_change(effect, nominal, found).tolist()
             changes = {"offset_px": replace(changes["offset_px"], estimate=moved)}

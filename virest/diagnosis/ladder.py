@@ -60,6 +60,7 @@ STRUCTURE_P = 1e-4
 TRACKING_BIAS_PX = 0.02
 SCALE_EXCESS = 1.25
 """Differences this many times their noise, measured without the model, are not all noise."""
+LEAST_IN_PAIR = 8
 STRAY_DISTANCE, STRAY_PART = 6.0, 0.1
 CALM = 40.0
 """Brightness this many typical deviations off counts half: a band of the sensor is evidence, a passer-by is not."""
@@ -452,9 +453,27 @@ def _points_left(geometric: GeometricVerdict) -> Remaining:
         size = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
     if not structured and stray > STRAY_PART:
         along = "place"
-    p_value = strongest.p_value if structured or not significant else 0.0
+    p_value = strongest.p_value
+    if not structured and significant:
+        p_value = min(s.p_value for s in found)
+        p_value = min(p_value, *_more_than_noise(fitted.distance, table.pair, noise / geometric.step_noise_px))
     sentence = f"{size:.3f} px remain, strongest along {along}" if significant else ""
     return Remaining(p_value, along, size, GEOMETRY, significant, sentence)
+
+
+def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> tuple[float, float]:
+    """Probabilities that pairs' whitened distances are noise alone, and that so many points stray by chance.
+
+    One-sided t tests over the pairs: of their capped mean squares against 2 noise² (SCALE_EXCESS allowed for), and of
+    their parts of strays against STRAY_PART.
+    """
+    count = np.maximum(np.bincount(pair), 1)
+    used = np.bincount(pair) > LEAST_IN_PAIR
+    square = np.bincount(pair, np.minimum(distance, STRAY_DISTANCE) ** 2) / count
+    stray = np.bincount(pair, distance > STRAY_DISTANCE) / count
+    tests = ((square, 2 * (SCALE_EXCESS * noise) ** 2), (stray, STRAY_PART))
+    first, second = (float(stats.ttest_1samp(v[used], mean, alternative="greater").pvalue) for v, mean in tests)
+    return first, second
 
 
 def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Structure:
@@ -464,7 +483,7 @@ def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Str
     for column in difference.T:
         mean = np.bincount(pair, weight * column) / total
         variance = np.bincount(pair, (weight * (column - mean[pair])) ** 2) / total**2
-        used = np.bincount(pair) > 8
+        used = np.bincount(pair) > LEAST_IN_PAIR
         spread = 2 * variance[used] + TRACKING_BIAS_PX**2
         excess += float(np.mean(np.maximum(mean[used] ** 2 - spread, 0.0)))
         chi2 += float(np.sum(mean[used] ** 2 / spread))

@@ -13,9 +13,8 @@ import numpy as np
 
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale
+from virest.app.diagnose import open_source
 from virest.app.simulate import simulate_command
-from virest.capture.folder import read_capture, resolve_profile
-from virest.capture.video import probe_movie, read_frames, read_gray
 from virest.diagnosis.catalogue import CATALOGUE
 from virest.diagnosis.findings import CONSISTENT, Diagnosis
 from virest.diagnosis.ladder import diagnose_capture
@@ -71,18 +70,8 @@ def diagnose_hidden(work: Path, name: str, seed: int) -> dict[str, Any]:
 
 def diagnose_folder(folder: Path) -> Diagnosis:
     """Diagnose a capture folder with its own profile."""
-    capture = read_capture(folder)
-    index = probe_movie(capture.movie)
-    return diagnose_capture(
-        capture,
-        resolve_profile(capture)[0],
-        lambda wanted: (
-            (k, picture)
-            for k, picture in read_frames(capture.movie, index, min(wanted), max(wanted))
-            if k in set(wanted)
-        ),
-        lambda wanted: read_gray(capture.movie, index, wanted),
-    )
+    source = open_source(folder)
+    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
 
 
 def errors_in_std(found: Diagnosis, name: str, truth: dict[str, Any]) -> list[float]:
