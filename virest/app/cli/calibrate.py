@@ -1,0 +1,83 @@
+"""`virest calibrate`: fit the phone to an ordinary capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, one_thread_each
+
+CALIBRATED_EXTRAS = (
+    "focal",
+    "distortion",
+    "principal-point",
+    "gyro-scale",
+    "clock-skew",
+    "exposure-scale",
+    "frame-lag",
+)
+
+
+def calibrate(
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its name from stdin.")],
+    config: Config = None,
+    extra: Annotated[
+        list[str] | None,
+        typer.Option("--with", metavar="NAME,...", help=f"Fit these too: {', '.join(CALIBRATED_EXTRAS)}."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The calibrated profile goes here.")] = Path(
+        "camera.yaml"
+    ),
+    kalibr: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write Kalibr's camchain-imucam.yaml and imu.yaml in here too.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Fit time offset, readout, IMU-camera rotation and gyroscope bias to an ordinary capture.
+
+    \b
+    $ virest calibrate shaken --with focal
+    shaken: calibrated
+    value                       start     calibrated        ±  determined  note
+    time_offset_s            0.000000       0.030998  3.9e-05  yes
+    readout_time_s           0.020000       0.022700  6.7e-05  yes
+    readout_direction   right_to_left  right_to_left           yes
+    ...
+    residual 0.399 -> 0.123 px, of which tracking makes 0.123 px
+    wrote camera.yaml
+
+    \b
+    $ virest calibrate shaken --json --out found.yaml | jq '.values[] | select(.determined) | .name, .value, .std'
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    one_thread_each()
+    from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
+
+    names = _parse_extras(extra or [])
+    output = CalibrationOutput(out, kalibr, overwrite)
+    output.require()
+    paths = console.expand_dash([capture])
+    if len(paths) != 1:
+        raise typer.BadParameter(f"standard input names {len(paths)} captures; a profile is calibrated from one")
+    plan = plan_calibration(Path(paths[0]), config, names)
+    with console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
+        facts, text = run_calibration(plan, output, bar.update if bar else None)
+    emit_facts(facts, text, as_json=json)
+    return 0
+
+
+def _parse_extras(options: list[str]) -> tuple[str, ...]:
+    """Names of ``--with``, each once; every option may hold several, separated by commas."""
+    from virest.app.calibrate import unknown_extra
+
+    names = tuple(dict.fromkeys(name.strip() for option in options for name in option.split(",") if name.strip()))
+    for complaint in filter(None, map(unknown_extra, names)):
+        raise typer.BadParameter(f"--with {complaint}")
+    return names

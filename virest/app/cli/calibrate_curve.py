@@ -1,0 +1,50 @@
+"""`virest calibrate-curve`: the exposure characteristic curve."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of, one_thread_each
+
+CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
+
+
+def calibrate_curve(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture.")],
+    exposures: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Exposure times: columns file,exposure_s. [EXIF]")
+    ] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(metavar="KIND", callback=one_of(CURVE_KINDS), help=f"{', '.join(CURVE_KINDS)}. [auto]"),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The response block goes here.")] = Path(
+        "curve.yaml"
+    ),
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Curve, data, residuals: png, svg or pdf.")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Fit the exposure characteristic curve to pictures of one still scene at several exposures.
+
+    \b
+    $ virest calibrate-curve bracket --exposures bracket/exposures.csv --plot curve.png
+    gamma 2.1998
+    fit error 0.47 grey levels rms, exposures 0.0009 to 0.92 covered
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    one_thread_each()
+    from virest.app.calibrate_curve import calibrate_curve as fit_and_write
+    from virest.app.calibrate_curve import plot_format_known
+
+    if plot is not None and not plot_format_known(plot):
+        raise typer.BadParameter(f"--plot {plot.name}: the name must end in .png, .svg or .pdf")
+    facts, text = fit_and_write(source, exposures=exposures, kind=kind or "auto", out=out, plot=plot)
+    emit_facts(facts, text, as_json=json)
+    return 0

@@ -1,0 +1,51 @@
+"""`virest inspect`: what is in a capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from virest.app import console
+from virest.app.cli.options import Captures, Json, Quiet, Verbose, Version, batch_code, capture_paths
+from virest.errors import VirestError
+
+
+def inspect(
+    captures: Captures,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Say what is in a capture and what is wrong with it, before any work.
+
+    \b
+    $ virest inspect honor_v10
+    $ virest inspect honor_v10 --json | jq .frames
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    paths = capture_paths(captures)
+    from virest.app.inspect import inspect_capture
+
+    codes = []
+    for path in paths:
+        try:
+            facts, text, code = inspect_capture(Path(path))
+            if json:
+                from virest.app.outputs import json_line
+
+                console.emit(json_line(facts))
+            else:
+                console.emit(text)
+            if code:
+                console.CONSOLE.line(f"error: {_first_error(facts)}")
+        except VirestError as error:
+            code = console.report_error(error)
+        codes.append(code)
+    return batch_code(codes)
+
+
+def _first_error(facts: dict[str, Any]) -> str:
+    """What makes a capture unusable, of all that was noted."""
+    errors = [note["text"] for note in facts["notes"] if note["severity"] == "error"]
+    return errors[0] if errors else f"{facts['capture']}: cannot be used"

@@ -1,0 +1,193 @@
+"""`virest simulate`: captures with known truth."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of, one_thread_each, parse_frames
+from virest.restoration.settings import REFERENCES
+
+DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
+LIKE_OPTIONS = (
+    "out",
+    "like",
+    "frames",
+    "config",
+    "noise",
+    "effect",
+    "reference",
+    "seed",
+    "overwrite",
+    "json",
+    "quiet",
+    "verbose",
+    "version",
+)
+"""What `simulate --like` heeds; all else is the capture's."""
+
+
+def simulate(
+    context: typer.Context,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the capture to write.")],
+    like: Annotated[
+        Path | None,
+        typer.Option(metavar="CAPTURE", help="Re-create this capture: its camera, times, exposures and motion."),
+    ] = None,
+    scene: Annotated[str, typer.Option(metavar="KIND", help="leaves, bright, board or text.")] = "leaves",
+    width: Annotated[int, typer.Option(metavar="PX")] = 720,
+    height: Annotated[int, typer.Option(metavar="PX")] = 1280,
+    frames: Annotated[
+        str | None, typer.Option(metavar="N", help="How many. With --like A:B, these of its frames. [12; all]")
+    ] = None,
+    fps: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
+    exposure_ms: Annotated[str, typer.Option(metavar="MS[,MS...]", help="Exposure; several are taken in turn.")] = "10",
+    auto_exposure: Annotated[
+        str | None,
+        typer.Option(
+            metavar="EV[:STEPS]",
+            help="Exposure x ISO and the brightness change by EV: a smooth walk, or STEPS exposures. [they stay]",
+        ),
+    ] = None,
+    readout_ms: Annotated[float, typer.Option(metavar="MS", help="First row to one past the last.")] = 20.0,
+    direction: Annotated[
+        str | None,
+        typer.Option(metavar="DIRECTION", callback=one_of(DIRECTIONS), help=f"Readout: {', '.join(DIRECTIONS)}."),
+    ] = None,
+    focal_px: Annotated[float | None, typer.Option(metavar="PX", help="Focal length.")] = None,
+    rate: Annotated[float, typer.Option(metavar="RAD_S", help="How fast the hand turns; 0: not at all.")] = 1.0,
+    noise: Annotated[float, typer.Option(metavar="LEVELS", help="Noise of the picture, grey levels.")] = 1.5,
+    response: Annotated[
+        str, typer.Option(metavar="CURVE", help="srgb, linear, gamma:2.2, five_segment[:xb,yb,xc,yc,y_max].")
+    ] = "srgb",
+    depth_m: Annotated[float | None, typer.Option(metavar="M", help="Distance of the scene. [infinity]")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Take the camera from this profile.")] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=VALUE]", help="Hide this effect in the capture; may be repeated."),
+    ] = None,
+    reference: Annotated[
+        str, typer.Option(metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Of the truth pictures.")
+    ] = REFERENCES[0],
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="The same seed gives the same capture.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a simulated capture.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Write a capture with known truth: movie, logs, camera.yaml, and truth/ with sharp frames and the motion.
+
+    \b
+    $ virest simulate leaves --frames 20 --rate 1.5 --effect time_offset=0.012
+    leaves: 20 frames of 720x1280, blur 9.1 px, effects: time_offset (time_offset_s 0.012)
+    $ virest process leaves
+
+    \b
+    $ virest simulate bracket --auto-exposure 5:9 --rate 0 --exposure-ms 4 --frames 27
+    $ virest calibrate-curve bracket
+
+    \b
+    $ virest simulate again --like 2022_03_09_15_21_07 --frames 30:90 --effect flicker=0.2,100
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    if like is not None:
+        _require_only(context, LIKE_OPTIONS, "--like takes it from the capture")
+        wishes = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
+        facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **wishes)
+        emit_facts(facts, _describe_simulation(facts), as_json=json)
+        return 0
+    count = _parse_count(frames, 12)
+    exposures_ms = _parse_exposures(exposure_ms)
+    auto_exposure_ev, auto_exposure_steps = _parse_auto_exposure(auto_exposure)
+    one_thread_each()
+    from virest.app.simulate import simulate_command
+    from virest.camera.profile import read_profile
+
+    with console.progress_bar(count, "simulate", quiet=quiet) as bar:
+        facts = simulate_command(
+            out,
+            scene=scene,
+            width=width,
+            height=height,
+            frames=count,
+            fps=fps,
+            exposure_ms=exposures_ms,
+            auto_exposure_ev=auto_exposure_ev,
+            auto_exposure_steps=auto_exposure_steps,
+            readout_ms=readout_ms,
+            direction=direction,
+            focal_px=focal_px,
+            rate_rad_s=rate,
+            noise_levels=noise,
+            response=response,
+            depth_m=depth_m,
+            profile=read_profile(config) if config else None,
+            effects=effect or [],
+            reference=reference,
+            seed=seed,
+            overwrite=overwrite,
+            progress=(lambda _done, _total: bar.update(1)) if bar else None,
+        )
+    emit_facts(facts, _describe_simulation(facts), as_json=json)
+    return 0
+
+
+def _simulate_like(
+    out: Path, like: Path, config: Path | None, frames: str | None, quiet: bool, **wishes: Any
+) -> dict[str, Any]:
+    """Re-create a capture; a bare N of ``--frames`` means its first N."""
+    chosen = parse_frames(frames if frames is None or ":" in frames else f":{frames}")
+    one_thread_each()
+    from virest.app.recreate import count_frames, simulate_like
+
+    with console.progress_bar(count_frames(like, chosen), "simulate", quiet=quiet) as bar:
+        step = (lambda _done, _total: bar.update(1)) if bar else None
+        return simulate_like(out, like, config=config, frames=chosen, progress=step, **wishes)
+
+
+def _describe_simulation(facts: dict[str, Any]) -> str:
+    effects = [
+        f"{effect['name']} ({', '.join(f'{name} {value}' for name, value in effect['parameters'].items())})"
+        for effect in facts["effects"]
+    ]
+    size = f"{facts['frames']} frames of {facts['width']}x{facts['height']}"
+    return f"{facts['capture']}: {size}, blur {facts['blur_px']} px, effects: {', '.join(effects) or 'none'}"
+
+
+def _require_only(context: typer.Context, allowed: tuple[str, ...], why: str) -> None:
+    """Refuse options that were typed and would do nothing."""
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if name not in allowed and source is not None and source.name == "COMMANDLINE":
+            raise typer.BadParameter(f"--{name.replace('_', '-')}: {why}")
+
+
+def _parse_count(text: str | None, default: int) -> int:
+    if text is None:
+        return default
+    if not re.fullmatch(r"\s*[+-]?\d{1,9}\s*", text, re.ASCII):
+        raise typer.BadParameter(f"--frames {text!r} is no number; A:B is for --like")
+    return int(text)
+
+
+def _parse_exposures(text: str) -> list[float]:
+    """Exposures in milliseconds, separated by commas."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no list of milliseconds; write 10 or 5,10,20") from None
+
+
+def _parse_auto_exposure(text: str | None) -> tuple[float | None, int | None]:
+    """Parse a range in EV, and the number of exposures where a staircase is asked for: ``4`` or ``6:9``."""
+    if text is None:
+        return None, None
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(?::\s*([0-9]{1,6})\s*)?", text, re.ASCII)
+    if found is None:
+        raise typer.BadParameter(f"{text!r} is no range of exposures; write 4 (a smooth walk), or 6:9 (nine steps)")
+    return float(found[1]), None if found[2] is None else int(found[2])
