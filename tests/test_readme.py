@@ -19,8 +19,9 @@ OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive
 
 
 def options_of(command: Any) -> set[str]:
-    """Long options of a command."""
-    return {name for p in command.params for name in (*p.opts, *p.secondary_opts) if name.startswith("--")}
+    """Long options of a command and of its own commands."""
+    own = {name for p in command.params for name in (*p.opts, *p.secondary_opts) if name.startswith("--")}
+    return own.union(*(options_of(sub) for sub in getattr(command, "commands", {}).values()))
 
 
 def keys_of(model: type[BaseModel]) -> set[str]:
@@ -39,9 +40,16 @@ def code_blocks() -> list[str]:
     return re.findall(r"^```[a-z]*\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
 
 
+def typed(block: str) -> list[str]:
+    """Lines of a fence; of a session only those behind a prompt."""
+    lines = block.replace("\\\n", " ").splitlines()
+    prompted = [line for line in lines if line.startswith("$ ")]
+    return prompted or lines
+
+
 def shell_lines() -> list[str]:
     """Code of the README that calls virest: lines of fences, and inline code."""
-    lines = [line for block in code_blocks() for line in block.replace("\\\n", " ").splitlines()]
+    lines = [line for block in code_blocks() for line in typed(block)]
     prose = re.sub(r"^```.*?^```", "", TEXT, flags=re.MULTILINE | re.DOTALL)
     return [
         line for line in [*lines, *re.findall(r"`([^`\n]+)`", prose)] if re.search(r"(^|[\s|/])virest\s+[a-z-]", line)

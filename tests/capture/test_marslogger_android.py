@@ -15,8 +15,8 @@ from virest.capture.marslogger_android import (
     read_frame_timestamps,
     read_gyro_accel,
     read_movie_metadata,
-    strictly_rising,
 )
+from virest.capture.tables import strictly_rising
 from virest.errors import CaptureError, ClockError, ImuError
 
 GYRO_TIGHT = "Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2]"

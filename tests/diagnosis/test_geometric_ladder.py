@@ -106,6 +106,14 @@ def test_a_readout_of_the_wrong_sense_is_named() -> None:
     assert verdict.model.profile.shutter == truth.shutter
 
 
+def wall_m(recording: Recording) -> float:
+    """Median over the frames of the wall's distance along the optical axis."""
+    middle_s = recording.stamp_s + recording.setup.time_offset_s + 0.014
+    sight = recording.orientation(middle_s).apply([0.0, 0.0, 1.0])
+    plane, moved = np.array(WALL.plane_per_m), recording.position(middle_s) - recording.position(middle_s[24:25])
+    return float(np.median((1 - moved @ plane) / (sight @ plane)))
+
+
 def test_a_depth_is_found_before_a_wall() -> None:
     """The distance along the optical axis, the median over the frames, within four deviations of the truth."""
     recording, given = recorded(WALL), evidence(WALL)
@@ -115,12 +123,29 @@ def test_a_depth_is_found_before_a_wall() -> None:
     scene = base_scene(given, profile, table)
     assert isinstance(scene, InertialMotion)
     depth_m, std = depth_of(given.fit(replace(model, scene=scene), (), table), table)
-    middle_s = recording.stamp_s + recording.setup.time_offset_s + 0.014
-    sight = recording.orientation(middle_s).apply([0.0, 0.0, 1.0])
-    plane, moved = np.array(WALL.plane_per_m), recording.position(middle_s) - recording.position(middle_s[24:25])
-    truth = float(np.median((1 - moved @ plane) / (sight @ plane)))
-    assert abs(depth_m - truth) < 4 * std + 0.01
-    assert std < 0.15 * truth
+    assert abs(depth_m - wall_m(recording)) < 4 * std + 0.01
+    assert std < 0.15 * wall_m(recording)
+
+
+def test_a_wall_that_is_nearer_than_the_profile_says_is_named() -> None:
+    """A wrong plane is no relief about a right one: the depth is named, alone, and found to three hundredths."""
+    recording = recorded(WALL)
+    verdict, found = climbed(WALL, replace(recording.profile, depth_m=2.9))
+    assert [finding.name for finding in found] == ["scene_depth"]
+    told = found[0].parameters["depth_m"]
+    assert told.nominal == 2.9
+    assert told.estimate == pytest.approx(wall_m(recording), rel=0.03)
+    assert_explained(verdict, WALL.noise_px)
+
+
+def test_exposures_that_vary_tell_their_scale() -> None:
+    """Rows' middles move by half of what each exposure is longer: no offset does that."""
+    truth = recorded(HAND).profile
+    nominal = replace(truth, shutter=replace(truth.shutter, exposure_scale=truth.shutter.exposure_scale / 1.4))
+    verdict, found = climbed(HAND, nominal)
+    assert [finding.name for finding in found] == ["exposure_time"]
+    assert found[0].parameters["exposure_scale"].estimate == pytest.approx(truth.shutter.exposure_scale, rel=0.1)
+    assert_explained(verdict, HAND.noise_px)
 
 
 # ── the ladder's parts ───────────────────────────────────────────────────────────────────────────────────────────
@@ -167,11 +192,11 @@ def test_a_fit_of_some_pairs_is_judged_on_all() -> None:
     model = Model(profile, None, ())
     table = given.table(model, 10**6)
     fitted = given.fit(model, (terms_of.TIME_OFFSET,), table, given.block % 2 == 0)
-    distance = given.distances(fitted, table)
+    distance = given.distances(fitted, table, 0.0)
     assert len(distance) == len(table) > len(fitted.distance)
     odd = given.block[table.pair] % 2 == 1
     assert capped_rms(distance[odd]) == pytest.approx(1.0, rel=0.1)
-    assert capped_rms(given.distances(given.fit(model, (), table), table)[odd]) > 2
+    assert capped_rms(given.distances(given.fit(model, (), table), table, 0.0)[odd]) > 2
 
 
 def test_lost_tracks_do_not_decide() -> None:
@@ -190,9 +215,9 @@ def test_the_total_change_is_what_a_term_changed(effect: object) -> None:
     entry = EFFECT[effect.name]  # type: ignore[attr-defined]
     assert entry.term is not None
     profile = recorded(HAND).profile
-    step = np.array([0.004, -0.007, 0.011])[: len(entry.term)]
+    step = np.array([0.004, -0.007, 0.011, -0.002])[: len(entry.term)]
     found = total_change(entry, profile, entry.term.change(profile, step))
-    # a stabiliser's cutoff has no nought to count from
+    # a stabiliser's cutoff has no nought to count from, and its lean is no part of the cause
     known = slice(0, 1) if entry.name == "stabilisation" else slice(None)
     np.testing.assert_allclose(found[known], step[known], atol=1e-9)
 

@@ -30,7 +30,7 @@ ASIDE = {
     "clock_skew": (0.0011,),
     "exposure_time": (0.21,),
     "focal_drift": (0.012,),
-    "stabilisation": (-0.16, 0.22),
+    "stabilisation": (-0.16, 0.22, 0.02, -0.03),
 }
 """How far each term of a spoilt profile lies from the truth."""
 PORTRAIT = Setup(seed=11, gyro_noise_rad_s=0.001, frames=40)
@@ -93,7 +93,10 @@ def test_every_term_is_found(setup: Setup, terms: tuple[Term, ...]) -> None:
     fitted = fitted_from(recorded(setup), terms)
     assert fitted.scale == pytest.approx(1.0, abs=0.08)
     assert (np.abs(errors(fitted)) < 4 * deviations(fitted) + 1e-9).all()
-    assert (deviations(fitted) < 0.2 * np.abs(errors(fitted) - fitted.change)).all()
+    put_aside = np.abs(errors(fitted) - fitted.change)
+    if terms_of.STABILISATION in terms:
+        put_aside[-2:] = np.inf  # how the lens leant when the log began is forgotten by the first frame
+    assert (deviations(fitted) < 0.2 * put_aside).all()
     assert set(fitted.slices) == {term.name for term in terms}
 
 

@@ -56,3 +56,14 @@ def test_specific_force_is_the_second_derivative_of_the_path(rng):
     second = (path[0] - 2 * path[1] + path[2]) / step**2
     expected = motion.rotation(time_s).inv().apply(second - GRAVITY)
     assert motion.specific_force_m_s2(time_s, arm, GRAVITY) == pytest.approx(expected, abs=5e-3)
+
+
+def test_a_walk_goes_from_side_to_side_on_top_of_the_sway():
+    """The hand's own motion stays as it was; the arc begins at +x/2 and ends at −x/2, y and z go out and back."""
+    options = {"rate_rms_rad_s": 0.8, "duration_s": 2.5, "sway_rms_m": 0.01}
+    still = random_hand_motion(np.random.default_rng(4), **options)
+    walking = random_hand_motion(np.random.default_rng(4), walk_m=(0.5, -0.1, 0.2), **options)
+    times = np.array([0.0, 1.25, 2.5])
+    walked = walking.position_m(times) - still.position_m(times)
+    np.testing.assert_allclose(walked, [[0.25, 0, 0], [0, -0.1, 0.2], [-0.25, 0, 0]], atol=1e-12)
+    np.testing.assert_array_equal(walking.node_quat, still.node_quat)

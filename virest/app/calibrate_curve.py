@@ -14,8 +14,8 @@ from virest.calibration.bracket_samples import BracketPicture
 from virest.calibration.response_curve import CurveFit, fit_response
 from virest.camera.profile import response_block
 from virest.camera.response import ResponseCurve
-from virest.capture.files import is_present
-from virest.capture.folder import MOVIE, read_capture
+from virest.capture.detect import is_capture
+from virest.capture.folder import read_capture
 from virest.capture.stills import Still, capture_bracket, read_bracket
 from virest.errors import CaptureError, OutputError, SettingsError
 from virest.report.figures import FORMATS, response_figure
@@ -68,7 +68,7 @@ def plot_format_known(path: Path) -> bool:
 
 def read_source(source: Path, exposures: Path | None) -> tuple[list[Still], list[str]]:
     """The pictures of a folder of stills or of a capture, and what is worth knowing about them."""
-    if not is_present(source / MOVIE):
+    if not is_capture(source):
         return read_bracket(source, exposures)
     if exposures is not None:
         text = f"{source}: is a capture, whose exposures are logged"

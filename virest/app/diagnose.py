@@ -207,6 +207,7 @@ def _cause(cause: Finding, figures: Sequence[str]) -> Json:
         },
         "rivals": [{"name": rival.name, "held_out_after": rival.held_out_after} for rival in cause.rivals],
         "p_value": cause.p_value,
+        "sentence": cause.sentence,
         "figures": list(figures),
     }
 

@@ -8,26 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from virest.capture.folder import (
-    EPOCHS,
-    GYRO,
-    METADATA,
-    MOVIE,
-    STAMPS,
-    Capture,
-    Frame,
-    Note,
-    read_capture,
-    resolve_profile,
-)
+from virest.capture.detect import partial_readers
+from virest.capture.folder import EPOCHS, Capture, Frame, Note, read_capture, resolve_profile
 from virest.capture.join import median_period_s
-from virest.capture.marslogger_android import (
-    read_edge_epochs,
-    read_frame_timestamps,
-    read_gyro_accel,
-    read_movie_metadata,
-)
-from virest.capture.video import probe_movie
+from virest.capture.video import MovieIndex
 from virest.errors import CaptureError, VirestError
 
 DROPPED = " dropped: "
@@ -57,6 +41,7 @@ def as_json(capture: Capture) -> dict[str, Any]:
     return {
         "capture": capture.name,
         "folder": str(capture.folder),
+        "kind": capture.kind,
         "usable": True,
         "exit_code": 0,
         "movie": {
@@ -164,15 +149,8 @@ def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
     }
     notes = [Note("error", _code(fault), str(fault))]
     if _is_folder(folder):
-        readers: dict[str, Callable[[Path], Any]] = {
-            MOVIE: probe_movie,
-            STAMPS: read_frame_timestamps,
-            METADATA: read_movie_metadata,
-            GYRO: read_gyro_accel,
-            EPOCHS: read_edge_epochs,
-        }
-        for name, reader in readers.items():
-            _look_at(folder / name, reader, facts, notes)
+        for path, reader in partial_readers(folder).items():
+            _look_at(path, reader, facts, notes)
     facts["notes"] = [_note(note) for note in notes]
     return facts
 
@@ -197,7 +175,7 @@ def _look_at(path: Path, reader: Callable[[Path], Any], facts: dict[str, Any], n
             notes.append(Note("error", _code(fault), str(fault)))
         return
     match path.name:
-        case "movie.mp4":
+        case _ if isinstance(found, MovieIndex):
             facts["movie"] = {
                 "width": found.width,
                 "height": found.height,
@@ -229,7 +207,7 @@ def _describe_facts(facts: dict[str, Any]) -> str:
 
 def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     """(title, text) of each line that has something to say."""
-    rows: list[tuple[str, str]] = []
+    rows: list[tuple[str, str]] = [("kind", facts["kind"])] if "kind" in facts else []
     if movie := facts.get("movie"):
         size = f"{movie['width']}x{movie['height']}"
         rows.append(("movie", f"{size}, {movie['frames']} frames, {movie['keyframes']} key frames"))

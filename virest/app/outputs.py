@@ -33,7 +33,7 @@ from virest.errors import OutputError, RestorationError
 
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
 PART = re.compile(r".*\.[0-9a-f]{8}\.part")
-BESIDE = ("diagnosis.json", "extended.yaml", "figures")
+BESIDE = ("diagnosis.json", "extended.yaml", "figures", "report.html")
 """What `diagnose` writes into the same folder: no obstacle for a run, and none of its files."""
 REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs")
 SIGNIFICANT_DIGITS = 10

@@ -37,11 +37,6 @@ from virest.app.outputs import (
 )
 from virest.camera.profile import CameraProfile, profile_mapping
 from virest.capture.folder import (
-    EPOCHS,
-    GYRO,
-    METADATA,
-    MOVIE,
-    STAMPS,
     Capture,
     Frame,
     read_capture,
@@ -58,7 +53,6 @@ log = logging.getLogger(__name__)
 PARTLY_FAILED = 9
 STATUSES = ("restored", "copied", "skipped", "failed")
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
-INPUTS = (MOVIE, STAMPS, METADATA, GYRO, EPOCHS, PROFILE_NAME)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,13 +209,13 @@ def _request(capture: Capture, profile: CameraProfile, options: ProcessOptions, 
 
 
 def _input_files(capture: Capture, config: Path | None) -> Iterator[Path]:
-    """Movie, logs, and the profile: the capture's own, or the one given by --config."""
-    for name in INPUTS:
-        file = capture.folder / name
-        if file.is_file() and not (config is not None and name == PROFILE_NAME):
-            yield file
+    """Movie or list of pictures, logs, and the profile: the capture's own, or the one given by --config."""
+    yield from (file for file in capture.inputs if file.is_file())
+    own = capture.folder / PROFILE_NAME
     if config is not None:
         yield config
+    elif own.is_file():
+        yield own
 
 
 def _plan(job: _Job, index: MovieIndex, settings: RestorationSettings) -> RestorationPlan:
@@ -339,6 +333,8 @@ def _account(job: _Job, plan: RestorationPlan, totals: dict[str, Any], wall_s: f
         "virest_run": 1,
         "version": __version__,
         "capture": job.name,
+        "folder": str(job.capture.folder.absolute()),
+        "movie": str(job.capture.movie.absolute()),
         "command": job.request["command"],
         "profile": profile_mapping(plan.profile),
         "profile_source": job.profile_source,

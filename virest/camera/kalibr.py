@@ -62,14 +62,14 @@ def is_kalibr(content: dict[str, Any]) -> bool:
 # ── read ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def parse_camchain(content: dict[str, Any], name: str = "camchain") -> CameraProfile:
-    """The chain's first camera as a profile; ``name`` is used in messages.
+def parse_camchain(content: dict[str, Any], name: str = "camchain", which: str = "cam0") -> CameraProfile:
+    """A camera of the chain, the first unless told, as a profile; ``name`` is used in messages.
 
     Raises SettingsError with the key that is missing or not usable.
     """
-    camera = content["cam0"]
+    camera = content.get(which)
     if not isinstance(camera, dict):
-        raise SettingsError(f"{name}: cam0 has no keys", hint="is it a Kalibr camchain?")
+        raise SettingsError(f"{name}: {which} has no keys", hint="is it a Kalibr camchain?")
     if camera.get("camera_model", "pinhole") != "pinhole":
         raise SettingsError(f"{name}: camera_model '{camera['camera_model']}'", hint="only pinhole can be read")
     width, height = _numbers(camera, "resolution", 2, name)
@@ -81,7 +81,7 @@ def parse_camchain(content: dict[str, Any], name: str = "camchain") -> CameraPro
     return parse_profile(
         {
             "virest_profile": 1,
-            "device": f"{name}, cam0",
+            "device": f"{name}, {which}",
             "image": {"width": int(width), "height": int(height)},
             "intrinsics": {
                 "fx_px": fx,
@@ -152,12 +152,19 @@ def _positive(block: dict[str, Any], key: str, name: str) -> float | None:
 # ── write ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def format_camchain(profile: CameraProfile, exposure_s: float | None = None) -> str:
+def format_camchain(
+    profile: CameraProfile,
+    exposure_s: float | None = None,
+    *,
+    command: str = "calibrate",
+    instant_s: float | None = None,
+) -> str:
     """Write a profile as a camera chain of one camera; what Kalibr cannot hold is said in comments.
 
     exposure_s: typical logged exposure, for stamps that do not mean its start.  Of a readout that is not top to bottom
-    Kalibr knows nothing: the time shift then is that of the picture's middle row, as for a global shutter.  Raises
-    SettingsError where the focal length is unknown.
+    Kalibr knows nothing: the time shift then is that of the picture's middle row, as for a global shutter.
+    instant_s: for tools that take every picture for one instant, the seconds from its stamp to that; no line delay
+    then.  Raises SettingsError where the focal length is unknown.
     """
     lens = profile.intrinsics
     if lens is None:
@@ -174,18 +181,28 @@ def format_camchain(profile: CameraProfile, exposure_s: float | None = None) -> 
         "resolution": [profile.width, profile.height],
         "rostopic": "/cam0/image_raw",
     }
-    if _has_line_delay(profile):
+    if instant_s is None and _has_line_delay(profile):
         camera["line_delay_nanoseconds"] = 1e9 * profile.shutter.readout_time_s / profile.height
     if profile.time_offset_s is not None:
-        camera["timeshift_cam_imu"] = profile.time_offset_s + _shift_for_kalibr_s(profile, exposure_s)
-    comments = [
-        "Kalibr camera chain, written by virest calibrate",
-        *_not_held(profile, coefficients, names, exposure_s),
-    ]
+        shift_s = _shift_for_kalibr_s(profile, exposure_s) if instant_s is None else instant_s
+        camera["timeshift_cam_imu"] = profile.time_offset_s + shift_s
+    lost = _not_held(profile, coefficients, names, exposure_s) if instant_s is None else _one_instant(profile)
+    comments = [f"Kalibr camera chain, written by virest {command}", *lost]
     return _commented(comments) + yaml.safe_dump({"cam0": camera}, default_flow_style=None, width=110)
 
 
-def format_imu(noise: ImuNoise) -> str:
+def _one_instant(profile: CameraProfile) -> list[str]:
+    """Sentences on a picture that counts as taken at once."""
+    said = ["timeshift_cam_imu leads to the one instant that a picture stands for, as tools without rows want it"]
+    if profile.time_offset_s is None:
+        said = ["the time offset is unknown: no timeshift_cam_imu"]
+    if profile.readout_known and profile.shutter.readout_time_s:
+        shutter = profile.shutter
+        said.append(f"which is its middle: rows are read {shutter.readout_direction} in {shutter.readout_time_s:.6g} s")
+    return said
+
+
+def format_imu(noise: ImuNoise, command: str = "calibrate") -> str:
     """Write noise as Kalibr's ``imu.yaml``, which needs every value: a usual random walk stands in for an unknown one.
 
     An unknown density is left out with a comment, for Kalibr to ask for it.
@@ -198,8 +215,8 @@ def format_imu(noise: ImuNoise) -> str:
         ("update_rate", noise.update_rate_hz, "Hz"),
     ]
     lines = [
-        "# Kalibr inertial sensor, written by virest calibrate. The densities are those of the stillest quarter of the",
-        "# capture, above a hand's motion: a lower bound where the phone filters its data.",
+        f"# Kalibr inertial sensor, written by virest {command}. The densities are those of the stillest quarter of",
+        "# the capture, above a hand's motion: a lower bound where the phone filters its data.",
     ]
     for key, value, remark in entries:
         lines.append(f"# {key}: unknown" if value is None else f"{key}: {_digits(value)}  # {remark}")

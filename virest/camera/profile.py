@@ -53,6 +53,8 @@ class Extensions:
     flicker_phase_rad: float = 0.0
     gain: tuple[float, ...] = ()
     defocus_sigma_px: float = 0.0
+    stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
+    """θ about x and y with which the inertial log begins; fitted on the way, and in no file: it is soon forgotten."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
-"""A capture folder: find its files, join them by time, say what is missing, and hand on one `Capture`.
+"""A capture folder, of any kind: join its files by time, say what is missing, and hand on one `Capture`.
 
-Files are told by their headers, frames are joined by time, and whatever is left out is counted and explained.
+Which kind it is, `detect` tells by its files and their headers; from then on there is one way for all.  Frames are
+joined by time, and whatever is left out is counted and explained.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture import startup as start
-from virest.capture.files import is_present, require_regular_file
+from virest.capture.detect import read_source
 from virest.capture.imu import ImuSamples
 from virest.capture.join import (
     Alignment,
@@ -25,22 +26,19 @@ from virest.capture.join import (
     outside_reason,
     pts_tolerance_ns,
 )
-from virest.capture.marslogger_android import (
-    EdgeEpochs,
-    GyroTable,
-    MetadataTable,
-    StampTable,
-    read_edge_epochs,
-    read_frame_timestamps,
-    read_gyro_accel,
-    read_movie_metadata,
-)
 from virest.capture.profile_source import default_profile, resolve_profile
 from virest.capture.records import NO_STAMP, STARTUP, Capture, CaptureMetadata, Frame, Note
-from virest.capture.video import MovieIndex, probe_movie, read_gray
+from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source
+from virest.capture.tables import GyroTable, MetadataTable, StampTable
+from virest.capture.video import read_gray
 from virest.errors import CaptureError, ClockError, ImuError
 
 __all__ = [
+    "EPOCHS",
+    "GYRO",
+    "METADATA",
+    "MOVIE",
+    "STAMPS",
     "Capture",
     "CaptureMetadata",
     "Frame",
@@ -50,8 +48,6 @@ __all__ = [
     "resolve_profile",
 ]
 
-MOVIE, STAMPS, METADATA = "movie.mp4", "frame_timestamps.txt", "movie_metadata.csv"
-GYRO, EPOCHS, UNFINISHED = "gyro_accel.csv", "edge_epochs.txt", ".marslogger_recording_in_progress"
 PLAUSIBLE_FOCAL = (0.55, 1.1)
 """fx over the long side of a phone's main camera."""
 BEARABLE_FOCAL = (0.4, 1.6)
@@ -59,17 +55,6 @@ BEARABLE_FOCAL = (0.4, 1.6)
 GUESSED_FOCAL = 0.8
 LARGE_RATE_RAD_S = 35.0
 """2000 °/s, where phone gyroscopes end."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Files:
-    """What stood in the folder, parsed."""
-
-    movie: MovieIndex
-    gyro: GyroTable
-    stamps: StampTable | None
-    metadata: MetadataTable | None
-    epochs: EdgeEpochs
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +71,7 @@ class _Joined:
 
 
 def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
-    """Read, join and check a MARSLogger folder.
+    """Read, join and check a capture folder.
 
     ``look_at_pictures``: decode the first two seconds to find repeated pictures (start-up lag).
     Raises VideoError, ImuError, ClockError or CaptureError where the capture cannot be used; what can be used in part
@@ -94,25 +79,26 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     """
     folder = require_folder(path)
     notes: list[Note] = []
-    files = _read_files(folder, notes)
+    files = read_source(folder, notes)
+    _note_movie(files, notes)
     joined = _join(files, notes)
     camera_ns = np.array([joined.stamps_ns[0], joined.stamps_ns[-1]])
-    shift_ns, remark = clock_shift_ns(camera_ns, files.gyro.time_ns, files.epochs)
+    shift_ns, remark = clock_shift_ns(camera_ns, files.gyro.time_ns, files.epochs, files.names.gyro)
     if remark:
         notes.append(Note("warning", "clock-shift", remark))
     zero_ns = joined.stamp_0_ns + shift_ns
     imu = ImuSamples((files.gyro.time_ns - zero_ns) / 1e9, files.gyro.gyro_rad_s, files.gyro.accel_m_s2)
     gaps = find_gaps(imu.time_s)
-    metadata = summarise_metadata(files.metadata, files.movie.width, files.movie.height, notes)
+    metadata = _summarise(files, notes)
     time_s = (joined.stamps_ns + shift_ns - zero_ns) / 1e9
-    began = _startup(folder / MOVIE, files, joined, time_s, imu, metadata, notes, look_at_pictures)
+    began = _startup(files, joined, time_s, imu, metadata, notes, look_at_pictures)
     frames = _frames(files, joined, shift_ns, time_s, imu, gaps, metadata, began)
     _note_imu(imu, gaps, notes)
     _note_frames(frames, notes)
     return Capture(
         name=folder.name,
         folder=folder,
-        movie=folder / MOVIE,
+        movie=files.movie_path,
         width=files.movie.width,
         height=files.movie.height,
         frames=frames,
@@ -127,6 +113,10 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
         stamp_0_ns=zero_ns,
         repeats=began.repeats,
         startup_lag_s=began.lag_s,
+        kind=files.kind,
+        metadata_file=files.names.metadata,
+        recorded_profile=files.profile,
+        inputs=files.inputs,
     )
 
 
@@ -144,92 +134,39 @@ def require_folder(path: Path) -> Path:
     raise CaptureError(f"{path}: is no folder", hint="pass the folder that holds movie.mp4")
 
 
-# ── reading ──────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _read_files(folder: Path, notes: list[Note]) -> _Files:
-    if is_present(folder / UNFINISHED):
-        notes.append(Note("warning", "unfinished", f"{UNFINISHED} is there: the recording was not stopped cleanly"))
-    try:
-        names = sorted(entry.name for entry in folder.iterdir())
-    except OSError as fault:
-        raise CaptureError(f"{folder.name}: {fault.strerror}", hint="check the folder's permissions") from None
-    if not {MOVIE, GYRO} & set(names):
-        shown = ", ".join(names[:6]) or "nothing"
-        text = f"{folder.name}: holds no {MOVIE} and no {GYRO} (but {shown})"
-        raise CaptureError(text, hint="pass a capture's folder")
-    gyro = read_gyro_accel(folder / GYRO)
-    movie = probe_movie(folder / MOVIE)
-    metadata = _read_metadata(folder, notes)
-    stamps = _read_stamps(folder, metadata, notes)
-    epochs = read_edge_epochs(folder / EPOCHS) if is_present(folder / EPOCHS) else EdgeEpochs("not logged", ())
-    if 0 < len(movie) < movie.declared_frames:
-        text = f"{MOVIE}: its index promises {movie.declared_frames} frames, {len(movie)} are there: the copy was cut"
+def _note_movie(files: Source, notes: list[Note]) -> None:
+    found, promised = len(files.movie), files.movie.declared_frames
+    if 0 < found < promised:
+        text = f"{files.names.movie}: its index promises {promised} frames, {found} are there: the copy was cut"
         notes.append(Note("warning", "movie-cut", text))
-    return _Files(movie, gyro, stamps, metadata, epochs)
-
-
-def _read_metadata(folder: Path, notes: list[Note]) -> MetadataTable | None:
-    if not is_present(folder / METADATA):
-        text = f"{METADATA} is missing: exposure, focal length and readout are unknown unless a profile has them"
-        notes.append(Note("warning", "no-metadata", text))
-        return None
-    if require_regular_file(folder / METADATA) == 0:
-        notes.append(Note("warning", "no-metadata", f"{METADATA} is empty: exposure, focal length, readout unknown"))
-        return None
-    table = read_movie_metadata(folder / METADATA)
-    if not len(table.time_ns):
-        notes.append(Note("warning", "no-metadata", f"{METADATA} has no rows: exposure, focal length, readout unknown"))
-        return None
-    return table
-
-
-def _read_stamps(folder: Path, metadata: MetadataTable | None, notes: list[Note]) -> StampTable | None:
-    """The stamps; None (with a note) where they were never written and the metadata can stand in."""
-    path, why = folder / STAMPS, ""
-    if not is_present(path):
-        why = "is missing"
-    elif require_regular_file(path) == 0:
-        why = "is empty"
-    else:
-        table = read_frame_timestamps(path)
-        if len(table.time_ns):
-            return table
-        why = "has no rows"
-    if metadata is None:
-        text = f"{folder.name}/{STAMPS}: {why}, and there is no {METADATA}"
-        raise ClockError(text, hint="frames have no times without either")
-    text = f"{STAMPS} {why} (written only at a clean Stop): PTS were slid over the rows of {METADATA} instead"
-    notes.append(Note("warning", "no-stamps", text))
-    return None
 
 
 # ── joining ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _join(files: _Files, notes: list[Note]) -> _Joined:
+def _join(files: Source, notes: list[Note]) -> _Joined:
     movie, metadata = files.movie, files.metadata
     pts_ns = movie.pts_ns
     tolerance = pts_tolerance_ns(float(movie.time_base) * 1e9)
     meta_ns = metadata.time_ns if metadata else np.zeros(0, np.int64)
     rows_ns = files.stamps.time_ns if files.stamps else floor_us(meta_ns)
-    what = STAMPS if files.stamps else METADATA
+    what = files.names.stamps if files.stamps else files.names.metadata
     alignment = align_frames(pts_ns, rows_ns, tolerance, meta_ns if files.stamps else None, what)
-    _note_alignment(alignment, len(pts_ns), len(rows_ns), what, notes)
+    _note_alignment(alignment, len(pts_ns), len(rows_ns), files.names.movie, what, notes)
     found = alignment.rows >= 0
     stamps_ns = np.where(found, rows_ns[alignment.rows], pts_ns + alignment.offset_ns)
     stamp_0_ns = int(files.stamps.time_ns[0]) if files.stamps else int(stamps_ns[0])
     joined = join_metadata(stamps_ns, meta_ns)
     if metadata is not None:
-        _note_metadata(joined, stamps_ns, meta_ns, notes)
+        _note_metadata(joined, stamps_ns, meta_ns, files.names.metadata, notes)
     lag = _unix_lag_s(files, alignment, joined)
     return _Joined(stamps_ns, found, stamp_0_ns, joined, lag)
 
 
-def _note_alignment(alignment: Alignment, frames: int, rows: int, what: str, notes: list[Note]) -> None:
+def _note_alignment(alignment: Alignment, frames: int, rows: int, movie: str, what: str, notes: list[Note]) -> None:
     if alignment.slid:
         matched = int((alignment.rows >= 0).sum())
-        text = f"{MOVIE} has {frames} frames, {what} {rows} rows: {matched} frames joined by sliding PTS over the rows"
+        text = f"{movie} has {frames} frames, {what} {rows} rows: {matched} frames joined by sliding PTS over the rows"
         notes.append(Note("warning" if matched < frames or rows != frames else "info", "stamps-slid", text))
     if alignment.rivals:
         text = (
@@ -240,24 +177,24 @@ def _note_alignment(alignment: Alignment, frames: int, rows: int, what: str, not
 
 
 def _note_metadata(
-    joined: NDArray[np.int64], stamps_ns: NDArray[np.int64], meta_ns: NDArray[np.int64], notes: list[Note]
+    joined: NDArray[np.int64], stamps_ns: NDArray[np.int64], meta_ns: NDArray[np.int64], name: str, notes: list[Note]
 ) -> None:
     lost = int((joined < 0).sum())
     if lost == len(joined):
         raise ClockError(
-            f"{METADATA} covers {meta_ns[0] / 1e9:.3f}–{meta_ns[-1] / 1e9:.3f} s, the frames "
+            f"{name} covers {meta_ns[0] / 1e9:.3f}–{meta_ns[-1] / 1e9:.3f} s, the frames "
             f"{stamps_ns[0] / 1e9:.3f}–{stamps_ns[-1] / 1e9:.3f} s: no row joins",
             hint="the files are of different sessions; remove the metadata to go on without exposures",
         )
     if lost:
-        text = f"{lost} of {len(joined)} frames have no row in {METADATA}: their exposure is unknown"
+        text = f"{lost} of {len(joined)} frames have no row in {name}: their exposure is unknown"
         notes.append(Note("warning", "metadata-missing", text))
     spare = len(meta_ns) - len(np.unique(joined[joined >= 0]))
     if spare:
-        notes.append(Note("info", "metadata-spare", f"{spare} rows of {METADATA} belong to no frame of the movie"))
+        notes.append(Note("info", "metadata-spare", f"{spare} rows of {name} belong to no frame of the movie"))
 
 
-def _unix_lag_s(files: _Files, alignment: Alignment, joined: NDArray[np.int64]) -> NDArray[np.float64] | None:
+def _unix_lag_s(files: Source, alignment: Alignment, joined: NDArray[np.int64]) -> NDArray[np.float64] | None:
     """Encoder output − capture result of each frame, from the two Unix columns; None where either is missing."""
     if files.stamps is None or files.metadata is None:
         return None
@@ -272,24 +209,32 @@ def _unix_lag_s(files: _Files, alignment: Alignment, joined: NDArray[np.int64]) 
 # ── what the metadata say ────────────────────────────────────────────────────────────────────────────────────────
 
 
-def summarise_metadata(table: MetadataTable | None, width: int, height: int, notes: list[Note]) -> CaptureMetadata:
-    """Medians over the rows; fx belongs to the sensor's long axis, which is vertical in a portrait picture."""
+def _summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
+    """Medians over the rows, and what the recorder says of camera and axes where the rows say nothing.
+
+    fx of the rows belongs to the sensor's long axis, which is vertical in a portrait picture.
+    """
+    lens = files.profile.intrinsics if files.profile else None
+    readout_s = files.profile.shutter.readout_time_s if files.profile and files.profile.readout_known else None
+    table, name = files.metadata, files.names.metadata
     if table is None:
-        return CaptureMetadata()
+        return CaptureMetadata(lens.fx_px if lens else None, lens.fy_px if lens else None, readout_s)
     fx, fy = _median(table.fx_px), _median(table.fy_px)
-    if not _focal_plausible(fx, width, height, notes):
+    if fx is None and lens is not None:
+        fx, fy = lens.fx_px, lens.fy_px
+    elif not _focal_plausible(fx, files.movie.width, files.movie.height, name, notes):
         fx = fy = None
-    if height > width:
+    elif files.movie.height > files.movie.width:
         fx, fy = fy, fx
-    readout = _median(table.readout_time_s)
-    if readout is None:
-        notes.append(Note("info", "readout-unknown", f"{METADATA} has no readout time"))
+    logged_s = _median(table.readout_time_s)
+    if logged_s is None and readout_s is None:
+        notes.append(Note("info", "readout-unknown", f"{name} has no readout time"))
     if _median(table.exposure_s) is None:
-        notes.append(Note("warning", "exposure-unknown", f"{METADATA} has no exposure times: no deblurring"))
+        notes.append(Note("warning", "exposure-unknown", f"{name} has no exposure times: no deblurring"))
     return CaptureMetadata(
         fx_px=fx,
         fy_px=fy,
-        readout_time_s=readout,
+        readout_time_s=readout_s if logged_s is None else logged_s,
         exposure_s=_median(table.exposure_s),
         iso=_median(table.iso),
         focal_length_mm=_median(table.focal_length_mm),
@@ -301,9 +246,9 @@ def _median(values: NDArray[np.float64]) -> float | None:
     return float(np.median(finite)) if len(finite) else None
 
 
-def _focal_plausible(fx: float | None, width: int, height: int, notes: list[Note]) -> bool:
+def _focal_plausible(fx: float | None, width: int, height: int, name: str, notes: list[Note]) -> bool:
     if fx is None:
-        text = f"{METADATA} has no focal length: give fx_px in camera.yaml, or let `virest calibrate` find it"
+        text = f"{name} has no focal length: give fx_px in camera.yaml, or let `virest calibrate` find it"
         notes.append(Note("warning", "fx-unknown", text))
         return False
     ratio = fx / max(width, height)
@@ -326,8 +271,7 @@ def _focal_plausible(fx: float | None, width: int, height: int, notes: list[Note
 
 
 def _startup(
-    movie: Path,
-    files: _Files,
+    files: Source,
     joined: _Joined,
     time_s: NDArray[np.float64],
     imu: ImuSamples,
@@ -342,7 +286,8 @@ def _startup(
         focal = metadata.fx_px or GUESSED_FOCAL * max(files.movie.width, files.movie.height)
         motion = start.expected_motion_px(time_s[:look], imu.time_s, imu.gyro_rad_s, focal, period)
         if (motion > start.MIN_MOTION_PX).any():
-            pictures = [p if p is None else p[::2, ::2].copy() for _, p in read_gray(movie, files.movie, range(look))]
+            stream = read_gray(files.movie_path, files.movie, range(look))
+            pictures = [p if p is None else p[::2, ::2].copy() for _, p in stream]
             repeats = start.find_repeats(start.picture_differences(pictures), motion)
     began = start.judge_startup(joined.unix_lag_s, repeats, len(time_s), period)
     if began.frames:
@@ -365,7 +310,7 @@ def _startup_note(began: start.Startup) -> Note:
 
 
 def _frames(
-    files: _Files,
+    files: Source,
     joined: _Joined,
     shift_ns: int,
     time_s: NDArray[np.float64],
@@ -383,7 +328,7 @@ def _frames(
             late = f"(at frame 0 by {began.lag_s or 0.0:.2f} s)"
             reasons.append((STARTUP, f"start-up: content later than its stamp {late}"))
         if not joined.has_stamp[i]:
-            reasons.append((NO_STAMP, f"no row in {STAMPS if files.stamps else METADATA}"))
+            reasons.append((NO_STAMP, f"no row in {files.names.stamps if files.stamps else files.names.metadata}"))
         start_s = float(time_s[i])
         end_s = start_s + (exposure_s or metadata.exposure_s or 0.0) + readout_s
         if outside := outside_reason(start_s, end_s, imu.time_s, gaps):
@@ -434,7 +379,7 @@ def _note_frames(frames: tuple[Frame, ...], notes: list[Note]) -> None:
         notes.append(Note("warning", "frames-without-imu", text))
 
 
-def _counts(files: _Files, joined: _Joined, frames: tuple[Frame, ...]) -> dict[str, int]:
+def _counts(files: Source, joined: _Joined, frames: tuple[Frame, ...]) -> dict[str, int]:
     counts = {
         "movie_frames": len(files.movie),
         "movie_repeated_pts": files.movie.repeated_pts,
@@ -448,9 +393,9 @@ def _counts(files: _Files, joined: _Joined, frames: tuple[Frame, ...]) -> dict[s
     for code in sorted({code for frame in frames for code in frame.skip_codes}):
         counts[f"frames_skipped: {code}"] = sum(code in frame.skip_codes for frame in frames)
     tables: Mapping[str, StampTable | MetadataTable | GyroTable | None] = {
-        STAMPS: files.stamps,
-        METADATA: files.metadata,
-        GYRO: files.gyro,
+        files.names.stamps: files.stamps,
+        files.names.metadata: files.metadata,
+        files.names.gyro: files.gyro,
     }
     for name, table in tables.items():
         for reason, number in (table.dropped if table else {}).items():

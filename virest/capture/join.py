@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.capture.marslogger_android import EdgeEpochs
+from virest.capture.tables import EdgeEpochs
 from virest.errors import ClockError
 
 TICK_90KHZ_NS = 1e9 / 90_000
@@ -131,7 +131,9 @@ def overlap_s(camera_ns: Int64, imu_ns: Int64, shift_ns: int = 0) -> float:
     return (min(int(camera_ns[-1]) + shift_ns, int(imu_ns[-1])) - start) / 1e9
 
 
-def clock_shift_ns(camera_ns: Int64, imu_ns: Int64, epochs: EdgeEpochs) -> tuple[int, str]:
+def clock_shift_ns(
+    camera_ns: Int64, imu_ns: Int64, epochs: EdgeEpochs, name: str = "gyro_accel.csv"
+) -> tuple[int, str]:
     """What to add to camera stamps to bring them to the IMU's clock, and a remark ('' if all is as it should be).
 
     REALTIME: nothing.  UNKNOWN: the mean difference of edge_epochs.  No difference known: nothing, if the spans share
@@ -148,7 +150,7 @@ def clock_shift_ns(camera_ns: Int64, imu_ns: Int64, epochs: EdgeEpochs) -> tuple
     camera = f"{(int(camera_ns[0]) + shift) / 1e9:.3f}–{(int(camera_ns[-1]) + shift) / 1e9:.3f} s"
     imu = f"{int(imu_ns[0]) / 1e9:.3f}–{int(imu_ns[-1]) / 1e9:.3f} s"
     raise ClockError(
-        f"gyro_accel.csv covers {imu}, the frames {camera}: {-overlap_s(camera_ns, imu_ns, shift):.3f} s apart",
+        f"{name} covers {imu}, the frames {camera}: {-overlap_s(camera_ns, imu_ns, shift):.3f} s apart",
         hint="the files are of different sessions, or edge_epochs.txt is missing or wrong",
         source=epochs.source,
     )

@@ -11,30 +11,35 @@ Times are whole nanoseconds and stay int64.  Each reader returns its table and, 
 from __future__ import annotations
 
 import re
-import warnings
-from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from virest.capture.files import TextScan, label, read_small_text, scan_text
+from virest.capture.tables import (
+    DAMAGED_TIME,
+    EXCEL_HINT,
+    INTEGER,
+    MAX_FIELDS,
+    EdgeEpochs,
+    Float64,
+    GyroTable,
+    Int64,
+    MetadataTable,
+    StampTable,
+    keep_rising,
+    make_gyro_table,
+    make_metadata_table,
+    numbers,
+    text_chunks,
+    whole_numbers,
+)
 from virest.errors import CaptureError, ClockError, ImuError
 
-ROWS_AT_ONCE = 100_000
-MAX_FIELDS = 16
-MAX_RATE_RAD_S = 200.0
-"""Phone gyroscopes end at 35 rad/s (2000 °/s); beyond this a row is damage, not motion."""
 MICROSECOND_GAP_LIMIT = 1_000_000
 """Stamps without a header: a median step below this is in microseconds (no camera runs at 1000 frames/s here)."""
-
-Int64 = NDArray[np.int64]
-Float64 = NDArray[np.float64]
 
 GYRO, METADATA, STAMPS, POSITION, IOS_METADATA, IOS_ARKIT, NO_SENSOR, BARE_STAMPS, UNKNOWN = (
     "gyro_accel.csv",
@@ -47,72 +52,6 @@ GYRO, METADATA, STAMPS, POSITION, IOS_METADATA, IOS_ARKIT, NO_SENSOR, BARE_STAMP
     "stamps without a header",
     "unknown",
 )
-
-_INTEGER = re.compile(r"[+-]?(?:\d{1,18}|[0-8]\d{18}|9[01]\d{17})")
-"""A whole number that fits in 64 bits; Unix nanoseconds have 19 digits."""
-_DAMAGED_TIME = r"[+-]?(?:\d+[.,]\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)"
-_EXCEL_HINT = "a spreadsheet has re-saved the file and lost the nanoseconds; copy the original from the phone again"
-
-
-@dataclass(frozen=True, slots=True)
-class GyroTable:
-    """gyro_accel.csv, strictly rising."""
-
-    time_ns: Int64
-    """(n,) IMU clock."""
-    gyro_rad_s: Float64
-    """(n, 3), no NaN."""
-    accel_m_s2: Float64
-    """(n, 3), NaN where there is none."""
-    rows: int
-    """Data rows read, dropped ones included."""
-    dropped: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class MetadataTable:
-    """movie_metadata.csv, strictly rising; NaN: ``null``, absent or implausible."""
-
-    time_ns: Int64
-    """(n,) camera clock."""
-    fx_px: Float64
-    """(n,) along the sensor's long axis; NaN for the logger's 1.0 = unknown."""
-    fy_px: Float64
-    exposure_s: Float64
-    readout_time_s: Float64
-    iso: Float64
-    focal_length_mm: Float64
-    unix_ns: Int64 | None
-    """(n,) when the capture result came, 0 where unreadable; None: no such column."""
-    rows: int
-    dropped: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class StampTable:
-    """frame_timestamps.txt, strictly rising."""
-
-    time_ns: Int64
-    """(n,) camera clock, whole microseconds."""
-    unix_ns: Int64 | None
-    """(n,) when the encoder handed the frame over, 0 where unreadable; None: no such column."""
-    rows: int
-    dropped: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeEpochs:
-    """edge_epochs.txt."""
-
-    source: str
-    """``REALTIME``, ``UNKNOWN`` or ``not logged``."""
-    differences_ns: tuple[int, ...]
-    """IMU clock − camera clock, one a row."""
-
-    @property
-    def mean_difference_ns(self) -> int | None:
-        """Mean over the rows, None without rows."""
-        return round(sum(self.differences_ns) / len(self.differences_ns)) if self.differences_ns else None
 
 
 # ── what a file is ───────────────────────────────────────────────────────────────────────────────────────────────
@@ -142,7 +81,7 @@ def identify(head: str) -> str:
         return STAMPS
     if "lat[deg]" in names:
         return POSITION
-    return BARE_STAMPS if _INTEGER.fullmatch(line.strip()) else UNKNOWN
+    return BARE_STAMPS if INTEGER.fullmatch(line.strip()) else UNKNOWN
 
 
 def _require_kind(scan: TextScan, path: Path, expected: str, error: type[CaptureError]) -> None:
@@ -157,7 +96,7 @@ def _require_kind(scan: TextScan, path: Path, expected: str, error: type[Capture
     separated = [mark for mark in ("\t", ";") if mark in line and identify(scan.head.replace(mark, ",")) == expected]
     if separated:
         mark = "tabs" if separated[0] == "\t" else "semicolons"
-        raise ClockError(f"{name}: columns are separated by {mark}, not commas", hint=_EXCEL_HINT)
+        raise ClockError(f"{name}: columns are separated by {mark}, not commas", hint=EXCEL_HINT)
     if kind == NO_SENSOR:
         raise ImuError(
             f"{name}: the logger says that the phone has no gyroscope or no accelerometer",
@@ -172,35 +111,6 @@ def _require_kind(scan: TextScan, path: Path, expected: str, error: type[Capture
 # ── rows ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _chunks(path: Path) -> Iterator[pd.DataFrame]:
-    """The file's fields as text, MAX_FIELDS columns, a bounded number of rows at once; absent fields are ''."""
-    options: dict[str, Any] = {
-        "header": None,
-        "names": list(range(MAX_FIELDS)),
-        "index_col": False,
-        "dtype": str,
-        "keep_default_na": False,
-        "na_filter": False,
-        "quoting": 3,
-        "skipinitialspace": True,
-        "skip_blank_lines": False,
-        "encoding": "utf-8-sig",
-        "encoding_errors": "replace",
-        "on_bad_lines": "skip",
-        "chunksize": ROWS_AT_ONCE,
-    }
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pd.errors.ParserWarning)
-        try:
-            with pd.read_csv(path, **options) as reader:
-                for chunk in reader:
-                    yield chunk.fillna("")
-        except pd.errors.EmptyDataError:
-            return
-        except (pd.errors.ParserError, OSError) as fault:
-            raise CaptureError(f"{label(path)}: {fault}", hint="copy the logger's file again") from None
-
-
 def _split_rows(
     chunk: pd.DataFrame, first_column: str, min_fields: int, path: Path, dropped: Counter[str]
 ) -> tuple[pd.DataFrame, Int64]:
@@ -210,11 +120,11 @@ def _split_rows(
     is_header = (lowered == first_column).to_numpy()
     is_comment = (text == "").to_numpy() | text.str.startswith("#").to_numpy()
     is_comment |= text.str.contains("gyroscope|accelerometer|IMU data").to_numpy()
-    whole = text.str.fullmatch(_INTEGER).to_numpy()
-    damaged = text.str.fullmatch(_DAMAGED_TIME).to_numpy() | text.str.contains("\t", regex=False).to_numpy()
+    whole = text.str.fullmatch(INTEGER).to_numpy()
+    damaged = text.str.fullmatch(DAMAGED_TIME).to_numpy() | text.str.contains("\t", regex=False).to_numpy()
     if damaged.any():
         shown = text[damaged].iloc[0][:40].replace("\t", "<tab>")
-        raise ClockError(f"{label(path)}: time '{shown}' is no whole number of nanoseconds", hint=_EXCEL_HINT)
+        raise ClockError(f"{label(path)}: time '{shown}' is no whole number of nanoseconds", hint=EXCEL_HINT)
     enough = (chunk[min_fields - 1] != "").to_numpy()
     times = np.zeros(len(chunk), np.int64)
     times[whole] = text[whole].astype("int64").to_numpy()
@@ -225,83 +135,10 @@ def _split_rows(
     return chunk[good], times[good]
 
 
-def _numbers(column: Any) -> Float64:
-    """Text to float64; ``null``, text and infinities become NaN."""
-    values = pd.to_numeric(column.str.strip(), errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def _whole_numbers(column: Any) -> Int64:
-    """Text to int64, exactly; 0 where it is no whole number."""
-    text = column.str.strip()
-    whole = text.str.fullmatch(_INTEGER).to_numpy()
-    values = np.zeros(len(text), np.int64)
-    values[whole] = text[whole].astype("int64").to_numpy()
-    return values
-
-
-def strictly_rising(times: Int64) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Mask of rows to keep so that times rise strictly, and how many were equal or fell.
-
-    The first of equal times stays.  A single time far ahead of its successors is dropped alone: where dropping what
-    falls would cost more rows, the longest rising subsequence is kept.
-    """
-    keep = np.ones(len(times), bool)
-    if len(times) < 2:
-        return keep, {}
-    keep[1:] = np.diff(times) != 0
-    equal = int((~keep).sum())
-    rows = np.flatnonzero(keep)
-    fresh = times[rows]
-    rising = np.concatenate([[True], fresh[1:] > np.maximum.accumulate(fresh)[:-1]])
-    if not rising.all():
-        longest = _longest_rising(fresh)
-        if longest.sum() > rising.sum():
-            rising = longest
-    keep[rows] = rising
-    counts = {"time equals its predecessor's": equal, "time falls or leaps": int((~rising).sum())}
-    return keep, {reason: count for reason, count in counts.items() if count}
-
-
-def _longest_rising(values: Int64) -> NDArray[np.bool_]:
-    """Mask of a longest strictly rising subsequence (patience sorting)."""
-    tails: list[int] = []
-    tail_rows: list[int] = []
-    parent = np.full(len(values), -1, np.int64)
-    for row, value in enumerate(values.tolist()):
-        place = bisect_left(tails, value)
-        if place:
-            parent[row] = tail_rows[place - 1]
-        if place == len(tails):
-            tails.append(value)
-            tail_rows.append(row)
-        else:
-            tails[place], tail_rows[place] = value, row
-    mask = np.zeros(len(values), bool)
-    row = tail_rows[-1] if tail_rows else -1
-    while row >= 0:
-        mask[row] = True
-        row = int(parent[row])
-    return mask
-
-
 def _count_rows(times: Int64, dropped: Counter[str]) -> int:
     """Data rows of the file: those read and those dropped; its own header is neither."""
     dropped["header repeated"] = max(dropped["header repeated"] - 1, 0)
     return len(times) + sum(dropped.values())
-
-
-def _rise(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.bool_]:
-    """The mask of :func:`strictly_rising`, its losses counted. Raises ClockError where most rows would go."""
-    keep, lost = strictly_rising(times)
-    if len(times) > 2 and keep.sum() * 2 <= len(times):
-        raise ClockError(
-            f"{label(path)}: only {int(keep.sum())} of {len(times)} times rise "
-            f"({', '.join(f'{n} {reason}' for reason, n in lost.items())})",
-            hint=_EXCEL_HINT,
-        )
-    dropped.update(lost)
-    return keep
 
 
 # ── the files ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -321,32 +158,21 @@ def read_gyro_accel(path: Path) -> GyroTable:
     times: list[Int64] = [np.zeros(0, np.int64)]
     values: list[Float64] = [np.zeros((0, 6))]
     seen, last_is_good = 0, False
-    for chunk in _chunks(path):
+    for chunk in text_chunks(path):
         table, time_ns = _split_rows(chunk, columns[0], 7, path, dropped)
         seen += len(chunk)
         last_is_good = len(table) > 0 and table.index[-1] == chunk.index[-1]
         times.append(time_ns)
-        values.append(np.stack([_numbers(table[column]) for column in range(1, 7)], axis=1))
+        values.append(np.stack([numbers(table[column]) for column in range(1, 7)], axis=1))
     dropped["cut or unreadable row"] += max(scan.lines - seen, 0)  # rows with too many fields never arrive
     time_ns, samples = np.concatenate(times), np.concatenate(values)
     rows = _count_rows(time_ns, dropped)
-    keep = _rise(time_ns, path, dropped)
+    keep = keep_rising(time_ns, path, dropped)
     if last_is_good and not scan.ends_with_newline and keep[-1]:
         keep[-1] = False  # its last number may be cut and still read as one
         dropped["last line without its end"] += 1
     time_ns, samples = time_ns[keep], samples[keep]
-    finite = np.isfinite(samples[:, :3]).all(axis=1)
-    plausible = (np.abs(np.where(np.isfinite(samples[:, :3]), samples[:, :3], 0.0)) <= MAX_RATE_RAD_S).all(axis=1)
-    dropped["gyroscope null or NaN"] += int((~finite).sum())
-    dropped[f"rate above {MAX_RATE_RAD_S:.0f} rad/s"] += int((finite & ~plausible).sum())
-    good = finite & plausible
-    if good.sum() < 2:
-        raise ImuError(
-            f"{label(path)}: {int(good.sum())} usable of {rows} rows",
-            hint="the logger wrote no gyroscope data; see the counts of `virest inspect`",
-            dropped=dict(+dropped),
-        )
-    return GyroTable(time_ns[good], samples[good, :3], samples[good, 3:], rows, dict(+dropped))
+    return make_gyro_table(path, time_ns, samples, rows, dict(+dropped))
 
 
 def _check_gyro_header(columns: tuple[str, ...], path: Path) -> None:
@@ -369,14 +195,6 @@ _METADATA_COLUMNS = {
     "iso": ("iso",),
     "focal_length_mm": ("focallength",),
 }
-_PLAUSIBLE = {
-    "fx_px": (1.5, 1e6),  # 1.0 is the logger's "unknown"
-    "fy_px": (1.5, 1e6),
-    "exposure_s": (1e-7, 10.0),
-    "readout_time_s": (1e-6, 0.5),  # 0 is written by phones that do not know it
-    "iso": (1e-3, 1e7),
-    "focal_length_mm": (0.1, 1000.0),
-}
 
 
 def read_movie_metadata(path: Path) -> MetadataTable:
@@ -394,22 +212,20 @@ def read_movie_metadata(path: Path) -> MetadataTable:
     dropped: Counter[str] = Counter()
     times, unix = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     values: dict[str, list[Float64]] = {name: [np.zeros(0)] for name in places}
-    for chunk in _chunks(path):
+    for chunk in text_chunks(path):
         table, time_ns = _split_rows(chunk, columns[0], 2, path, dropped)
         times.append(time_ns)
-        unix.append(np.zeros(len(table), np.int64) if unix_place is None else _whole_numbers(table[unix_place]))
+        unix.append(np.zeros(len(table), np.int64) if unix_place is None else whole_numbers(table[unix_place]))
         for name, place in places.items():
-            values[name].append(np.full(len(table), np.nan) if place is None else _numbers(table[place]))
+            values[name].append(np.full(len(table), np.nan) if place is None else numbers(table[place]))
     time_ns = np.concatenate(times)
     rows = _count_rows(time_ns, dropped)
-    keep = _rise(time_ns, path, dropped)
+    keep = keep_rising(time_ns, path, dropped)
     found = {name: np.concatenate(parts)[keep] for name, parts in values.items()}
     for name in ("exposure_s", "readout_time_s"):
         found[name] = found[name] * 1e-9
-    for name, (low, high) in _PLAUSIBLE.items():
-        found[name] = np.where((found[name] >= low) & (found[name] <= high), found[name], np.nan)
     unix_ns = None if unix_place is None else np.concatenate(unix)[keep]
-    return MetadataTable(time_ns[keep], **found, unix_ns=unix_ns, rows=rows, dropped=dict(+dropped))
+    return make_metadata_table(time_ns[keep], rows, dict(+dropped), unix_ns=unix_ns, **found)
 
 
 def _place(columns: tuple[str, ...], spellings: tuple[str, ...]) -> int | None:
@@ -430,13 +246,13 @@ def read_frame_timestamps(path: Path) -> StampTable:
     has_unix = "unixtime[nanosec]" in columns[1:2]
     dropped: Counter[str] = Counter()
     times, unix = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for chunk in _chunks(path):
+    for chunk in text_chunks(path):
         table, time_ns = _split_rows(chunk, "frametimestamp[nanosec]", 1, path, dropped)
         times.append(time_ns)
-        unix.append(_whole_numbers(table[1]) if has_unix else np.zeros(len(table), np.int64))
+        unix.append(whole_numbers(table[1]) if has_unix else np.zeros(len(table), np.int64))
     time_ns = np.concatenate(times)
     rows = _count_rows(time_ns, dropped)
-    keep = _rise(time_ns, path, dropped)
+    keep = keep_rising(time_ns, path, dropped)
     time_ns = time_ns[keep]
     if bare and len(time_ns) > 1 and np.median(np.diff(time_ns)) < MICROSECOND_GAP_LIMIT:
         time_ns = time_ns * 1000
@@ -450,7 +266,7 @@ def read_edge_epochs(path: Path) -> EdgeEpochs:
         if named := re.search(r"SENSOR_INFO_TIMESTAMP_SOURCE is SENSOR_INFO_TIMESTAMP_SOURCE_(REALTIME|UNKNOWN)", line):
             source = named.group(1)
         fields = line.split()
-        if line.startswith("#") or len(fields) < 2 or not all(_INTEGER.fullmatch(item) for item in fields):
+        if line.startswith("#") or len(fields) < 2 or not all(INTEGER.fullmatch(item) for item in fields):
             continue
         differences.append(int(fields[2]) if len(fields) > 2 else int(fields[0]) - int(fields[1]))
     return EdgeEpochs(source, tuple(differences))

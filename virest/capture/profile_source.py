@@ -16,7 +16,6 @@ from virest.errors import SettingsError
 PROFILE_NAME = "camera.yaml"
 LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 """Stored landscape picture of an Android phone's rear camera (sensor rows horizontal) against the device axes."""
-LOGGED = "movie_metadata.csv, median"
 
 
 def default_profile(capture: Capture) -> CameraProfile:
@@ -24,33 +23,42 @@ def default_profile(capture: Capture) -> CameraProfile:
 
     Documented defaults: principal point in the middle, no distortion; portrait pictures are read right to left with
     x_cam = diag(1, −1, −1) x_imu, landscape ones top to bottom with the Android landscape map; response and time
-    offset unknown; readout unknown unless logged.
+    offset unknown; readout unknown unless logged.  Where the recorder describes the camera itself (EuRoC's sensor.yaml,
+    a .gcsv's header), that stands in the phone's place.
     """
-    portrait = capture.height > capture.width
-    profile = CameraProfile(
-        width=capture.width,
-        height=capture.height,
-        device=capture.metadata.device,
+    recorded = capture.recorded_profile
+    if recorded is None:
+        logged = capture.metadata
+        recorded = phone_profile(capture.width, capture.height, logged.device, logged.focal_length_mm)
+    return fill_from_metadata(recorded, capture)
+
+
+def phone_profile(width: int, height: int, device: str = "", focal_length_mm: float | None = None) -> CameraProfile:
+    """What a phone that says nothing of its axes is taken for, by the shape of its stored picture."""
+    portrait = height > width
+    return CameraProfile(
+        width=width,
+        height=height,
+        device=device,
         shutter=Shutter(0.0, "right_to_left" if portrait else "top_to_bottom"),
         readout_known=False,
         r_cam_imu=ANDROID_R_CAM_IMU if portrait else LANDSCAPE_R_CAM_IMU,
-        focal_length_mm=capture.metadata.focal_length_mm,
+        focal_length_mm=focal_length_mm,
     )
-    return fill_from_metadata(profile, capture)
 
 
 def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfile:
     """Put logged values where the profile has none: focal length and readout time; each with its source."""
-    logged = capture.metadata
+    logged, source = capture.metadata, f"{capture.metadata_file}, median"
     if profile.intrinsics is None and (fx := logged.fx_px or logged.fy_px):
         fy = logged.fy_px or fx
         centre = (capture.width - 1) / 2, (capture.height - 1) / 2
         lens = Intrinsics(capture.width, capture.height, fx, fy, *centre)
-        profile = profile.with_estimate("fx_px", fx, None, LOGGED, intrinsics=lens)
+        profile = profile.with_estimate("fx_px", fx, None, source, intrinsics=lens)
     if not profile.readout_known and logged.readout_time_s is not None:
         shutter = replace(profile.shutter, readout_time_s=logged.readout_time_s)
         profile = profile.with_estimate(
-            "readout_time_s", logged.readout_time_s, None, LOGGED, shutter=shutter, readout_known=True
+            "readout_time_s", logged.readout_time_s, None, source, shutter=shutter, readout_known=True
         )
     return profile
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 
 STARTUP = "start-up"
@@ -94,6 +95,14 @@ class Capture:
     """Frames of the first two seconds that repeat their predecessor although the phone turned."""
     startup_lag_s: float | None = None
     """How much later than its stamp frame 0's picture is, at least; None: no lag seen."""
+    kind: str = "MARSLogger"
+    """What recorded it, as told by its files."""
+    metadata_file: str = "movie_metadata.csv"
+    """Where ``metadata`` comes from."""
+    recorded_profile: CameraProfile | None = None
+    """What the recorder says of camera and axes beyond ``metadata``; None: nothing."""
+    inputs: tuple[Path, ...] = ()
+    """Files that were read: logs, lists, sensor descriptions, the movie; of listed pictures only the list."""
 
     @property
     def usable(self) -> tuple[Frame, ...]:

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.files import label, require_regular_file
+from virest.capture.pictures import PictureList, first_size, is_picture_source, read_picture_list, read_pictures
 from virest.errors import VideoError
 
 log = logging.getLogger(__name__)
@@ -69,6 +70,8 @@ class MovieIndex:
     """What the container's table promises; more than ``len``: the file was cut. 0: not said."""
     repeated_pts: int = 0
     """Access units left out since another one has their time."""
+    pictures: tuple[str, ...] = ()
+    """Of a folder of pictures: their paths, from the folder or from the list's folder; empty for a movie."""
 
     def __len__(self) -> int:
         return len(self.pts_ticks)
@@ -90,10 +93,12 @@ class MovieIndex:
 
 
 def probe_movie(path: Path) -> MovieIndex:
-    """Index the movie by its packets, without decoding.
+    """Index the movie by its packets, without decoding; or the pictures of a list or a folder.
 
     Raises VideoError for a missing, cut or foreign file, no video stream, and absurd sizes.
     """
+    if is_picture_source(path):
+        return index_pictures(path, read_picture_list(path))
     size = require_regular_file(path, VideoError, "a capture needs its movie.mp4")
     if size == 0:
         raise VideoError(f"{label(path)}: is empty", hint="the recording was not stopped cleanly, or the copy failed")
@@ -108,6 +113,15 @@ def probe_movie(path: Path) -> MovieIndex:
             f"{label(path)}: cannot be opened as a movie ({_reason(fault)}, {size} bytes)",
             hint="it has no index (moov) if the recorder was not stopped cleanly; stop it, then copy again",
         ) from None
+
+
+def index_pictures(path: Path, found: PictureList) -> MovieIndex:
+    """Index listed pictures: ticks of a nanosecond, every picture one that the decoder can start from."""
+    width, height = first_size(found, path)
+    _check_size(width, height, path)
+    every = tuple(range(len(found.names)))
+    codec = Path(found.names[0]).suffix.lstrip(".").lower()
+    return MovieIndex(width, height, Fraction(1, 10**9), found.time_ns, every, every, codec, pictures=found.names)
 
 
 def read_frames(path: Path, index: MovieIndex, first: int, last: int) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
@@ -189,6 +203,10 @@ def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> 
 def _read(
     path: Path, index: MovieIndex, frames: Iterable[int], convert: Callable[[Any], NDArray[np.uint8]]
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    if index.pictures:
+        base, size = path if path.is_dir() else path.parent, (index.width, index.height)
+        yield from read_pictures(base, index.pictures, size, frames, gray=convert is to_gray)
+        return
     require_regular_file(path, VideoError, "a capture needs its movie.mp4")
     for run in _runs(index, frames):
         try:

@@ -164,6 +164,13 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         "the focal length is {focal_scale} times the profile's",
     ),
     GeometricEffect(
+        "exposure_time",
+        terms_of.EXPOSURE_SCALE,
+        lambda p: {"exposure_scale": p.shutter.exposure_scale},
+        _scaled("exposure_scale", lambda p: {"exposure_scale": p.shutter.exposure_scale}),
+        "the true exposure is {exposure_scale} times the logged one",
+    ),
+    GeometricEffect(
         "focal_drift",
         terms_of.FOCAL_DRIFT,
         lambda p: {"focal_drift_per_s": p.extensions.focal_drift_per_s},
@@ -190,6 +197,6 @@ GEOMETRIC_EFFECTS: tuple[GeometricEffect, ...] = (
         _stabiliser,
         lambda p, s: {"fraction": float(s[0]), "cutoff_hz": float(s[1]) * p.extensions.stabilisation_cutoff_hz},
         "the lens is moved against the shake: it cancels {fraction} of what is faster than {cutoff_hz} Hz",
-        ((0.5, 0.0), (0.5, 1.2), (0.5, -1.2)),
+        ((0.5, 0.0, 0.0, 0.0), (0.5, 1.2, 0.0, 0.0), (0.5, -1.2, 0.0, 0.0)),
     ),
 )

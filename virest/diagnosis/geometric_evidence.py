@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.observed_tracks import ObservedTracks
-from virest.motion.scene_motion import InertialMotion, Motion
+from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
-from virest.motion.track_model import TrackTable, centre, ground, seen_s
+from virest.motion.track_model import TrackTable, centre, ground, predict, seen_s
 from virest.motion.track_noise import smooth_flow_residual
 
 Array = NDArray[np.float64]
@@ -26,7 +26,10 @@ BLOCK_LENGTHS = (7, 11, 8, 13, 9)
 """Pairs in a block of time, in turn: fixed lengths beat with periodic faults."""
 FULL_LENGTH_PAIRS = 60
 """With fewer pairs blocks are shorter, so that there are some six of them."""
-TILT_STD_PER_M, KNOWN_DEPTH_STD = 0.3, 0.01
+TILT_STD, KNOWN_DEPTH_STD = 0.8, 0.03
+"""Of a plane at a known depth: its slope, and the part by which the depth ahead differs between moments."""
+MISPLACED, HELD_DEPTH_STD = 4.0, 1e-3
+"""A plane that points pull this many KNOWN_DEPTH_STD away is held where the profile says: that is what is judged."""
 START_INVERSE_DEPTH_PER_M = 0.5
 MIN_SWAY_DEPTH_PER_M = 1e-4
 
@@ -51,13 +54,23 @@ class Evidence:
     block: NDArray[np.intp]
     """(pairs,) number of the block of time."""
 
-    @property
-    def noise_px(self) -> float:
-        """What tracking alone makes: capped rms per coordinate of what a free smooth flow leaves."""
-        residual = [
-            smooth_flow_residual(pair) / n for pair, n in zip(self.observed.pairs, self.observed.noise_px, strict=True)
-        ]
-        return capped_rms(np.linalg.norm(np.concatenate(residual), axis=-1)) * self.typical_px
+    def noise_px(self, fitted: TrackFit) -> float:
+        """What tracking alone makes: capped rms per coordinate of what a free smooth flow leaves.
+
+        Where any depth is allowed only what lies across the parallax counts, as in the fit.
+        """
+        residual = np.concatenate(
+            [
+                smooth_flow_residual(pair) / n
+                for pair, n in zip(self.observed.pairs, self.observed.noise_px, strict=True)
+            ]
+        )
+        if isinstance(fitted.scene, DirectedMotion):
+            along = predict(fitted.ground, self.observed.table(self.observed.tracks), fitted.scene).along_px
+            assert along is not None
+            way = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+            residual = residual - (residual * way).sum(axis=-1, keepdims=True) * way
+        return capped_rms(np.linalg.norm(residual, axis=-1)) * self.typical_px
 
     @property
     def typical_px(self) -> float:
@@ -76,9 +89,13 @@ class Evidence:
         rows = table if use is None else table.chosen(use[table.pair])
         return fit_tracks(self.imu, rows, model.profile, terms, model.scene, max_iterations=10)
 
-    def distances(self, fitted: TrackFit, table: TrackTable) -> Array:
+    def distances(self, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
         """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
-        return fit_tracks(self.imu, table, fitted.profile, (), fitted.scene, max_iterations=0).distance
+        scene = fitted.scene
+        if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
+            scene = many_directions(table)
+        everywhere = fit_tracks(self.imu, table, fitted.profile, (), scene, max_iterations=0)
+        return everywhere.distance_at(depth_spread_per_m)
 
 
 def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
@@ -95,6 +112,11 @@ def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
 def loss(distance: Array, scale: float) -> Array:
     """Cauchy loss of whitened distances at a scale."""
     return np.asarray(np.log1p((distance / (CAUCHY * scale)) ** 2))
+
+
+def relief_loss(fitted: TrackFit) -> float:
+    """Mean loss of a fit as a likelihood counts it, at its own spread of depths."""
+    return float((loss(fitted.distance, 1.0) + 2 / CAUCHY**2 * fitted.relief_cost()).mean())
 
 
 def capped_rms(distance: Array) -> float:
@@ -114,7 +136,13 @@ def base_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) ->
     scene = start_scene(evidence.imu, known, table, START_INVERSE_DEPTH_PER_M if depth_m is None else 1 / depth_m)
     if depth_m is None:
         return scene
-    return replace(scene, plane_std_per_m=(TILT_STD_PER_M, TILT_STD_PER_M, KNOWN_DEPTH_STD / depth_m))
+    axes = known.trajectory.orientation(np.asarray(profile.imu_time_s(table.origin_s)))
+    tilt = TILT_STD / depth_m
+    placed = replace(scene, plane_std_per_m=(tilt, tilt, KNOWN_DEPTH_STD / depth_m), plane_axes=axes)
+    pulled_m, _ = depth_of(evidence.fit(Model(profile, placed, ()), (), table), table)
+    if abs(depth_m / pulled_m - 1) < MISPLACED * KNOWN_DEPTH_STD:
+        return placed
+    return replace(placed, plane_std_per_m=(tilt, tilt, HELD_DEPTH_STD / depth_m))
 
 
 def free_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) -> InertialMotion | None:
@@ -150,5 +178,7 @@ def _depth_std(fitted: TrackFit, world: Array, window: int) -> float:
     part = fitted.covariance[first : first + 3, first : first + 3]
     assert isinstance(fitted.scene, InertialMotion)
     inverse = float(fitted.scene.plane_per_m[int(window)] @ world)
-    variance = float(world @ part @ world)
+    axes = fitted.scene.plane_axes
+    way = world if axes is None else axes[int(window)].T @ world
+    variance = float(way @ part @ way)
     return float(np.sqrt(max(variance, 0.0))) / max(inverse, MIN_SWAY_DEPTH_PER_M) ** 2

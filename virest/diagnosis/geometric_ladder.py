@@ -21,6 +21,7 @@ from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import (
+    KNOWN_DEPTH_STD,
     Evidence,
     Model,
     base_scene,
@@ -28,6 +29,7 @@ from virest.diagnosis.geometric_evidence import (
     depth_of,
     free_scene,
     loss,
+    relief_loss,
 )
 from virest.diagnosis.start_up import Schedule
 from virest.motion.track_fit import Term, TrackFit
@@ -46,6 +48,8 @@ MAX_P = 1e-5
 SURE = 1e-12
 MIN_GAIN = 0.004
 """Least part of the loss that a cause must take away on held-out blocks."""
+LARGE_GAIN, LARGE_MIN_T = 0.05, 1.7
+"""So large a gain need not be so even (one-sided 5 %): stretches of time tell more or less of a cause."""
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 MAX_RUNGS = 5
@@ -60,9 +64,33 @@ PLAUSIBLE = {
     "focal_drift": 0.3,
     "radial_distortion": 0.8,
     "principal_point": 300.0,
+    "exposure_time": 1.5,
 }
 """Largest believable changes, in the units of the terms."""
+CONSTANT_EXPOSURE = 0.03
+"""Exposures within this part of their median are one."""
 STABILISER_CUTOFF_HZ = (0.03, 15.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FarClock:
+    """Changes of a profile's clocks, beyond a fit's reach, at which the turns of pictures and gyroscope agree."""
+
+    offset_s: float = 0.0
+    """At the profile's own clock rate; 0: none."""
+    skewed_offset_s: float = 0.0
+    """At the rate changed by ``skew``."""
+    skew: float = 0.0
+
+    def start(self, name: str, profile: CameraProfile, offset_free: bool) -> CameraProfile | None:
+        """Where a fit of this effect might begin; a skew moves the offset along if that is fitted too."""
+        offset_s = profile.time_offset_s or 0.0
+        if name == "time_offset" and self.offset_s:
+            return replace(profile, time_offset_s=offset_s + self.offset_s)
+        if name == "clock_skew" and self.skew:
+            skewed_s = offset_s + self.skewed_offset_s if offset_free else offset_s
+            return replace(profile, time_offset_s=skewed_s, clock_skew=profile.clock_skew + self.skew)
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +136,8 @@ class GeometricVerdict:
     """What tracking alone makes, as an rms like the two above."""
     step_noise_px: float
     """Typical standard deviation of a tracked step, per coordinate."""
+    astray: float = 0.0
+    """Part of the points that lie in parts of the picture that move together on their own, and were left out."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -116,13 +146,13 @@ def climb(
     nominal: CameraProfile,
     null_terms: Sequence[Term],
     lags: Sequence[Schedule],
-    far_off_s: float = 0.0,
+    far: FarClock | None = None,
     progress: Callable[[float], None] | None = None,
     max_rungs: int = MAX_RUNGS,
 ) -> GeometricVerdict:
     """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
 
-    lags: the start-up schedules to try.  far_off_s: a change of the time offset at which turns were seen to agree.
+    lags: the start-up schedules to try.  far: changes of the clocks at which turns were seen to agree.
     """
     say = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
@@ -133,7 +163,7 @@ def climb(
     rungs: list[Rung] = []
     say(0.1)
     for number in range(max_rungs):
-        best, rung = _rung(evidence, model, accepted, lags, far_off_s)
+        best, rung = _rung(evidence, nominal, model, accepted, lags, far or FarClock())
         rungs.append(rung)
         say(0.1 + 0.8 * (number + 1) / MAX_RUNGS)
         if best is None:
@@ -167,27 +197,30 @@ class _Judged:
 
 def _rung(
     evidence: Evidence,
+    nominal: CameraProfile,
     model: Model,
     accepted: list[Accepted],
     lags: Sequence[Schedule],
-    far_off_s: float,
+    far: FarClock,
 ) -> tuple[tuple[Model, Accepted] | None, Rung]:
     tried = {entry.name for entry in accepted}
-    candidates = _candidates(evidence, model, tried, lags, far_off_s)
+    candidates = _candidates(evidence, nominal, model, tried, lags, far)
     base = _screened(evidence, Candidate("", model, (), None))
     screened = _best_of_each([_screened(evidence, candidate) for candidate in candidates])
-    promising = sorted(screened, key=lambda s: s[0])[:PROMISING]
-    promising = [entry for entry in promising if entry[0] < base[0]]
-    scale = min([base[2], *(entry[2] for entry in promising)])
-    before = _judge(evidence, base[1], scale)
-    judged = [_judge(evidence, entry[1], scale) for entry in promising]
+    promising = sorted(screened, key=lambda s: s.loss)[:PROMISING]
+    promising = [entry for entry in promising if entry.loss < base.loss]
+    scale = min([base.scale, *(entry.scale for entry in promising)])
+    spread = (promising[0] if promising else base).depth_spread_per_m
+    before = _judge(evidence, base.candidate, scale, spread)
+    judged = [_judge(evidence, entry.candidate, scale, spread) for entry in promising]
     table = {j.candidate.name: j.rms * evidence.typical_px for j in judged}
     nothing = Rung(None, table, before.rms * evidence.typical_px, GEOMETRY)
     for best in sorted(judged, key=lambda j: float(j.block_loss.mean())):
         gain = before.block_loss - best.block_loss
         if best.candidate.name == "frame_lag":
             gain = _lagging_gain(evidence, before, best)
-        if gain.mean() < MIN_GAIN * before.block_loss.mean() or _t(gain) < MIN_T:
+        part = float(gain.mean() / before.block_loss.mean())
+        if part < MIN_GAIN or _t(gain) < (MIN_T if part < LARGE_GAIN else LARGE_MIN_T):
             continue
         entered, p_value = _significant(evidence, best.candidate, model.profile)
         if entered is None:
@@ -208,27 +241,41 @@ def _rung(
 
 def _candidates(
     evidence: Evidence,
+    nominal: CameraProfile,
     model: Model,
     tried: set[str],
     lags: Sequence[Schedule],
-    far_off_s: float,
+    far: FarClock,
 ) -> list[Candidate]:
     in_terms = {term.name for term in model.terms}
     found: list[Candidate] = []
     for effect in GEOMETRIC_EFFECTS:
-        if effect.name in tried or effect.name in in_terms:
+        if effect.name in tried or effect.name in in_terms or not _tells(evidence, effect):
             continue
         if effect.term is None:
             found += _words(effect, model)
             continue
-        far = ((far_off_s,),) if effect.name == "time_offset" and far_off_s else ()
-        for values in (None, *effect.starts, *far):
+        for values in (None, *effect.starts):
             profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
             found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
+        if (far_off := far.start(effect.name, nominal, "time_offset" in in_terms)) is not None:
+            clocks = replace(model.profile, time_offset_s=far_off.time_offset_s, clock_skew=far_off.clock_skew)
+            found.append(Candidate(effect.name, replace(model, profile=clocks), (effect.term,), effect))
     found += _depths(evidence, model, tried)
     if "frame_lag" not in tried:
         found += [_lagging(model, *lag) for lag in lags]
     return found
+
+
+def _tells(evidence: Evidence, effect: GeometricEffect) -> bool:
+    """Whether points can tell this cause: an exposure's length only by its changes, otherwise it is an offset."""
+    return effect.name != "exposure_time" or varies(evidence.observed.exposure_s)
+
+
+def varies(exposure_s: Array) -> bool:
+    """Whether logged exposures (n,) differ enough to move rows by different times."""
+    middle = float(np.median(exposure_s))
+    return middle > 0 and float(np.ptp(exposure_s)) >= CONSTANT_EXPOSURE * middle
 
 
 def _words(effect: GeometricEffect, model: Model) -> list[Candidate]:
@@ -258,25 +305,34 @@ def _lagging(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...
     )
 
 
-def _screened(evidence: Evidence, candidate: Candidate) -> tuple[float, Candidate, float]:
-    """(mean loss, the candidate with its fitted model, scale) on all blocks, with few points."""
+@dataclass(frozen=True, slots=True)
+class _Screened:
+    """A candidate with its model fitted to all blocks, with few points."""
+
+    loss: float
+    candidate: Candidate
+    scale: float
+    depth_spread_per_m: float
+
+
+def _screened(evidence: Evidence, candidate: Candidate) -> _Screened:
     table = evidence.table(candidate.model, SCREEN_POINTS)
     terms = (*candidate.model.terms, *candidate.added)
     fitted = evidence.fit(candidate.model, terms, table)
     model = replace(candidate.model, profile=fitted.profile, scene=fitted.scene)
-    return float(loss(fitted.distance, 1.0).mean()), replace(candidate, model=model), fitted.scale
+    return _Screened(relief_loss(fitted), replace(candidate, model=model), fitted.scale, fitted.depth_spread_per_m)
 
 
-def _best_of_each(screened: list[tuple[float, Candidate, float]]) -> list[tuple[float, Candidate, float]]:
-    best: dict[str, tuple[float, Candidate, float]] = {}
+def _best_of_each(screened: list[_Screened]) -> list[_Screened]:
+    best: dict[str, _Screened] = {}
     for entry in screened:
-        name = entry[1].name
-        if name not in best or entry[0] < best[name][0]:
+        name = entry.candidate.name
+        if name not in best or entry.loss < best[name].loss:
             best[name] = entry
     return list(best.values())
 
 
-def _judge(evidence: Evidence, candidate: Candidate, scale: float) -> _Judged:
+def _judge(evidence: Evidence, candidate: Candidate, scale: float, depth_spread_per_m: float) -> _Judged:
     """Fit on every other block, judge on those between, and the other way round."""
     table = evidence.table(candidate.model, JUDGE_POINTS)
     terms = (*candidate.model.terms, *candidate.added)
@@ -285,7 +341,7 @@ def _judge(evidence: Evidence, candidate: Candidate, scale: float) -> _Judged:
         use = evidence.block % 2 == fold
         fitted = evidence.fit(candidate.model, terms, table, use)
         held = ~use[table.pair]
-        distance[held] = evidence.distances(fitted, table)[held]
+        distance[held] = evidence.distances(fitted, table, depth_spread_per_m)[held]
     block = evidence.block[table.pair]
     counts = np.maximum(np.bincount(block), 1)
     each = loss(distance, scale)
@@ -315,7 +371,10 @@ def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile
     model, fitted = _refitted(evidence, model, JUDGE_POINTS)
     if candidate.name == "scene_depth":
         depth_m, std = depth_of(fitted, evidence.table(model, JUDGE_POINTS))
-        p_value = float(stats.chi2.sf((depth_m / max(std, 1e-9)) ** 2, 1))
+        given_m = before.depth_m or np.inf
+        nearer = 1 / depth_m - 1 / given_m
+        certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
+        p_value = float(stats.chi2.sf((nearer / max(certain, 1e-9)) ** 2, 1))
     elif candidate.effect is None or candidate.effect.term is None:
         p_value = SURE
     elif not is_plausible(candidate.effect, model.profile, total_change(candidate.effect, before, model.profile)):
@@ -377,9 +436,10 @@ def _conclude(
     nominal_table = evidence.table(nominal_model, FINAL_POINTS)
     nominal_fit = evidence.fit(nominal_model, nominal_model.terms, nominal_table)
     typical = evidence.typical_px
+    before = capped_rms(nominal_fit.distance_at(fitted.depth_spread_per_m)) * typical
     return GeometricVerdict(
         model, fitted, table, accepted, rungs, nominal_model, nominal_fit, nominal_table,
-        capped_rms(nominal_fit.distance) * typical, capped_rms(fitted.distance) * typical, evidence.noise_px, typical,
+        before, capped_rms(fitted.distance) * typical, evidence.noise_px(fitted), typical,
     )  # fmt: skip
 
 
@@ -401,6 +461,8 @@ def total_change(effect: GeometricEffect, nominal: CameraProfile, found: CameraP
             return np.array([np.log(found.gyro_scale[0] / nominal.gyro_scale[0])])
         case "imu_rotation":
             return rotation_between(nominal, found)
+        case "exposure_time":
+            return np.array([np.log(found.shutter.exposure_scale / nominal.shutter.exposure_scale)])
         case "focal_length":
             return np.array([np.log(lens.fx_px / before.fx_px)])
         case "focal_drift":
@@ -410,7 +472,9 @@ def total_change(effect: GeometricEffect, nominal: CameraProfile, found: CameraP
         case "principal_point":
             return np.array([lens.cx_px - before.cx_px, lens.cy_px - before.cy_px])
         case _:
-            return np.array([found.extensions.stabilisation_fraction - nominal.extensions.stabilisation_fraction, 0.0])
+            return np.array(
+                [found.extensions.stabilisation_fraction - nominal.extensions.stabilisation_fraction, 0.0, 0.0, 0.0]
+            )
 
 
 def rotation_between(nominal: CameraProfile, found: CameraProfile) -> Array:
@@ -448,6 +512,7 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
     nominal, found = verdict.nominal.profile, verdict.model.profile
     if entry.name == "scene_depth":
         depth_m, std = depth_of(verdict.fit, verdict.table)
+        std = float(np.hypot(std, depth_m * bias_std(verdict.fit, "scene_depth", verdict.step_noise_px)[0]))
         return {"depth_m": ParameterChange(nominal.depth_m, depth_m, std)}
     if entry.name == "frame_lag":
         extensions = found.extensions

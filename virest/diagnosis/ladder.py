@@ -34,25 +34,30 @@ from virest.diagnosis.findings import (
     Rival,
 )
 from virest.diagnosis.geometric_evidence import make_evidence
-from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, climb, findings_of
+from virest.diagnosis.geometric_ladder import MAX_RUNGS, FarClock, GeometricVerdict, climb, findings_of, varies
 from virest.diagnosis.picture_ladder import Reader, climb_blur, climb_photometry, judge_curve
 from virest.diagnosis.start_up import Schedule, lag_schedules
 from virest.diagnosis.structure import Structure, structures
 from virest.errors import CaptureError
 from virest.motion import profile_terms as terms_of
-from virest.motion.coarse_alignment import align_coarsely
+from virest.motion.coarse_alignment import align_coarsely, align_with_skew
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import ObservedTracks, observe_tracks
+from virest.motion.observed_tracks import CELLS, ObservedTracks, observe_tracks
 from virest.motion.track_fit import Term
 from virest.motion.track_model import seen_s
+from virest.motion.track_noise import step_noise_px
 from virest.motion.tracking import track_pairs
+from virest.motion.turns import gyro_turns
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 MIN_PAIRS = 6
 MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
-CONSTANT_EXPOSURE = 0.03
+AXIS_EXPLAINED = 0.6
+"""Least squared correlation about one axis."""
+WELL_EXPLAINED = 0.98
+"""Turns that agree so well leave no other clock rate to look for far off."""
 COINCIDENCE_SIGMA = 3.5
 STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
 """Structure of this size, and of this part of the noise, has a cause."""
@@ -62,6 +67,10 @@ SCALE_EXCESS = 1.25
 """Differences this many times their noise, measured without the model, are not all noise."""
 LEAST_IN_PAIR = 8
 STRAY_DISTANCE, STRAY_PART = 6.0, 0.1
+TOGETHER = 0.3
+"""Least intraclass correlation of points that move together."""
+NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 2).ravel()
+"""Number of the block of two by two cells that each cell lies in."""
 CALM = 40.0
 """Brightness this many typical deviations off counts half: a band of the sensor is evidence, a passer-by is not."""
 PHOTOMETRIC_STRUCTURE = 1.5
@@ -83,7 +92,7 @@ def diagnose_capture(
     indices = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
     say("tracking", 0.02)
     observed = observe_tracks(capture, track_pairs(gray(indices)), profile)
-    start, null_terms, notes, far_off_s, follows = _with_null_values(observed, capture, profile)
+    start, null_terms, notes, far, follows = _with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
         raise CaptureError(
@@ -95,7 +104,7 @@ def diagnose_capture(
     rungs_allowed = MAX_RUNGS if follows or schedules else 0
     if not rungs_allowed:
         notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
-    points = _Points(capture, observed, start, tuple(null_terms), schedules, far_off_s, rungs_allowed)
+    points = _Points(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed)
     first = geometric = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
     frames = _at_model_times(capture, geometric)
     trajectory = integrate_gyro(capture.imu, geometric.model.profile)
@@ -125,11 +134,13 @@ def diagnose_capture(
         )
         findings = [exposure, *_stamped(geometric, findings_of(geometric), observed.exposure_s)]
         blurred = _one_exposure(blurred)
+    elif any(finding.name == "exposure_time" for finding in findings):
+        blurred, is_exposure = _one_exposure(blurred), True
     extended = _merged(geometric.model.profile, photometric.profile, blurred.profile, is_exposure)
     say("curve", 0.92)
     curve = picture_ladder.PictureVerdict(extended)
     if moves_right and not _paths_uncertain(extended, geometric):
-        curve = judge_curve(extended, photometric.observations, frames, integrate_gyro(capture.imu, extended), gray)
+        curve = judge_curve(extended, photometric.observations, frames, integrate_gyro(capture.imu, extended), pictures)
         extended = curve.profile
     say("what is left", 0.97)
     findings = [*findings, *photometric.findings, *blurred.findings, *curve.findings]
@@ -157,15 +168,42 @@ class _Points:
     start: CameraProfile
     null_terms: tuple[Term, ...]
     schedules: Sequence[Schedule]
-    far_off_s: float
+    far: FarClock
     rungs_allowed: int
 
     def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
-        """The ladder's end."""
-        evidence = make_evidence(self.capture.imu, self.observed)
-        return climb(
-            evidence, self.start, self.null_terms, self.schedules, self.far_off_s, progress, self.rungs_allowed
-        )
+        """The ladder's end, climbed again without the parts of the picture that move together on their own."""
+        found = self._climbed(self.observed, progress)
+        if not self.rungs_allowed:
+            return found
+        cells = self.observed.astray_cells(found.table.first_px, found.fit.distance)
+        place = self.observed.cells(found.table.first_px)
+        there, astray = cells[place], float(cells[place].mean())
+        neighbours = len(cells) * found.table.pair + NEIGHBOURHOOD[place]
+        calm = found.fit.difference_px * found.fit.weight[:, None]
+        if astray < STRAY_PART or _together(calm[there], neighbours[there]) < TOGETHER:
+            return found
+        rest = self.observed.without_cells(cells)
+        again = self._climbed(replace(rest, noise_px=step_noise_px(rest.pairs)), progress)
+        again.astray = astray
+        again.notes.append(f"{astray:.0%} of the points lie in parts of the picture that go their own way: left out")
+        return again
+
+    def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
+        evidence = make_evidence(self.capture.imu, observed)
+        return climb(evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed)
+
+
+def _together(difference_px: Array, group: NDArray[np.intp]) -> float:
+    """How much of the differences (n, 2) neighbours of one moment share: their intraclass correlation.
+
+    Neighbours that are badly tracked share nothing; a thing that moves is shared by its points.
+    """
+    count = np.bincount(group)
+    ordered = float((count * (count - 1)).sum())
+    squared = float((difference_px**2).sum())
+    common = sum(float((np.bincount(group, column) ** 2).sum()) for column in difference_px.T) - squared
+    return common / max(ordered, 1.0) / max(squared / max(len(group), 1), 1e-12)
 
 
 def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> bool:
@@ -225,11 +263,10 @@ def _evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Re
 
 def _with_null_values(
     observed: ObservedTracks, capture: Capture, profile: CameraProfile
-) -> tuple[CameraProfile, list[Term], list[str], float, bool]:
-    """The profile with unknown values begun somewhere, the terms to fit on every rung, and a far-off time offset.
+) -> tuple[CameraProfile, list[Term], list[str], FarClock, bool]:
+    """The profile with unknown values begun somewhere, terms to fit on every rung, and far-off starts of the clocks.
 
-    The last two: how far from the profile's offset the turns of pictures and gyroscope agree best, and whether they
-    agree at all, as far as the camera turns.
+    The last: whether the turns of pictures and gyroscope agree at any offset, as far as the camera turns.
     """
     terms: list[Term] = []
     notes: list[str] = []
@@ -239,15 +276,16 @@ def _with_null_values(
         notes.append("focal length unknown: fitted on every rung, from a guess")
     if not profile.readout_known:
         terms.append(terms_of.READOUT)
-    far_off_s = _agrees_at(observed, capture, profile)
-    still = _hardly_turns(observed, profile)
+    far = _agree_at(observed, capture, profile)
+    agree = far is not None or _hardly_turns(observed, profile) or _one_axis_agrees(observed, capture, profile)
     if profile.time_offset_s is not None:
-        return profile, terms, notes, (0.0 if far_off_s is None else far_off_s), far_off_s is not None or still
-    if far_off_s is None:
+        return profile, terms, notes, far or FarClock(), agree
+    if far is None:
         notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
-    else:
-        terms.append(terms_of.TIME_OFFSET)
-    return replace(profile, time_offset_s=far_off_s or 0.0), terms, notes, 0.0, far_off_s is not None or still
+        return replace(profile, time_offset_s=0.0), terms, notes, FarClock(), agree
+    terms.append(terms_of.TIME_OFFSET)
+    begun = replace(profile, time_offset_s=far.offset_s)
+    return begun, terms, notes, FarClock(0.0, far.skewed_offset_s - far.offset_s, far.skew), agree
 
 
 def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:
@@ -259,14 +297,33 @@ def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:
     return float(np.sqrt(np.mean((changing**2).sum(axis=-1)))) * observed.lens.fx_px < MIN_MOTION_PX
 
 
-def _agrees_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> float | None:
-    """By how much the offset at which turns agree best differs from the profile's; None where they agree nowhere."""
+def _one_axis_agrees(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> bool:
+    """Whether turns about some axis follow the gyroscope's by any factor: a stabiliser takes most of pitch and yaw."""
+    profile = replace(profile, time_offset_s=profile.time_offset_s or 0.0)
+    turns = observed.covered(capture.imu, profile).turns(profile)
+    if len(turns.vector_rad) < MIN_PAIRS:
+        return False
+    times = (np.asarray(profile.imu_time_s(s)) for s in (turns.first_s, turns.second_s))
+    told = turns.detrended(gyro_turns(integrate_gyro(capture.imu, profile), *times))
+    seen = turns.detrended(turns.vector_rad)
+    product = (seen * told).sum(axis=0) ** 2
+    square = np.maximum((seen**2).sum(axis=0) * (told**2).sum(axis=0), 1e-30)
+    return bool(np.max(product / square) > AXIS_EXPLAINED)
+
+
+def _agree_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> FarClock | None:
+    """Changes of the profile's clocks at which turns agree best; None where they agree nowhere."""
     if len(observed.pairs) < MIN_PAIRS:
         return None
-    coarse = align_coarsely(observed.turns(profile), capture.imu, profile)
+    turns, given_s = observed.turns(profile), profile.time_offset_s or 0.0
+    coarse = align_coarsely(turns, capture.imu, profile)
     if coarse is None or coarse.explained < MIN_EXPLAINED or coarse.at_end:
         return None
-    return coarse.time_offset_s - (profile.time_offset_s or 0.0)
+    far = FarClock(coarse.time_offset_s - given_s)
+    if coarse.explained < WELL_EXPLAINED and (other := align_with_skew(turns, capture.imu, profile)) is not None:
+        skewed, skew = other
+        far = replace(far, skewed_offset_s=skewed.time_offset_s - given_s, skew=skew - profile.clock_skew)
+    return far
 
 
 def _at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]:
@@ -283,13 +340,9 @@ def _at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame
 # ── causes that look alike ───────────────────────────────────────────────────────────────────────────────────────
 
 
-def _is_constant(exposure_s: Array) -> bool:
-    return float(np.ptp(exposure_s)) < CONSTANT_EXPOSURE * float(np.median(exposure_s))
-
-
 def _stamped(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
     """At constant exposure an offset of just half or one exposure is another meaning of the stamp."""
-    if not _is_constant(exposure_s) or float(np.median(exposure_s)) <= 0:
+    if varies(exposure_s) or float(np.median(exposure_s)) <= 0:
         return findings
     nominal = geometric.nominal.profile
     exposure = nominal.shutter.true_exposure_s(float(np.median(exposure_s)))
@@ -339,7 +392,7 @@ def _exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array) -> floa
     """The exposure scale whose longer or shorter middle would look like the time offset found."""
     exposure = float(np.median(exposure_s))
     for finding in findings:
-        if finding.name == "time_offset" and _is_constant(exposure_s) and exposure > 0:
+        if finding.name == "time_offset" and not varies(exposure_s) and exposure > 0:
             change = finding.parameters["time_offset_s"]
             return 1.0 + 2.0 * (change.estimate - (change.nominal or 0.0)) / exposure
     return None
@@ -441,7 +494,7 @@ def _points_left(geometric: GeometricVerdict) -> Remaining:
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
     found.append(_along_time(fitted.difference_px, fitted.weight, table.pair))
     strongest = max(found, key=lambda s: s.size)
-    stray = float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0)))
+    stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.astray)
     limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
     excess = geometric.final_rms_px / max(noise, 1e-9)
     log.debug("left: %s, limit %.3f, excess %.3f, stray %.3f", found, limit, excess, stray)

@@ -158,7 +158,8 @@ def judge(
         after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
         noise.append(before[-1][1])
     quadratic = [float(np.sqrt(np.mean(np.square(v)))) if v else 0.0 for v in ([b[0] for b in before], after, noise)]
-    return HeldOut(quadratic[0], quadratic[1], quadratic[2], "place" if by_place else "time")
+    # What is left on held-out blocks contains the noise: a larger one was not noise.
+    return HeldOut(quadratic[0], quadratic[1], min(quadratic[1:]), "place" if by_place else "time")
 
 
 def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:

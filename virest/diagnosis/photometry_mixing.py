@@ -4,7 +4,9 @@ Of two frames of one place, A nearly sharp and B blurred, with paths k_A and k_B
 ``k_B ∗ E′(A)`` and ``k_A ∗ E′(B)`` are the same light blurred by both paths, if E is the curve.  Under a wrong curve
 the bright side of every blurred edge grows or shrinks, whichever way the edge faces; a wrong registration, a wrong
 length of the path and a change of brightness do something else.  They are free in every tile, and only what is left
-counts.  A path in a wrong direction is not: correct the geometry first.
+counts.  A path in a wrong direction is not: correct the geometry first.  Each colour is mixed on its own, for luma is
+the curve of no light; what is compared is the luma of both sides, but not where colours change: movies keep those at
+half the resolution.
 
 What a gamma and a black level do this way is nearly the same: each is estimated as if the other were nominal, and they
 are rivals.  Only exposures × ISO that change as logged tell them apart (photometry_fit).
@@ -30,8 +32,10 @@ from virest.diagnosis.photometry_patches import Follower, path_over_exposure, se
 from virest.motion.trajectory import Trajectory
 
 Gray = NDArray[np.uint8]
+Rgb = NDArray[np.uint8]
 Plane = NDArray[np.float32]
-ReadGray = Callable[[Sequence[int]], Iterable[tuple[int, Gray | None]]]
+ReadRgb = Callable[[Sequence[int]], Iterable[tuple[int, Rgb | None]]]
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 STEPS = {"response_curve": np.log([0.8, 1.0, 1.25]), "black_level": np.array([0.0, 0.04, 0.08])}
 """Where residuals are taken: added to the logarithm of the profile's gamma, or to its black level."""
@@ -40,6 +44,8 @@ DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 _MIN_TILE_PIXELS = 400
 _MARGIN_PX = 24
 _NODE_PX = 16
+_MAX_CHROMA_RANGE = 40
+"""Levels of Cr or Cb within a blur's reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +94,7 @@ class MixingEstimate:
 
 
 def observe_mixing(
-    read_gray: ReadGray,
+    read_rgb: ReadRgb,
     frames: Sequence[Frame],
     trajectory: Trajectory,
     profile: CameraProfile,
@@ -98,7 +104,7 @@ def observe_mixing(
     settings = settings or MixingSettings()
     pairs = _choose_pairs(frames, trajectory, profile, settings)
     wanted = sorted({k for pair in pairs for k in pair})
-    pictures = {index: gray for index, gray in read_gray(wanted) if gray is not None}
+    pictures = {index: rgb for index, rgb in read_rgb(wanted) if rgb is not None}
     by_index = {frame.index: frame for frame in frames}
     rows: list[tuple[int, Array]] = []
     for number, (sharp, blurred) in enumerate(pairs):
@@ -191,15 +197,16 @@ def _choose_pairs(
 
 
 def _compare(
-    sharp: tuple[Frame, Gray],
-    blurred: tuple[Frame, Gray],
+    sharp: tuple[Frame, Rgb],
+    blurred: tuple[Frame, Rgb],
     trajectory: Trajectory,
     profile: CameraProfile,
     settings: MixingSettings,
 ) -> list[Array]:
     """Stiffness and scores (8,) of each usable tile of one pair."""
-    height, width = blurred[1].shape
-    where = seen_elsewhere(Follower(*blurred), Follower(*sharp), trajectory, profile, _nodes(width, height))
+    height, width = blurred[1].shape[:2]
+    here, there = (Follower(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
+    where = seen_elsewhere(here, there, trajectory, profile, _nodes(width, height))
     if where is None:
         return []
     x, y = ((np.arange(n) / _NODE_PX).astype(np.float32) for n in (width, height))
@@ -217,8 +224,8 @@ def _compare(
         table = changed.linear_table()
         light = cv2.remap(table[sharp[1]], place, None, cv2.INTER_CUBIC), table[blurred[1]]
         from_sharp, from_blurred = _blurred(light[0], kernels[1], tiles), _blurred(light[1], kernels[0], tiles)
-        grey = 255 * changed.encode(from_sharp)
-        return 255 * changed.encode(from_blurred) - grey, grey
+        grey = (255 * changed.encode(from_sharp)) @ LUMA
+        return (255 * changed.encode(from_blurred)) @ LUMA - grey, grey
 
     nominal, grey = difference(curve)
     gammas = [
@@ -281,19 +288,21 @@ def _tiles(width: int, height: int, side: int) -> list[tuple[slice, slice]]:
     return [(slice(int(a), int(b)), slice(int(c), int(d))) for a, b in pairwise(rows) for c, d in pairwise(columns)]
 
 
-def _usable(sharp: Gray, blurred: Gray, place: Plane) -> Mask:
-    """Pixels whose surroundings are inside both pictures and not clipped in either."""
-    height, width = blurred.shape
+def _usable(sharp: Rgb, blurred: Rgb, place: Plane) -> Mask:
+    """Pixels whose surroundings are inside both pictures, clipped in no colour of either, and about of one hue."""
+    height, width = blurred.shape[:2]
     edge = 8
     inside = ((place > edge) & (place < (width - 1 - edge, height - 1 - edge))).all(axis=-1)
 
-    def near_clipped(gray: Gray) -> Gray:
-        return np.asarray(
-            cv2.dilate(((gray > 247) | (gray < 4)).astype(np.uint8), np.ones((21, 21), np.uint8)), np.uint8
-        )
+    def unfit(rgb: Rgb) -> Gray:
+        around = np.ones((21, 21), np.uint8)
+        clipped = cv2.dilate(((rgb > 247) | (rgb < 4)).any(axis=-1).astype(np.uint8), around)
+        chroma = cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb)[..., 1:]
+        varied = (cv2.dilate(chroma, around) - cv2.erode(chroma, around)).max(axis=-1) > _MAX_CHROMA_RANGE
+        return clipped | varied.astype(np.uint8)
 
-    seen = cv2.remap(near_clipped(sharp), place, None, cv2.INTER_NEAREST)
-    return np.asarray(inside & (near_clipped(blurred) == 0) & (seen == 0))
+    seen = cv2.remap(unfit(sharp), place, None, cv2.INTER_NEAREST)
+    return np.asarray(inside & (unfit(blurred) == 0) & (seen == 0))
 
 
 def _kernel(path_px: Array) -> Plane:
@@ -313,7 +322,7 @@ def _kernel(path_px: Array) -> Plane:
 
 def _blurred(light: Plane, kernels: list[Plane], tiles: list[tuple[slice, slice]]) -> Plane:
     """Each tile filtered by its own kernel, with a margin of its neighbours."""
-    height, width = light.shape
+    height, width = light.shape[:2]
     out = np.empty_like(light)
     for kernel, (rows, columns) in zip(kernels, tiles, strict=True):
         top, left = max(rows.start - _MARGIN_PX, 0), max(columns.start - _MARGIN_PX, 0)

@@ -1,7 +1,8 @@
 """How well the brightness of a patch is measured, found without the camera model.
 
-Each frame gets a free smooth field: what all its patches have in common as a function of place, row and brightness is
-taken away, whatever its cause.  What remains is noise: of the sensor, of the encoder, and of looking beside the patch.
+Each frame gets a free smooth field of place, row and brightness, and each patch a brightness of its own, whatever the
+cause; both are found together, so that a patch seen only while the exposure was long is no odd one among the others.
+What remains is noise: of the sensor, of the encoder, and of looking beside the patch.
 """
 
 from __future__ import annotations
@@ -9,74 +10,119 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import lsmr
 
+from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import Array, Indices, PhotometricObservations
 
-_ROW_KNOTS = 9
+_MOST_ROW_KNOTS = 17
+"""Lamps pulse two or three times in a readout: so many knots follow them."""
+_PLACES_PER_TERM = 3.0
+"""A field has at most one term for so many places of its frame: the three colours of a place are not independent."""
 _PRIOR_COUNT = 6.0
 """Weight of the frame's own noise, in observations, against that of the patch."""
 _LEAST_LEVELS = 0.05
-_PASSES = 3
+_PASSES = 4
+_SOLVER_STEPS = 60
 
 
-def measured_noise(observations: PhotometricObservations) -> PhotometricObservations:
-    """The observations with their noise: a factor per frame and one per patch, from what the free fields leave."""
+def measured_noise(observations: PhotometricObservations, curve: ResponseCurve | None = None) -> PhotometricObservations:
+    """The observations with their noise: a factor per frame and one per patch, from what the free fields leave.
+
+    curve: of the profile; takes off what the logged exposure × ISO does, so that a smooth field can do the rest.
+    """
     if len(observations) == 0:
         return observations
-    left = np.zeros(len(observations))
-    reference = _patch_medians(observations)
-    rest = observations.grey - reference[observations.patch]
-    frame_noise = np.ones(len(observations))
-    for frame in observations.frames:
-        chosen = np.flatnonzero(observations.frame == frame)
-        left[chosen], noise = _field_residual(observations, chosen, rest[chosen], reference)
-        frame_noise[chosen] = noise
-    # Medians of patches know nothing of where the patch is in each frame; their mean residual is theirs.
-    left -= _patch_mean(observations.patch, left)
+    left = _two_way_residual(observations, curve or ResponseCurve("srgb"))
+    frame = np.searchsorted(observations.frames, observations.frame)
+    frame_noise = np.maximum(_spread(frame, left), _LEAST_LEVELS)[frame]
     ratio = np.clip(left / frame_noise, -6, 6) ** 2
     count = np.bincount(observations.patch)
     per_patch = (np.bincount(observations.patch, ratio) + _PRIOR_COUNT) / (np.maximum(count - 1, 0) + _PRIOR_COUNT)
     return replace(observations, noise=frame_noise * np.sqrt(per_patch)[observations.patch])
 
 
-def _patch_medians(observations: PhotometricObservations) -> Array:
-    """(largest patch + 1,) median grey of each patch."""
-    order = np.lexsort((observations.grey, observations.patch))
-    patch, grey = observations.patch[order], observations.grey[order]
-    count = np.bincount(patch)
-    start = np.cumsum(count) - count
-    middle = start + np.maximum(count - 1, 0) // 2
-    return np.asarray(grey[np.minimum(middle, len(grey) - 1)])
+def _two_way_residual(observations: PhotometricObservations, curve: ResponseCurve) -> Array:
+    """(n,) what a robust joint fit of the patches' brightness and the frames' fields leaves, grey levels.
 
-
-def _patch_mean(patch: Indices, values: Array) -> Array:
-    return np.asarray((np.bincount(patch, values) / np.maximum(np.bincount(patch), 1))[patch])
-
-
-def _field_residual(
-    observations: PhotometricObservations, chosen: Indices, rest: Array, reference: Array
-) -> tuple[Array, float]:
-    """Robust fit of the free field to one frame's deviations from the patches' medians: residuals and their spread."""
-    basis = _basis(observations, chosen, reference[observations.patch[chosen]])
-    weight = np.ones(len(chosen))
-    left = rest
+    ``grey = level + change(level, exposure × ISO) + field[frame](place, row, level)``, ``level`` one value for each
+    patch.  Change and field are taken at the last pass's levels, the rest is linear least squares.
+    """
+    patch = np.unique(observations.patch, return_inverse=True)[1]
+    frame = np.searchsorted(observations.frames, observations.frame)
+    level = _medians(patch, _relit(observations.grey, -observations.log_product, curve))[patch]
+    weight, left = np.ones(len(level)), np.zeros(len(level))
     for _ in range(_PASSES):
-        fit = np.linalg.lstsq(weight[:, None] * basis, weight * rest, rcond=1e-8)[0]
-        left = rest - basis @ fit
-        spread = 1.4826 * float(np.median(np.abs(left)))
-        weight = np.sqrt(1 / (1 + (left / max(2.0 * spread, _LEAST_LEVELS)) ** 2))
-    free = max(len(chosen) - basis.shape[1], 1)
-    grown = spread * np.sqrt(len(chosen) / free)
-    return left, max(float(grown), _LEAST_LEVELS)
+        target = observations.grey - _relit(level, observations.log_product, curve)
+        design, scale = _design(observations, patch, frame, level, weight)
+        found = lsmr(design, weight * target, atol=1e-7, btol=1e-7, maxiter=_SOLVER_STEPS)[0]
+        left = target - (design @ found) / weight
+        level = level + (found[: len(scale)] * scale)[patch]
+        spread = _spread(frame, left)[frame]
+        weight = np.sqrt(1 / (1 + (left / np.maximum(2.0 * spread, _LEAST_LEVELS)) ** 2))
+    places = len(np.unique(np.stack([observations.place, observations.frame]), axis=1).T)
+    spent = len(np.unique(observations.place)) + design.shape[1] - len(scale)
+    return left * np.sqrt(places / max(places - spent, 0.25 * places))
+
+
+def _relit(grey: Array, log_light: Array, curve: ResponseCurve) -> Array:
+    """Grey levels after a change of light, by the curve."""
+    if not log_light.any():
+        return grey
+    light = curve.linearise(np.clip(grey / 255.0, 0.0, 1.0)) * np.exp(log_light)
+    return np.asarray(255.0 * curve.encode(light), float)
+
+
+def _medians(group: Indices, values: Array) -> Array:
+    """(groups,) lower medians."""
+    order = np.lexsort((values, group))
+    count = np.bincount(group)
+    start = np.cumsum(count) - count
+    return np.asarray(values[order][start + np.maximum(count - 1, 0) // 2])
+
+
+def _spread(group: Indices, values: Array) -> Array:
+    """(groups,) standard deviations, by the median of the sizes."""
+    return 1.4826 * _medians(group, np.abs(values))
+
+
+def _design(
+    observations: PhotometricObservations, patch: Indices, frame: Indices, level: Array, weight: Array
+) -> tuple[sparse.csr_matrix, Array]:
+    """Weighted columns of all patches and of all frames' fields, each orthonormal, and the patches' scales.
+
+    Within a frame the basis is orthonormal and so are the patches among each other: LSMR then takes few steps.
+    """
+    scale = 1 / np.sqrt(np.bincount(patch, weight**2))
+    blocks = [sparse.csr_matrix((weight * scale[patch], (np.arange(len(patch)), patch)))]
+    rows, columns, values, width = [], [], [], 0
+    for k in range(int(frame.max()) + 1):
+        chosen = np.flatnonzero(frame == k)
+        basis = np.linalg.qr(weight[chosen, None] * _basis(observations, chosen, level[chosen]))[0]
+        rows.append(np.repeat(chosen, basis.shape[1]))
+        columns.append(np.tile(width + np.arange(basis.shape[1]), len(chosen)))
+        values.append(basis.ravel())
+        width += basis.shape[1]
+    place = np.concatenate(rows), np.concatenate(columns)
+    blocks.append(sparse.csr_matrix((np.concatenate(values), place), shape=(len(patch), width)))
+    return sparse.csr_matrix(sparse.hstack(blocks)), scale
 
 
 def _basis(observations: PhotometricObservations, chosen: Indices, level: Array) -> Array:
-    """Brightness times (a quadratic in place + hats along the readout), and a cubic in brightness."""
+    """A cubic in brightness, and brightness times (a quadratic in place + hats along the readout).
+
+    As many of them as the frame's places can bear.
+    """
     size = max(observations.width, observations.height)
     x = (observations.x_px[chosen] - observations.width / 2) / size
     y = (observations.y_px[chosen] - observations.height / 2) / size
     part = level / 128.0
-    knots = np.linspace(0, 1, _ROW_KNOTS)
-    hats = np.maximum(0, 1 - np.abs(observations.row_fraction[chosen, None] - knots) * (_ROW_KNOTS - 1))
-    smooth = np.column_stack([x, y, x * x, x * y, y * y, hats])
-    return np.column_stack([part[:, None] * smooth, np.ones_like(part), part**2, part**3])
+    smooth = np.column_stack([np.ones_like(part), part**2, part[:, None] * np.column_stack([x, y, x * x, x * y, y * y])])
+    columns = np.column_stack([part, smooth, part**3])
+    terms = int(len(np.unique(observations.place[chosen])) / _PLACES_PER_TERM)
+    knots = min(terms - columns.shape[1] + 2, _MOST_ROW_KNOTS)
+    if knots < 4:
+        return np.asarray(columns[:, : max(terms, 1)])
+    hats = np.abs(observations.row_fraction[chosen, None] * (knots - 1) - np.arange(1, knots - 1))
+    return np.column_stack([columns, part[:, None] * np.maximum(0, 1 - hats)])

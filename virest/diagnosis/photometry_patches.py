@@ -368,7 +368,7 @@ def _observations(
         width=width,
         height=height,
     )
-    return measured_noise(observations)
+    return measured_noise(observations, profile.response)
 
 
 def _logged_products(frames: list[Frame]) -> tuple[Array, Array, bool]:

@@ -211,11 +211,11 @@ def judge_curve(
     observations: PhotometricObservations | None,
     frames: Sequence[Frame],
     trajectory: Trajectory,
-    gray: Reader,
+    pictures: Reader,
 ) -> PictureVerdict:
     """Gamma or black level from how blur mixes light, where nothing else tells them; paths must be right by now."""
     verdict = PictureVerdict(profile)
-    _mixing(verdict, observations, frames, trajectory, gray)
+    _mixing(verdict, observations, frames, trajectory, pictures)
     return verdict
 
 
@@ -224,12 +224,12 @@ def _mixing(
     observations: PhotometricObservations | None,
     frames: Sequence[Frame],
     trajectory: Trajectory,
-    gray: Reader,
+    pictures: Reader,
 ) -> None:
     if observations is not None and _light_spread(observations) >= VARIED_LIGHT:
         return
     usable = [frame for frame in frames if frame.exposure_s]
-    evidence = observe_mixing(gray, usable, trajectory, verdict.profile)
+    evidence = observe_mixing(pictures, usable, trajectory, verdict.profile)
     found = {name: estimate_mixing(evidence, verdict.profile, name) for name in ("response_curve", "black_level")}
     gamma, black = found["response_curve"], found["black_level"]
     log.debug("mixing: gamma %s, black %s", gamma, black)
@@ -239,7 +239,7 @@ def _mixing(
     is_gamma = gamma.p_value < MIXING_P and abs(np.log(gamma.value)) > MIXING_GAMMA
     is_black = black.p_value < MIXING_P and black.value > MIXING_BLACK
     if is_black and is_gamma:
-        is_black = _floor_allows(gray, usable, black.value)
+        is_black = _floor_allows(pictures, usable, black.value)
         is_gamma = not is_black
     name = "black_level" if is_black else "response_curve" if is_gamma else None
     if name is None:
@@ -260,11 +260,13 @@ def _mixing(
     verdict.rungs.append(Rung(name, {name: gain.after}, gain.before, PHOTOMETRY))
 
 
-def _floor_allows(gray: Reader, frames: Sequence[Frame], black_level: float) -> bool:
-    """Whether no grey is much darker than a black level would be."""
+def _floor_allows(pictures: Reader, frames: Sequence[Frame], black_level: float) -> bool:
+    """Whether nothing is much darker than a black level would be."""
     picked = [frames[int(k)].index for k in np.linspace(0, len(frames) - 1, min(8, len(frames)))]
     darkest = [
-        float(np.quantile(picture, FLOOR_QUANTILE)) for _, picture in gray(sorted(set(picked))) if picture is not None
+        float(np.quantile(picture, FLOOR_QUANTILE))
+        for _, picture in pictures(sorted(set(picked)))
+        if picture is not None
     ]
     return bool(darkest) and float(np.median(darkest)) > FLOOR_PART * black_level * GREY_LEVELS
 

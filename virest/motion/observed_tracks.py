@@ -77,26 +77,34 @@ class ObservedTracks:
         return self.chosen(use)
 
     def without_astray(self, first_px: Array, distance: Array) -> tuple[ObservedTracks, float]:
-        """Leave out the parts of the picture that go their own way, and say how many of the points that takes.
+        """Leave out the parts of the picture that go their own way, and say how many of the points that takes."""
+        astray = self.astray_cells(first_px, distance)
+        if not astray.any():
+            return self, 0.0
+        return self.without_cells(astray), float(astray[self.cells(first_px)].mean())
+
+    def astray_cells(self, first_px: Array, distance: Array) -> NDArray[np.bool_]:
+        """Which cells (CELLS²,) of the picture go their own way: a dashboard, a passer-by.
 
         first_px (n, 2), distance (n,): points of a fit and how far each lies from it, in standard deviations.  A cell
-        goes its own way if its median distance is ASTRAY times the typical cell's: a dashboard, a passer-by.
+        is astray if its median distance is ASTRAY times the typical cell's; none if most points would be.
         """
-        cell = self._cells(first_px)
+        cell = self.cells(first_px)
         counts = np.bincount(cell, minlength=CELLS**2)
-        medians = np.full(CELLS**2, np.nan)
-        for number in np.flatnonzero(counts >= LEAST_IN_CELL):
+        medians = np.zeros(CELLS**2)
+        full = np.flatnonzero(counts >= LEAST_IN_CELL)
+        for number in full:
             medians[number] = np.median(distance[cell == number])
-        astray = (
-            np.nan_to_num(medians, nan=0.0) > ASTRAY * np.nanmedian(medians) if np.isfinite(medians).any() else None
-        )
-        if astray is None or not astray.any() or counts[astray].sum() > MOST_ASTRAY * counts.sum():
-            return self, 0.0
-        kept = [_selected(pair, ~astray[self._cells(pair.points_first_px)]) for pair in self.pairs]
-        use = np.array([len(pair) >= MIN_TRACKS for pair in kept])
-        return replace(self, pairs=tuple(kept)).chosen(use), float(counts[astray].sum() / counts.sum())
+        astray = medians > ASTRAY * (np.median(medians[full]) if len(full) else np.inf)
+        return astray & (counts[astray].sum() <= MOST_ASTRAY * counts.sum())
 
-    def _cells(self, points_px: Array) -> NDArray[np.intp]:
+    def without_cells(self, cells: NDArray[np.bool_]) -> ObservedTracks:
+        """Leave out the points that begin in some cells (CELLS²,) of the picture, and pairs that are then too few."""
+        kept = [_selected(pair, ~cells[self.cells(pair.points_first_px)]) for pair in self.pairs]
+        use = np.array([len(pair) >= MIN_TRACKS for pair in kept])
+        return replace(self, pairs=tuple(kept)).chosen(use)
+
+    def cells(self, points_px: Array) -> NDArray[np.intp]:
         """Number of the cell that each point lies in."""
         part = points_px * (CELLS / np.array([self.lens.width, self.lens.height]))
         x, y = np.clip(part.astype(np.intp), 0, CELLS - 1).T

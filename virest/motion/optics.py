@@ -92,9 +92,12 @@ def moving_lens(trajectory: Trajectory, profile: CameraProfile) -> MovingLens:
     if not extensions.stabilisation_fraction:
         return MovingLens(profile.intrinsics, extensions.focal_drift_per_s)
     time_s = _shift_grid(*trajectory.span_s)
-    shift = stabiliser_shift(
-        time_s, trajectory.rate_rad_s(time_s), extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
-    )
+    fraction, cutoff_hz = extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
+    shift = stabiliser_shift(time_s, trajectory.rate_rad_s(time_s), fraction, cutoff_hz)
+    if any(extensions.stabilisation_lean_rad):
+        about_x, about_y = extensions.stabilisation_lean_rad
+        forgotten = np.exp(-2 * np.pi * cutoff_hz * (time_s - time_s[0]))
+        shift = shift + fraction * forgotten[:, None] * np.array([about_y, -about_x])
     return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift)
 
 

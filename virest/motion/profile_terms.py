@@ -90,11 +90,17 @@ def drift_focal(profile: CameraProfile, v: Array) -> CameraProfile:
 
 
 def stabilise(profile: CameraProfile, v: Array) -> CameraProfile:
-    """Add v[0] to the stabiliser's fraction and multiply its cutoff by exp(v[1])."""
+    """Add v[0] to the stabiliser's fraction, multiply its cutoff by exp(v[1]), add v[2:] rad to its lean at first."""
     before = profile.extensions
     cutoff = float(np.clip(before.stabilisation_cutoff_hz * np.exp(v[1]), 0.02, 20.0))
     fraction = before.stabilisation_fraction + float(v[0])
-    return _extend(profile, stabilisation_fraction=fraction, stabilisation_cutoff_hz=cutoff)
+    lean = before.stabilisation_lean_rad
+    return _extend(
+        profile,
+        stabilisation_fraction=fraction,
+        stabilisation_cutoff_hz=cutoff,
+        stabilisation_lean_rad=(lean[0] + float(v[2]), lean[1] + float(v[3])),
+    )
 
 
 TIME_OFFSET = Term("time_offset", shift_offset, (1e-4,), (0.02,), (INF,))
@@ -110,4 +116,4 @@ CLOCK_SKEW = Term(
 )
 EXPOSURE_SCALE = Term("exposure_time", scale_exposure, (0.05,), (0.3,), (0.7,))
 FOCAL_DRIFT = Term("focal_drift", drift_focal, (1e-3,), (0.03,), (0.2,))
-STABILISATION = Term("stabilisation", stabilise, (0.02, 0.1), (0.3, 0.5), (1.0, 1.5))
+STABILISATION = Term("stabilisation", stabilise, (0.02, 0.1, 0.01, 0.01), (0.3, 0.5, 0.1, 0.1), (1.0, 1.5, 0.05, 0.05))

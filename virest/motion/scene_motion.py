@@ -35,7 +35,9 @@ class InertialMotion:
     plane_per_m: Array
     """(windows, 3) m of the scene's plane m · X = 1, origin at the camera's centre at the window's middle."""
     plane_std_per_m: tuple[float, float, float] = (PLANE_STD_PER_M,) * 3
-    """Prior of the plane about where the fit began, world axes."""
+    """Prior of the plane about where the fit began, in ``plane_axes``."""
+    plane_axes: Array | None = None
+    """(windows, 3, 3) R_world_plane: axes in which planes are varied; None: the world's."""
 
     @property
     def windows(self) -> int:
@@ -44,19 +46,25 @@ class InertialMotion:
 
     def vector(self) -> Array:
         """Gravity, bias, delay, then velocity and plane of each window: (7 + 6 windows,)."""
-        own = np.concatenate([self.velocity_m_s, self.plane_per_m], axis=-1)
+        plane = self.plane_per_m
+        if self.plane_axes is not None:
+            plane = np.einsum("wij,wi->wj", self.plane_axes, plane)
+        own = np.concatenate([self.velocity_m_s, plane], axis=-1)
         return np.concatenate([self.gravity_m_s2, self.accel_bias_m_s2, [self.accel_delay_s], own.ravel()])
 
     def with_vector(self, vector: Array) -> InertialMotion:
         """The motion of such a vector."""
         own = vector[7:].reshape(-1, 6)
+        plane = own[:, 3:]
+        if self.plane_axes is not None:
+            plane = np.einsum("wij,wj->wi", self.plane_axes, plane)
         return replace(
             self,
             velocity_m_s=own[:, :3],
             gravity_m_s2=vector[:3],
             accel_bias_m_s2=vector[3:6],
             accel_delay_s=float(vector[6]),
-            plane_per_m=own[:, 3:],
+            plane_per_m=plane,
         )
 
     def prior_std(self) -> Array:

@@ -86,7 +86,32 @@ class TrackFit:
     ground: Ground
     seconds: Array
     """(n,) when the second points were seen, IMU clock."""
+    noise_px: Array
+    """(n,) of each point's step, per coordinate."""
+    along_px: Array | None
+    """(n, 2) change of the second points per unit of inverse depth; None where no relief is allowed for."""
     slices: dict[str, slice] = field(default_factory=dict)
+
+    def distance_at(self, depth_spread_per_m: float) -> Array:
+        """Whitened distances (n,) as if points' inverse depths spread so much about the plane.
+
+        Fits are comparable at one spread only: a wrong plane calls for a wide one, and is then no further off.
+        """
+        left = self.difference_px / self.noise_px[:, None]
+        if self.along_px is None:
+            return self.distance
+        length = np.linalg.norm(self.along_px, axis=-1)
+        way = self.along_px / np.maximum(length, 1e-12)[:, None]
+        variance = 1 + (depth_spread_per_m * length / self.noise_px) ** 2
+        along = (left * way).sum(axis=-1)
+        return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
+
+    def relief_cost(self) -> Array:
+        """What the points' spread of depths costs in the likelihood (n,): the logarithm of their standard deviation."""
+        if self.along_px is None:
+            return np.zeros(len(self.distance))
+        ratio = np.linalg.norm(self.along_px, axis=-1) / self.noise_px
+        return np.asarray(0.5 * np.log1p((self.depth_spread_per_m * ratio) ** 2))
 
     def std(self, name: str) -> Array:
         """Standard deviations (k,) of a term's values."""
@@ -329,7 +354,8 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
         state.known.profile, state.scene, terms, state.change, covariance, inverse, system.scale,
         system.depth_spread, difference, system.weight, np.sqrt(system.squared), stretches,
         _cost(system, 1.0), state.known,
-        system.prediction.second_s, slices,
+        system.prediction.second_s, table.noise_px[table.pair],
+        None if isinstance(state.scene, DirectedMotion) else system.prediction.along_px, slices,
     )  # fmt: skip
 
 

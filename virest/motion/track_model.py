@@ -263,6 +263,8 @@ def _moved_inertially(
     since_1, since_2, each = first_s - origin_s, second_s - origin_s, np.eye(3)[None]
     nearer = (inverse_depth / clearance)[:, None] * plane  # change of the inverse depth per metre of the first centre
     per_plane = world / clearance[:, None] + (inverse_depth / clearance)[:, None] * centre_1
+    if scene.plane_axes is not None:
+        per_plane = np.einsum("ni,nij->nj", per_plane, scene.plane_axes[window])
     first, second = (
         _shared_slopes(each, since, bias, delay)
         for since, bias, delay in ((since_1, bias_1, delay_1), (since_2, bias_2, delay_2))

@@ -26,11 +26,12 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "focal_drift": (3e-4,),
     "radial_distortion": (7e-4,),
     "principal_point": (0.2, 0.2),
-    "stabilisation": (0.002, 0.02),
+    "stabilisation": (0.002, 0.02, 0.0, 0.0),
     "clock_skew": (1e-5,),
     "exposure_time": (0.03,),
+    "scene_depth": (0.004,),
 }
-"""At the typical noise, in the units of the terms of profile_terms."""
+"""At the typical noise, in the units of the terms of profile_terms; a depth's relative."""
 
 
 def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:

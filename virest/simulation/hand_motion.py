@@ -117,18 +117,22 @@ def random_hand_motion(
     rate_rms_rad_s: float,
     duration_s: float,
     sway_rms_m: float = 0.0,
+    walk_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     margin_s: float = 1.0,
     band_hz: tuple[float, float] = (0.5, 12.0),
 ) -> HandMotion:
     """Hand tremor whose rate has the given RMS (of the vector's length) over [0, duration_s].
 
     The rate's spectrum rises to about 2 Hz, is flat, and falls above 8 Hz.  Orientations cover ``margin_s`` more on
-    both sides.  ``sway_rms_m`` adds a translation between 0.3 and 2.5 Hz of that RMS length.
+    both sides.  ``sway_rms_m`` adds a translation between 0.3 and 2.5 Hz of that RMS length, ``walk_m`` a step along an
+    arc: so far from side to side, and so far out and back along y and z.
     """
     rate = _random_waves(rng, band_hz, lambda f: (f / 2) / (1 + f / 2) / (1 + (f / 8) ** 2))
     rate = _with_rms(rate, np.array(SHARE_PER_AXIS) * rate_rms_rad_s, duration_s)
     sway = _random_waves(rng, (0.3, 2.5), lambda f: 1 / (1 + f))
     sway = _with_rms(sway, np.array([0.65, 0.65, 0.4]) * sway_rms_m, duration_s)
+    if any(walk_m):
+        sway = _with_arc(sway, walk_m, duration_s)
     return integrate_motion(rate, sway, -margin_s, duration_s + margin_s, centre_on_s=(0.0, duration_s))
 
 
@@ -191,6 +195,15 @@ def _random_waves(rng: np.random.Generator, band_hz: tuple[float, float], spectr
     frequency = np.exp(low + (high - low) * place)
     amplitude = spectrum(frequency) * rng.uniform(0.6, 1.4, (3, _COMPONENTS))
     return Waves(frequency, amplitude, rng.uniform(0, 2 * np.pi, (3, _COMPONENTS)))
+
+
+def _with_arc(waves: Waves, walk_m: tuple[float, float, float], duration_s: float) -> Waves:
+    """Half a turn of an ellipse over [0, duration_s] on top: x from +walk/2 to −walk/2, y and z out and back."""
+    frequency = np.full((3, 1), 0.5 / duration_s)
+    amplitude = np.array([[0.5 * walk_m[0]], [walk_m[1]], [walk_m[2]]])
+    phase = np.array([[0.0], [-np.pi / 2], [-np.pi / 2]])
+    parts = ((waves.frequency_hz, frequency), (waves.amplitude, amplitude), (waves.phase_rad, phase))
+    return Waves(*(np.concatenate(pair, axis=1) for pair in parts))
 
 
 def _with_rms(waves: Waves, rms_per_axis: Array, duration_s: float) -> Waves:

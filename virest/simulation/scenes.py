@@ -96,6 +96,52 @@ class Scene:
         return cv2.remap(self.chart, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
 
+@dataclass(frozen=True, slots=True)
+class ReliefScene(Scene):
+    """A chart with things hanging before it: two planes, the nearer one painted over the farther.
+
+    Homographies come in pairs, (..., 2, 3, 3): the farther plane's, then the nearer one's.
+    """
+
+    near: Scene | None = None
+    """The nearer plane; its chart holds light × cover in three channels and cover, 0 to 1, in a fourth."""
+
+    def chart_from_ray(
+        self, rotation_world_cam: NDArray[np.float64], position_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Both planes' homographies, as :meth:`Scene.chart_from_ray`: (..., 2, 3, 3)."""
+        planes = [Scene(self.chart, self.chart_focal_px, self.depth_m, self.normal), self.near or self]
+        return np.stack([Scene.chart_from_ray(plane, rotation_world_cam, position_m) for plane in planes], axis=-3)
+
+    def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+        """Light along rays: the nearer chart's where it covers, else the farther one's: (h, w, 3)."""
+        light = Scene.sample(self, homography[0], x, y)
+        if self.near is None:
+            return light
+        before = self.near.sample(homography[1], x, y)
+        return light * (1 - before[..., 3:]) + before[..., :3]
+
+
+def hang_before(
+    scene: Scene, rng: np.random.Generator, *, depth_m: float, focal_px: float, things: int = 14, size: float = 0.13
+) -> ReliefScene:
+    """Hang discs, ellipses and polygons of leaves' texture on a nearer plane, facing the camera.
+
+    focal_px: of the camera, as for :func:`make_scene`.  size: mean radius in units of x/z, as seen from the origin.
+    """
+    height, width = scene.chart.shape[:2]
+    oversampling = scene.chart_focal_px / focal_px
+    cover = np.zeros((height, width), np.float32)
+    for _ in range(things):
+        centre = rng.uniform((0, 0), (width, height))
+        _fill_leaf(cover, rng, centre, float(rng.uniform(0.5, 1.5)) * size * scene.chart_focal_px, 1.0)
+    drawing = _draw_leaves(rng, width, height, oversampling)
+    layers = np.dstack([drawing * cover[..., None], cover])
+    layers = cv2.GaussianBlur(layers, (0, 0), LENS_SIGMA_PX * oversampling, borderType=cv2.BORDER_REFLECT)
+    near = Scene(layers, scene.chart_focal_px, depth_m)
+    return ReliefScene(scene.chart, scene.chart_focal_px, scene.depth_m, scene.normal, near)
+
+
 def make_scene(
     kind: str,
     rng: np.random.Generator,

@@ -13,9 +13,12 @@ from virest.app import console
 from virest.app.cli.calibrate import calibrate
 from virest.app.cli.calibrate_curve import calibrate_curve
 from virest.app.cli.diagnose import diagnose
+from virest.app.cli.evaluate import evaluate
+from virest.app.cli.export import export
 from virest.app.cli.inspect import inspect
 from virest.app.cli.options import Version
 from virest.app.cli.process import process
+from virest.app.cli.report import report
 from virest.app.cli.simulate import simulate
 from virest.errors import OutputError
 
@@ -44,9 +47,10 @@ def _virest(version: Version = False) -> None:
     pass
 
 
-for command in (process, inspect, simulate, calibrate, diagnose):
+for command in (process, inspect, simulate, calibrate, diagnose, report, export):
     app.command()(command)
 app.command("calibrate-curve")(calibrate_curve)
+app.add_typer(evaluate, name="evaluate")
 
 
 def _terminate(number: int, _frame: Any) -> NoReturn:

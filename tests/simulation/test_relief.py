@@ -1,0 +1,73 @@
+"""Things that hang before a plane: nearer, so they move more, and they hide what is behind them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from virest.simulation.scenes import ReliefScene, Scene, hang_before
+
+NEAR_M, FAR_M, FOCAL = 1.1, 1.9, 50.0
+CENTRE = np.array([59.5, 39.5])
+POSE = Rotation.from_rotvec([0.05, -0.08, 0.2])
+PLACE_M = np.array([0.12, -0.07, 0.15])
+
+
+def chart(rng: np.random.Generator) -> np.ndarray:
+    """A smooth chart whose colours tell the place: red grows with x, green with y."""
+    y, x = np.mgrid[0:80, 0:120].astype(np.float32)
+    return np.dstack([x / 120, y / 80, np.full_like(x, float(rng.uniform(0.1, 0.9)))]).astype(np.float32)
+
+
+def colour_at(pixel: np.ndarray, blue: float) -> np.ndarray:
+    """Colour of a place of the chart."""
+    return np.array([pixel[0] / 120, pixel[1] / 80, blue])
+
+
+def ray_to(point_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x/z and y/z of a world point from the moved camera."""
+    seen = POSE.inv().apply(point_m - PLACE_M)
+    return np.full((1, 1), seen[0] / seen[2], np.float32), np.full((1, 1), seen[1] / seen[2], np.float32)
+
+
+def relief(rng: np.random.Generator) -> tuple[ReliefScene, float, float]:
+    """A relief whose nearer plane covers the chart left of its middle; the two planes' blues."""
+    far, near = chart(rng), chart(rng)
+    cover = np.zeros((80, 120, 1), np.float32)
+    cover[:, :60] = 1
+    before = Scene(np.concatenate([near * cover, cover], axis=2), FOCAL, NEAR_M)
+    return ReliefScene(far, FOCAL, FAR_M, (0.0, 0.0, 1.0), before), float(far[0, 0, 2]), float(near[0, 0, 2])
+
+
+def test_a_point_of_each_plane_is_seen_where_its_ray_goes(rng: np.random.Generator):
+    """From a camera that has moved and turned, the nearer plane hides the farther one, and a gap does not."""
+    scene, far_blue, near_blue = relief(rng)
+    both = scene.chart_from_ray(POSE.as_matrix(), PLACE_M)
+    on_near = np.array([-0.31, 0.11, NEAR_M])
+    seen = scene.sample(both, *ray_to(on_near))[0, 0]
+    np.testing.assert_allclose(seen, colour_at(CENTRE + FOCAL * on_near[:2] / NEAR_M, near_blue), atol=2e-3)
+    on_far = np.array([0.83, -0.2, FAR_M])
+    seen = scene.sample(both, *ray_to(on_far))[0, 0]
+    np.testing.assert_allclose(seen, colour_at(CENTRE + FOCAL * on_far[:2] / FAR_M, far_blue), atol=2e-3)
+
+
+def test_poses_at_several_times_give_pairs_of_homographies(rng: np.random.Generator):
+    """One pair for each pose, the same as one by one."""
+    scene, *_ = relief(rng)
+    turns = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.2, 0.3], [0, -0.2, 0]]).as_matrix()
+    places = np.array([[0, 0, 0], [0.1, 0, 0], PLACE_M])
+    all_at_once = scene.chart_from_ray(turns, places)
+    assert all_at_once.shape == (3, 2, 3, 3)
+    np.testing.assert_allclose(all_at_once[2], scene.chart_from_ray(turns[2], places[2]))
+
+
+def test_things_hung_before_a_scene_hide_some_of_it_and_not_all(rng: np.random.Generator):
+    """The farther plane stays as it was; covered light never exceeds the cover."""
+    plane = Scene(chart(rng), FOCAL, FAR_M)
+    scene = hang_before(plane, rng, depth_m=NEAR_M, focal_px=FOCAL)
+    assert scene.near is not None
+    assert (scene.depth_m, scene.near.depth_m) == (FAR_M, NEAR_M)
+    np.testing.assert_array_equal(scene.chart, plane.chart)
+    cover = scene.near.chart[..., 3]
+    assert 0.02 < cover.mean() < 0.9
+    assert (scene.near.chart[..., :3].max(axis=2) <= cover + 1e-6).all()

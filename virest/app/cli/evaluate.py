@@ -1,0 +1,142 @@
+"""`virest evaluate shutter|deblur|slam`: the paper's Cases A, B and C."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from virest.app import console
+from virest.app.cli.evaluate_slam import slam
+from virest.app.cli.options import (
+    Config,
+    Json,
+    Quiet,
+    Verbose,
+    Version,
+    emit_facts,
+    on_bar,
+    one_of,
+    one_thread_each,
+    parse_frames,
+)
+
+BOARDS = ("auto", "chessboard", "aprilgrid")
+
+evaluate = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    help="How good is it: against truth, and against other methods given the same advantages.",
+)
+TrueCaptures = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[CAPTURE]...", help="Captures with truth/; - reads names from stdin. [simulated]"),
+]
+Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B[:STEP]", help="Judge only these frames. [all]")]
+Maps = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write difference maps in here.")]
+
+
+@evaluate.command()
+def shutter(
+    captures: TrueCaptures = None,
+    config: Config = None,
+    frames: Frames = None,
+    board: Annotated[
+        str, typer.Option(metavar="KIND", callback=one_of(BOARDS), help="auto, chessboard or aprilgrid.")
+    ] = "auto",
+    out: Maps = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Two simulated captures, four frames each.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Angles at a board's corners and pictures against truth, straightened by several methods (Case A).
+
+    \b
+    $ virest evaluate shutter --out maps
+    CASE A, rolling shutter: 50 frames of 5 captures, ...
+    method                 mean  spread     max  relative %  angles
+    none                 1.6642  1.9543  3.9687      1.8515     200
+    schubert2018         0.3409  0.4456  1.7405      0.3798     200
+    perspective          0.5057  0.6176  1.2714      0.5603     200
+    rowwise-rotation     0.2372  0.3978  1.0126      0.2637     200
+    rowwise              0.0092  0.0115  0.0358      0.0102     200
+    ...
+    $ virest simulate wall --scene board --rate 2 --exposure-ms 1
+    $ virest evaluate shutter wall --json | jq .all.methods.rowwise.outer
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    paths = console.expand_dash(captures or [])
+    if captures and not paths:
+        return 0
+    _require_captures(paths, {"--config": config, "--frames": frames})
+    chosen = parse_frames(frames)
+    one_thread_each()
+    from virest.app.evaluate_shutter import ShutterOptions, run_shutter
+
+    options = ShutterOptions(tuple(paths), config, chosen, board, out, quick)
+    with console.progress_bar(100, "evaluate shutter", quiet=quiet) as bar:
+        facts, text = run_shutter(options, on_bar(bar))
+    emit_facts(facts, text, as_json=json)
+    return 0
+
+
+@evaluate.command()
+def deblur(
+    captures: TrueCaptures = None,
+    config: Config = None,
+    frames: Frames = None,
+    restored: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Judge these pictures, against --reference.")
+    ] = None,
+    reference: Annotated[Path | None, typer.Option(metavar="DIR", help="Their references, by the same names.")] = None,
+    out: Maps = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Two simulated captures, two frames each.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """MSE, PSNR, SSIM and matched points of pictures deblurred by several methods, against truth (Case B).
+
+    \b
+    $ virest evaluate deblur --quick
+    CASE B, motion blur: 4 frames, ...
+    method                          MSE  PSNR dB    SSIM  matches  in place
+    blurred                       385.9    22.27  0.7292      244       216
+    skimage richardson_lucy       288.0    23.54  0.7435      362       328
+    virest balanced               190.6    25.33  0.8268      526       483
+    ...
+    $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    paths = console.expand_dash(captures or [])
+    if captures and not paths:
+        return 0
+    if (restored is None) != (reference is None):
+        raise typer.BadParameter("--restored and --reference go together")
+    if restored is not None and paths:
+        raise typer.BadParameter("give captures, or --restored and --reference, not both")
+    _require_captures(paths, {"--config": config, "--frames": frames})
+    chosen = parse_frames(frames)
+    one_thread_each()
+    from virest.app.evaluate_deblur import DeblurOptions, run_deblur
+
+    options = DeblurOptions(tuple(paths), config, chosen, restored, reference, out, quick)
+    with console.progress_bar(100, "evaluate deblur", quiet=quiet) as bar:
+        facts, text = run_deblur(options, on_bar(bar))
+    emit_facts(facts, text, as_json=json)
+    return 0
+
+
+evaluate.command("slam")(slam)
+
+
+def _require_captures(paths: list[str], wishes: dict[str, Any]) -> None:
+    """Refuse options that would do nothing."""
+    for name, wish in wishes.items():
+        if wish is not None and not paths:
+            raise typer.BadParameter(f"{name} goes with a CAPTURE")

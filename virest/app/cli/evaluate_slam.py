@@ -1,0 +1,68 @@
+"""`virest evaluate slam`: what restored frames are worth to a SLAM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, on_bar, one_of, one_thread_each
+from virest.restoration.settings import PRESETS
+
+
+def slam(
+    captures: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[CAPTURE]...", help="Capture folders with truth/; - reads names from stdin. [simulated]"
+        ),
+    ] = None,
+    command: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CMD",
+            help="Run this SLAM in COLMAP's place: {sequence} {trajectory}, and {settings} {times} {seed} if wanted.",
+        ),
+    ] = None,
+    seeds: Annotated[int | None, typer.Option(metavar="N", min=1, help="Runs of each. [3; 1 for devices]")] = None,
+    devices: Annotated[bool, typer.Option("--devices", help="Eight simulated phones too.")] = False,
+    preset: Annotated[
+        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Of the restoration.")
+    ] = "balanced",
+    timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", min=0.1, help="Of one run of CMD.")] = 600.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Keep sequences, trajectories and results here.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="One short sequence, one seed, two devices.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Compare trajectories from global-shutter, rolling-shutter and restored frames with the true one.
+
+    \b
+    $ virest evaluate slam
+    sequence  readout ms  ...         global mm              rolling mm       restored mm  removed
+    relief            25  ...  0.39 (0.39-0.39)     27.98 (27.96-28.01)  1.23 (1.23-1.23)  97.0 %   leaves, some at 1 m
+    print           29.5  ...  0.51 (0.29-0.51)     32.37 (32.29-32.72)  0.78 (0.48-1.51)  99.1 %   text, sideways
+    shaken        20.733  ...  0.53 (0.53-0.53)  107.73 (101.50-136.34)  0.83 (0.83-0.83)  99.7 %   leaves, upright
+    ...
+    $ virest evaluate slam walk --command 'mono_euroc_tum ORBvoc.txt {settings} {sequence} {times} {trajectory}'
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    paths = [Path(path) for path in console.expand_dash(captures or [])]
+    if captures and not paths:
+        return 0
+    if paths and devices:
+        raise typer.BadParameter("--devices are simulated; give no CAPTURE with it")
+    one_thread_each()
+    from virest.app.evaluate_slam import SlamOptions, run_slam
+
+    options = SlamOptions(command, seeds, devices, quick, out, preset, timeout_s)
+    with console.progress_bar(100, "evaluate slam", quiet=quiet) as bar:
+        facts, text, code = run_slam(paths, options, on_bar(bar))
+    emit_facts(facts, text, as_json=json)
+    return code

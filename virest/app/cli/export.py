@@ -1,0 +1,70 @@
+"""`virest export`: a capture in the folders that SLAM tools read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, one_of, parse_frames
+
+FORMATS, STAMPS = ("euroc", "tum"), ("logged", "instant")
+
+
+def export(
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its name from stdin.")],
+    format: Annotated[
+        str, typer.Option("--format", metavar="NAME", callback=one_of(FORMATS), help="euroc or tum.")
+    ] = "euroc",
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The export goes into DIR/<capture>.")] = Path(
+        "virest-export"
+    ),
+    restored: Annotated[
+        Path | None,
+        typer.Option("--restored", metavar="RUN_DIR", help="Pictures of this finished run of virest process."),
+    ] = None,
+    config: Config = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's indices.")
+    ] = None,
+    stamps: Annotated[
+        str,
+        typer.Option(
+            "--stamps",
+            metavar="NAME",
+            callback=one_of(STAMPS),
+            help="logged, or instant: moved to the instant that a picture stands for.",
+        ),
+    ] = "logged",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an export that exists.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Write frames (raw or restored) and IMU as SLAM tools read them, without ROS, with calibration files.
+
+    \b
+    $ virest export walk --format euroc --restored virest-out/walk
+    walk: 60 restored pictures over 1.97 s and 640 inertial rows as euroc
+    a picture stands for the instant 0.00 ms after its stamp
+    wrote virest-export/walk
+
+    \b
+    $ mono_inertial_euroc ORBvoc.txt virest-export/walk/orb_slam3.yaml virest-export/walk virest-export/walk/times.txt
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    chosen = parse_frames(frames)
+    paths = console.expand_dash([capture])
+    if len(paths) != 1:
+        raise typer.BadParameter(f"standard input names {len(paths)} captures; one is exported at a time")
+    from virest.app.export import ExportOptions, plan_export, run_export
+
+    options = ExportOptions(out, format, restored, config, chosen, stamps, overwrite)
+    plan = plan_export(paths[0], options)
+    with console.progress_bar(len(plan.frames), plan.capture.name, quiet=quiet) as bar:
+        facts, text = run_export(plan, bar.update if bar else None)
+    emit_facts(facts, text, as_json=json)
+    return 0

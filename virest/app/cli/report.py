@@ -1,0 +1,52 @@
+"""`virest report`: a run or a diagnosis as one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_thread_each
+
+
+def report(
+    run_dir: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN_DIR", help="OUT/<capture> of a run or diagnosis, or OUT itself: then all captures in it."
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The page. [RUN_DIR/report.html]")] = None,
+    frames: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=200, help="Frames shown of each capture. [6]")
+    ] = None,
+    capture: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where the capture is now, or the folder that holds the captures."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing page.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Show a run or a diagnosis as one HTML page that needs no network: before and after, curves, verdict.
+
+    \b
+    $ virest process sample_data/text
+    $ virest report virest-out/text
+    text: restored (12 restored)
+    wrote virest-out/text/report.html, 1.3 MB
+
+    \b
+    $ virest report virest-out --json | jq -r '.captures[] | select(.counts.failed > 0) | .capture'
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    one_thread_each()
+    from virest.app.report import ReportOptions, write_report
+
+    outcome = write_report(run_dir, ReportOptions(out, frames, capture, overwrite))
+    emit_facts(outcome.facts, outcome.text, as_json=json)
+    return outcome.exit_code

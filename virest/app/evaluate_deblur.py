@@ -1,0 +1,392 @@
+"""``virest evaluate deblur``: restored pictures against truth, over methods (the paper's Case B, Table 1)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.app.console import table
+from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, read_picture, write_png
+from virest.app.simulate import simulate_command
+from virest.camera.response import ResponseCurve
+from virest.degradation.row_motion import RowMotion
+from virest.errors import CaptureError
+from virest.evaluation.baselines import BASELINES, baseline_pictures
+from virest.evaluation.fidelity import (
+    MARGIN_PX,
+    difference_map,
+    fidelity,
+    inner_part,
+    mean_squared_error,
+    psnr_of,
+    shift_px,
+)
+from virest.evaluation.matching import METHOD, count_matches
+from virest.restoration.settings import PRESETS, RestorationSettings
+
+Picture = NDArray[np.uint8]
+Progress = Callable[[str, float], Any]
+BLURRED = "blurred"
+OURS = tuple(f"virest {preset}" for preset in PRESETS)
+SIZE: dict[str, Any] = {"width": 640, "height": 480}
+STANDARD: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("leaves", SIZE | {"scene": "leaves", "exposure_ms": 16.0, "rate_rad_s": 1.4, "noise_levels": 1.5, "seed": 51}),
+    ("text", SIZE | {"scene": "text", "exposure_ms": 16.0, "rate_rad_s": 1.4, "noise_levels": 2.0, "seed": 52}),
+    ("board", SIZE | {"scene": "board", "exposure_ms": 16.0, "rate_rad_s": 1.4, "noise_levels": 2.5, "seed": 53}),
+)
+QUICK = ("leaves", "text")
+FRAMES, FRAMES_QUICK = 4, 2
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+MAP_GAIN = 2
+"""Difference maps are shown so many times as bright."""
+SHEET_COLUMNS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class DeblurOptions:
+    """What to judge and how."""
+
+    captures: tuple[str, ...] = ()
+    """None: the standard set is simulated, unless two folders are given."""
+    config: Path | None = None
+    frames: slice | None = None
+    restored: Path | None = None
+    reference: Path | None = None
+    out: Path | None = None
+    """Difference maps go here."""
+    quick: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """One frame by one method."""
+
+    capture: str
+    frame: str
+    method: str
+    mse: float
+    ssim: float
+    matches: int
+    matches_in_place: int
+
+
+def run_deblur(options: DeblurOptions, progress: Progress | None = None) -> tuple[dict[str, Any], str]:
+    """Evaluate captures with truth, the standard set, or two folders. Returns the facts and the text."""
+    if options.restored is not None and options.reference is not None:
+        return _run_folders(options, options.restored, options.reference, progress)
+    results: list[FrameResult] = []
+    with _chosen_captures(options) as (captures, simulated):
+        total, done = sum(len(capture.frames) for capture in captures), 0
+        for capture in captures:
+            for number, pictures, truth, valid_px in _all_methods(capture):
+                results += list(_measure(capture.name, f"{number:06d}", pictures, truth, valid_px))
+                _draw(options.out, f"{capture.name}-{number:06d}", pictures, truth, valid_px)
+                done += 1
+                if progress:
+                    progress(capture.name, done / total)
+    facts = _facts(results, {"simulated": simulated})
+    return facts, _text(facts)
+
+
+@contextmanager
+def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture], list[dict[str, Any]]]]:
+    if options.captures:
+        chosen = options.frames or slice(None)
+        yield [open_true_capture(Path(path), options.config, chosen) for path in options.captures], []
+        return
+    work = Path(tempfile.mkdtemp(prefix="virest-evaluate-"))
+    try:
+        names = [(name, wishes) for name, wishes in STANDARD if not options.quick or name in QUICK]
+        count = FRAMES_QUICK if options.quick else FRAMES
+        told = [{**simulate_command(work / name, frames=count, **wishes), "capture": name} for name, wishes in names]
+        yield [open_true_capture(work / name) for name, _ in names], told
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+# ── one capture ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _all_methods(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture], Picture, tuple[int, int, int, int]]]:
+    """Each frame's index, its picture by every method, its truth, and the rectangle with data; all straightened."""
+    plan = capture.plan(RestorationSettings(deblur="none"))
+    plans = {BLURRED: plan} | {f"virest {name}": replace(plan, settings=preset) for name, preset in PRESETS.items()}
+    curve = plan.profile.response or ResponseCurve("srgb")
+    motions = capture.motions(plan)
+    streams = zip(capture.recorded(), *(capture.restored(p) for p in plans.values()), strict=True)
+    for (frame, recorded), *restored in streams:
+        if any(r.picture is None for r in restored):
+            continue
+        truth, valid_px = capture.truth(frame.index), restored[-1].valid_px
+        ours = {name: r.picture for name, r in zip(plans, restored, strict=True) if r.picture is not None}
+        peers = _baselines(recorded, motions[frame.index], curve, truth, valid_px)
+        yield frame.index, {BLURRED: ours.pop(BLURRED), **peers, **ours}, truth, valid_px
+
+
+def _baselines(
+    recorded: Picture, motion: RowMotion, curve: ResponseCurve, truth: Picture, valid_px: Sequence[int]
+) -> dict[str, Picture]:
+    """Each baseline's best picture by squared error against truth; those whose library is missing are left out."""
+    inside = inner_part(valid_px)
+
+    def error(picture: Picture) -> float:
+        return mean_squared_error(picture[inside], truth[inside])
+
+    return {
+        name: min(baseline_pictures(baseline, recorded, motion, curve), key=error)
+        for name, baseline in BASELINES.items()
+        if baseline.available
+    }
+
+
+def _measure(
+    capture: str, frame: str, pictures: Mapping[str, Picture], truth: Picture, valid_px: Sequence[int]
+) -> Iterator[FrameResult]:
+    inside = inner_part(valid_px)
+    for method, picture in pictures.items():
+        close, alike = fidelity(picture[inside], truth[inside]), count_matches(picture[inside], truth[inside])
+        yield FrameResult(capture, frame, method, close.mse, close.ssim, alike.good, alike.in_place)
+
+
+def _draw(
+    out: Path | None, name: str, pictures: Mapping[str, Picture], truth: Picture, valid_px: Sequence[int]
+) -> None:
+    """The pictures above their difference maps, truth first, four beside each other."""
+    if out is None:
+        return
+    inside = inner_part(valid_px)
+    shown = {"truth": truth, **pictures}
+    cells = [_column(method, picture[inside], truth[inside]) for method, picture in shown.items()]
+    cells += [np.full_like(cells[0], 255)] * (-len(cells) % SHEET_COLUMNS)
+    rows = [np.concatenate(cells[k : k + SHEET_COLUMNS], axis=1) for k in range(0, len(cells), SHEET_COLUMNS)]
+    write_png(out / f"{name}-difference.png", np.concatenate(rows))
+
+
+def _column(name: str, picture: Picture, truth: Picture) -> Picture:
+    grey = cv2.convertScaleAbs(difference_map(picture, truth), alpha=MAP_GAIN)
+    both = np.concatenate([picture, np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), np.uint8)])
+    head = np.full((22, both.shape[1], 3), 255, np.uint8)
+    cv2.putText(head, name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    return cv2.copyMakeBorder(np.concatenate([head, both]), 0, 0, 0, 4, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+
+
+# ── two folders ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _run_folders(
+    options: DeblurOptions, restored: Path, reference: Path, progress: Progress | None
+) -> tuple[dict[str, Any], str]:
+    """Compare pictures of the same name, each moved over its reference and both cut to what they share."""
+    names = _common_names(restored, reference)
+    results, shifts = [], {}
+    real_px = _valid_areas(restored.parent / "parameters.jsonl")
+    for position, name in enumerate(names):
+        picture, truth = read_picture(restored / name), read_picture(reference / name)
+        if picture.shape != truth.shape:
+            raise CaptureError(f"{name}: {_size(picture)} in {restored}, {_size(truth)} in {reference}",
+                               hint="give pictures of one size")  # fmt: skip
+        aligned, shift, shared_px = _laid_over(picture, truth)
+        shared_px = _common(shared_px, real_px.get(name, shared_px))
+        shifts[name] = {"shift_px": [round(float(s), 4) for s in shift], "compared_px": list(shared_px)}
+        results += list(_measure(restored.name, name, {"restored": aligned}, truth, shared_px))
+        _draw(options.out, Path(name).stem, {"restored": aligned}, truth, shared_px)
+        if progress:
+            progress(name, (position + 1) / len(names))
+    facts = _facts(results, {"restored": str(restored), "reference": str(reference), "pictures": shifts})
+    return facts, _text(facts)
+
+
+def _common_names(restored: Path, reference: Path) -> list[str]:
+    for folder in (restored, reference):
+        if not folder.is_dir():
+            raise CaptureError(f"{folder}: no such folder", hint="give two folders of pictures of the same names")
+    there = {p.name for p in reference.iterdir()}
+    names = sorted(p.name for p in restored.iterdir() if p.suffix.lower() in PICTURE_ENDINGS and p.name in there)
+    if not names:
+        raise CaptureError(f"{restored} and {reference} share no picture's name", hint="name pairs alike: 000017.png")
+    return names
+
+
+def _valid_areas(log: Path) -> dict[str, tuple[int, ...]]:
+    """valid_px of each picture, where the folder is that of a ``virest process`` run; beyond it edges are repeated."""
+    if not log.is_file():
+        return {}
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    return {Path(line["output"]).name: tuple(line["valid_px"]) for line in lines if line["output"]}
+
+
+def _common(first: Sequence[int], second: Sequence[int]) -> tuple[int, int, int, int]:
+    """The rectangle that two rectangles share."""
+    (x0, y0, x1, y1), (u0, v0, u1, v1) = first, second
+    return max(x0, u0), max(y0, v0), min(x1, u1), min(y1, v1)
+
+
+def _size(picture: Picture) -> str:
+    return f"{picture.shape[1]}x{picture.shape[0]}"
+
+
+def _laid_over(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.float64], tuple[int, int, int, int]]:
+    """The picture moved to where its reference shows the same; how far it was off; the rectangle that both have.
+
+    Whole pixels by phase correlation, the rest by least squares; moved by cubic interpolation, and not at all where
+    it is off by less than a fiftieth of a pixel.
+    """
+    height, width = truth.shape[:2]
+    coarse = _whole_shift(picture, truth)
+    margin = int(np.ceil(np.abs(coarse).max())) + MARGIN_PX
+    moved = _moved(picture, coarse.astype(float))
+    shift = coarse + shift_px(moved, truth, (0, 0, width, height), margin)
+    if np.abs(shift).max() < 0.02:
+        return picture, shift, (0, 0, width, height)
+    (left, top), (right, bottom) = np.ceil(np.maximum(-shift, 0)), np.ceil(np.maximum(shift, 0))
+    return _moved(picture, shift), shift, (int(left), int(top), width - int(right), height - int(bottom))
+
+
+def _whole_shift(picture: Picture, truth: Picture) -> NDArray[np.float64]:
+    """How many whole pixels the picture lies beside its reference, (x, y); none where that makes it no closer."""
+    grey = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in (truth, picture)]
+    window = cv2.createHanningWindow(grey[0].shape[::-1], cv2.CV_32F)
+    shift = np.rint(np.array(cv2.phaseCorrelate(grey[0], grey[1], window)[0]))
+    if np.abs(shift).max() > min(grey[0].shape) / 4:
+        return np.zeros(2)
+    inside = inner_part((0, 0, *grey[0].shape[::-1]), int(np.abs(shift).max()) + 1)
+    before, after = (
+        float(np.mean((_moved(picture, s)[inside].astype(float) - truth[inside]) ** 2)) for s in (np.zeros(2), shift)
+    )
+    return shift if after < before else np.zeros(2)
+
+
+def _moved(picture: Picture, shift: NDArray[np.float64]) -> Picture:
+    back = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])
+    size = picture.shape[1], picture.shape[0]
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(picture, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+# ── what is said ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _facts(results: list[FrameResult], about: dict[str, Any]) -> dict[str, Any]:
+    methods = list(dict.fromkeys(result.method for result in results))
+    captures = list(dict.fromkeys(result.capture for result in results))
+    missing = [name for name, baseline in BASELINES.items() if not baseline.available]
+    return {
+        "case": "B: motion blur",
+        "versions": peer_versions(),
+        "matching": METHOD,
+        "margin_px": MARGIN_PX,
+        "left_out": missing if len(methods) > 1 else [],
+        "baselines": {name: baseline.title for name, baseline in BASELINES.items() if name in methods},
+        **about,
+        "frames": len({(r.capture, r.frame) for r in results}),
+        "methods": _summary(results, methods),
+        "by_capture": {c: _summary([r for r in results if r.capture == c], methods) for c in captures},
+        "first": _first(results, methods),
+        "results": [
+            {"capture": r.capture, "frame": r.frame, "method": r.method, "mse": r.mse,
+             "psnr_db": psnr_of(r.mse) if r.mse else "inf",
+             "ssim": r.ssim, "matches": r.matches, "matches_in_place": r.matches_in_place}
+            for r in results
+        ],
+    }  # fmt: skip
+
+
+def _summary(results: Sequence[FrameResult], methods: Sequence[str]) -> dict[str, Any]:
+    """Means over frames, by method; PSNR is that of the mean MSE."""
+    summary = {}
+    for method in methods:
+        own = [r for r in results if r.method == method]
+        mse = float(np.mean([r.mse for r in own]))
+        summary[method] = {
+            "mse": mse,
+            "psnr_db": psnr_of(mse) if mse else "inf",
+            "mean_frame_psnr_db": float(np.mean([psnr_of(r.mse) for r in own])) if all(r.mse for r in own) else "inf",
+            "ssim": float(np.mean([r.ssim for r in own])),
+            "matches": float(np.mean([r.matches for r in own])),
+            "matches_in_place": float(np.mean([r.matches_in_place for r in own])),
+            "frames": len(own),
+        }
+    return summary
+
+
+def _first(results: Sequence[FrameResult], methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """In what part of the frames each preset leads all other methods in PSNR, SSIM and matches at once; else by whom.
+
+    led_by: how many frames have another method level or ahead in one of the three.
+    """
+    frames: dict[tuple[str, str], dict[str, FrameResult]] = {}
+    for result in results:
+        frames.setdefault((result.capture, result.frame), {})[result.method] = result
+    first = {}
+    for ours in (method for method in OURS if method in methods):
+        ahead = [
+            [method for method, r in found.items() if method not in OURS and not _leads(found[ours], r)]
+            for found in frames.values()
+        ]
+        counts = Counter(method for names in ahead for method in names)
+        first[ours] = {"part": float(np.mean([not names for names in ahead])), "led_by": dict(counts.most_common())}
+    return first
+
+
+def _leads(own: FrameResult, other: FrameResult) -> bool:
+    return own.mse < other.mse and own.ssim > other.ssim and own.matches > other.matches
+
+
+def _text(facts: Mapping[str, Any]) -> str:
+    header = ["method", "MSE", "PSNR dB", "SSIM", "matches", "in place"]
+    parts = [
+        f"CASE B, motion blur: {facts['frames']} frames, {facts['versions']}",
+        "means over the frames; PSNR of the mean MSE",
+        _table(header, _rows(facts["methods"])),
+    ]
+    if len(facts["by_capture"]) > 1:
+        for name, part in facts["by_capture"].items():
+            parts += [f"\n{name}: {next(iter(part.values()))['frames']} frames", _table(header, _rows(part))]
+    parts += ["", *_account(facts)]
+    return "\n".join(parts)
+
+
+def _rows(summary: Mapping[str, Any]) -> list[list[str]]:
+    return [
+        [method, f"{s['mse']:.1f}", s["psnr_db"] if isinstance(s["psnr_db"], str) else f"{s['psnr_db']:.2f}",
+         f"{s['ssim']:.4f}", f"{s['matches']:.0f}", f"{s['matches_in_place']:.0f}"]
+        for method, s in summary.items()
+    ]  # fmt: skip
+
+
+def _account(facts: Mapping[str, Any]) -> list[str]:
+    """What the figures were measured on, and how."""
+    lines = []
+    for name, found in facts["first"].items():
+        led_by = ", ".join(f"{method} ({frames})" for method, frames in found["led_by"].items())
+        lines.append(f"{name}: first in PSNR, SSIM and matches at once in {100 * found['part']:.0f} % of the frames"
+                     + (f"; led in one of them by {led_by}" if led_by else ""))  # fmt: skip
+    if "pictures" in facts:
+        far = max(max(map(abs, p["shift_px"])) for p in facts["pictures"].values())
+        lines.append(f"each picture moved over its reference, by at most {far:.2f} px, and cut to what both have")
+    lines.append(f"compared inside the area with data less {facts['margin_px']} px; matches: {facts['matching']}")
+    if facts["baselines"]:
+        lines.append("baselines: true kernel at the centre, blended border, linear light unless said, the same warp as "
+                     "ours, the best of their settings on each frame by MSE against truth")  # fmt: skip
+        lines += [f"{name}: {title}" for name, title in facts["baselines"].items()]
+    lines += [f"{name}: left out, its library is not installed" for name in facts["left_out"]]
+    for s in facts.get("simulated", []):
+        lines.append(f"{s['capture']}: seed {s['seed']}, {s['width']}x{s['height']}, {s['frames']} frames, exposure "
+                     f"{s['exposure_ms'][0]:g} ms, readout {s['readout_ms']:g} ms, blur {s['blur_px']} px")  # fmt: skip
+    return lines
+
+
+def _table(header: list[str], rows: list[list[str]]) -> str:
+    """Numbers to the right: the console's table has its last two columns to the left."""
+    return table([*header, "", ""], [[*row, "", ""] for row in rows])

@@ -1,0 +1,123 @@
+"""What is judged: captures whose truth lies beside them, and what the program makes of their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest import __version__
+from virest.app.outputs import write_whole
+from virest.camera.profile import CameraProfile
+from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
+from virest.capture.video import MovieIndex, probe_movie, read_frames, read_gray
+from virest.degradation.row_motion import RowMotion, row_motion
+from virest.errors import CaptureError, OutputError
+from virest.motion.integration import integrate_gyro
+from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration, restore_frames
+from virest.restoration.frame import RestoredFrame
+from virest.restoration.settings import RestorationSettings
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class TrueCapture:
+    """A capture with sharp global-shutter pictures of its frames in truth/frames."""
+
+    name: str
+    capture: Capture
+    profile: CameraProfile
+    index: MovieIndex
+    frames: tuple[Frame, ...]
+    """Those that are judged, in order: usable ones that have a truth."""
+
+    def recorded(self) -> Iterator[tuple[Frame, Picture]]:
+        """The judged frames with their decoded pictures, RGB."""
+        wanted = {frame.index: frame for frame in self.frames}
+        for number, picture in read_frames(self.capture.movie, self.index, min(wanted), max(wanted)):
+            if number in wanted and picture is not None:
+                yield wanted[number], picture
+
+    def truth(self, number: int) -> Picture:
+        """The sharp picture of a frame, RGB."""
+        return read_picture(_truth_path(self.capture.folder, number))
+
+    def plan(self, settings: RestorationSettings, **profile: Any) -> RestorationPlan:
+        """What ``virest process`` would plan, with some of the profile's values changed."""
+        return plan_restoration(self.capture, replace(self.profile, **profile), settings, self.luma)
+
+    def restored(self, plan: RestorationPlan) -> Iterator[RestoredFrame]:
+        """What ``virest process`` makes of the judged frames."""
+        return restore_frames(self.recorded(), self.capture.imu, plan)
+
+    def motions(self, plan: RestorationPlan) -> dict[int, RowMotion]:
+        """The motion over each judged frame, as the plan has it."""
+        trajectory = integrate_gyro(self.capture.imu, plan.profile)
+        reference, known = plan.settings.reference, plan.translations or {}
+        return {
+            f.index: row_motion(trajectory, plan.profile, f.time_s, f.exposure_s, reference, known.get(f.index))
+            for f in self.frames
+        }
+
+    def luma(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """Luma of some frames, those that can be decoded."""
+        for number, picture in read_gray(self.capture.movie, self.index, numbers):
+            if picture is not None:
+                yield number, picture
+
+
+def open_true_capture(folder: Path, config: Path | None = None, chosen: slice = slice(None)) -> TrueCapture:
+    """Read a capture that ``virest simulate`` wrote; CaptureError where it has no truth for any chosen frame."""
+    capture = read_capture(folder)
+    profile, _ = resolve_profile(capture, config)
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    numbers = sorted(range(len(frames))[chosen])
+    usable = tuple(
+        frames[k] for k in numbers if frames[k].skip_reason is None and _truth_path(folder, frames[k].index).is_file()
+    )
+    if not usable:
+        raise CaptureError(
+            f"{folder}: none of {len(numbers)} chosen frames has a truth in {folder.name}/truth/frames",
+            hint="captures with truth are written by virest simulate",
+        )
+    return TrueCapture(capture.folder.resolve().name, capture, profile, probe_movie(capture.movie), usable)
+
+
+def read_picture(path: Path) -> Picture:
+    """Read an RGB picture of 8 bits."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise CaptureError(f"{path}: is no picture that can be read", hint="give PNG or JPEG files")
+    return picture[..., ::-1].astype(np.uint8)
+
+
+def _truth_path(folder: Path, number: int) -> Path:
+    return folder / "truth" / "frames" / f"{number:06d}.png"
+
+
+def peer_versions() -> str:
+    """Versions of what was compared with and measured by."""
+    try:
+        peer = f"scikit-image {version('scikit-image')}"
+    except PackageNotFoundError:
+        peer = "scikit-image not installed"
+    return f"virest {__version__}, OpenCV {cv2.__version__}, {peer}"
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Write an RGB or grey picture whole or not at all; its folder is made."""
+    done, coded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
+    if not done:
+        raise OutputError(f"{path}: the picture cannot be coded", hint="report this")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, coded.tobytes())
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror or error}", hint="check space and permissions") from error

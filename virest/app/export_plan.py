@@ -1,0 +1,297 @@
+"""What an export will hold, decided before anything is written: frames, stamps, profile, times of the samples."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.app.outputs import RunFolder, capture_name, read_lines
+from virest.camera.kalibr import ImuNoise, measure_imu_noise
+from virest.camera.profile import CameraProfile, Extensions, parse_profile
+from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile
+from virest.errors import CaptureError, OutputError
+from virest.restoration.capture import at_true_times
+
+log = logging.getLogger(__name__)
+
+FORMATS = ("euroc", "tum")
+STAMPS = ("logged", "instant")
+RECORD = "export.json"
+INSTANT_NOTE = "a picture stands for an instant"
+PLAIN_PICTURES = ("restored", "copied")
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """What an export was asked for."""
+
+    out: Path
+    """The export goes into a folder of the capture's name in here."""
+    format: str = "euroc"
+    restored: Path | None = None
+    """A finished run of ``virest process``, whose pictures stand in for the movie's."""
+    config: Path | None = None
+    frames: slice = field(default_factory=lambda: slice(None))
+    """Of the movie's frame indices."""
+    stamps: str = "logged"
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ExportFrame:
+    """One picture to be written."""
+
+    index: int
+    time_ns: int
+    """As written."""
+    exposure_s: float | None
+    picture: Path | None
+    """The restored picture; None: decode the movie's."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportPlan:
+    """Everything decided, nothing written."""
+
+    target: Path
+    capture: Capture
+    options: ExportOptions
+    frames: tuple[ExportFrame, ...]
+    left_out: dict[str, int]
+    """Frames by the reason that they are not written."""
+    profile: CameraProfile
+    """Of the written pictures and samples: their offset, shutter and stamps, not the capture's."""
+    instant_s: float
+    """From a written stamp to the instant that its picture stands for."""
+    imu_time_ns: NDArray[np.int64]
+    noise: ImuNoise | None
+    source: str
+    notes: tuple[str, ...]
+
+
+def plan_export(path: str, options: ExportOptions) -> ExportPlan:
+    """Read the capture, and the run if one is given, and decide what is written. Raises CaptureError, OutputError."""
+    folder, target = require_folder(Path(path)), options.out / capture_name(path)
+    _require_free(target, folder, options)
+    capture = read_capture(folder)
+    profile, source = resolve_profile(capture, options.config)
+    pictures: dict[int, Path] | None = None
+    left_out: dict[str, int] = {}
+    reference = "middle"
+    if options.restored is not None:
+        run = RunFolder(options.restored)
+        account = _read_account(run, capture)
+        profile, source = parse_profile(account["profile"], "run.json"), f"{options.restored.name}/run.json"
+        reference = account.get("settings", {}).get("reference", "exposure-start")
+        pictures = _restored_pictures(run, capture, left_out)
+    chosen = _choose(capture, profile, options, pictures, left_out)
+    if not chosen:
+        why = ", ".join(f"{number} {reason}" for reason, number in left_out.items()) or "--frames selects none"
+        raise CaptureError(f"{capture.name}: no frame to export: {why}", hint="see `virest inspect`")
+    instants_s = _instants_s(chosen, profile, reference)
+    frames = _stamped(chosen, capture, instants_s, options, pictures, left_out)
+    notes = _notes(capture, profile, options, instants_s)
+    for note in notes:
+        log.warning("%s: %s", capture.name, note)
+    written, instant_s = _written_profile(profile, instants_s, options)
+    written = replace(written, extensions=_written_extensions(written, frames, capture, options))
+    imu = capture.imu
+    noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
+    times = _imu_time_ns(capture, profile)
+    return ExportPlan(
+        target, capture, options, frames, left_out, written, instant_s, times, noise, source, tuple(notes)
+    )
+
+
+def _require_free(target: Path, capture: Path, options: ExportOptions) -> None:
+    """Raise OutputError where the export's place is taken by anything but an export that may be replaced."""
+    for kept in (capture, options.restored):
+        place = target.resolve()
+        if kept is not None and (place == kept.resolve() or place in kept.resolve().parents):
+            raise OutputError(f"{target}: is where {kept} lies", hint="choose another folder with --out")
+    if not target.exists() and not target.is_symlink():
+        return
+    if not (target / RECORD).is_file():
+        raise OutputError(f"{target}: exists and is no export of virest", hint="choose another folder with --out")
+    if not options.overwrite:
+        raise OutputError(f"{target}: holds an export", hint="--overwrite replaces it, --out chooses another folder")
+
+
+def _read_account(run: RunFolder, capture: Capture) -> Json:
+    """run.json of a finished run of this capture."""
+    try:
+        account = json.loads(run.run_json.read_bytes())
+    except (OSError, ValueError):
+        account = None
+    if not isinstance(account, dict) or not isinstance(account.get("profile"), dict):
+        raise CaptureError(f"{run.path}: holds no finished run", hint="pass OUT/<capture> of virest process")
+    if account.get("capture") != capture.name:
+        text = f"{run.path}: is a run of {str(account.get('capture'))[:60]!r}, not of {capture.name!r}"
+        raise CaptureError(text, hint="pass the run of this capture")
+    return account
+
+
+def _restored_pictures(run: RunFolder, capture: Capture, left_out: dict[str, int]) -> dict[int, Path]:
+    """Picture of each frame that the run has one of. Raises CaptureError where its frames are not the capture's."""
+    pictures: dict[int, Path] = {}
+    try:
+        lines = read_lines(run.parameters)
+    except (OSError, ValueError, AttributeError):
+        raise CaptureError(f"{run.parameters}: cannot be read", hint="run virest process again") from None
+    for line in lines:
+        index, status = int(line.get("frame", -1)), line.get("status")
+        known = 0 <= index < len(capture.frames)
+        if not known or line.get("timestamp_ns") != capture.frames[index].timestamp_ns:
+            text = f"{run.parameters}: frame {index} is none of {capture.name}: its stamp differs"
+            raise CaptureError(text, hint="pass the run of this capture")
+        picture = run.picture(index)
+        if status in PLAIN_PICTURES and picture.is_file():
+            pictures[index] = picture
+        else:
+            reason = str(status) if status not in PLAIN_PICTURES else "picture is missing"
+            left_out[reason] = left_out.get(reason, 0) + 1
+    return pictures
+
+
+def _choose(
+    capture: Capture,
+    profile: CameraProfile,
+    options: ExportOptions,
+    pictures: dict[int, Path] | None,
+    left_out: dict[str, int],
+) -> list[Frame]:
+    """The frames to be written: those selected and used, or those that the run has pictures of."""
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    chosen = [frames[i] for i in sorted(range(len(frames))[options.frames])]
+    if pictures is not None:
+        return [frame for frame in chosen if frame.index in pictures]
+    for frame in chosen:
+        if frame.skip_reason is not None:
+            reason = f"skipped: {', '.join(frame.skip_codes)}"
+            left_out[reason] = left_out.get(reason, 0) + 1
+    return [frame for frame in chosen if frame.skip_reason is None]
+
+
+def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> NDArray[np.float64]:
+    """(n,) seconds from each stamp to the instant that its picture stands for.
+
+    reference: ``exposure-start`` of the first row, else the middle: half the readout and half the exposure later.
+    """
+    exposures_s = np.array([np.nan if frame.exposure_s is None else frame.exposure_s for frame in frames])
+    usual_s = float(np.nanmedian(exposures_s)) if np.isfinite(exposures_s).any() else 0.0
+    exposures_s = np.where(np.isfinite(exposures_s), exposures_s, usual_s)
+    start_s = profile.shutter.first_row_start_s(np.zeros(len(frames)), exposures_s)
+    if reference == "exposure-start":
+        return np.asarray(start_s, np.float64)
+    half_s = 0.5 * (profile.shutter.readout_time_s + profile.shutter.true_exposure_s(exposures_s))
+    return np.asarray(start_s + half_s, np.float64)
+
+
+def _stamped(
+    chosen: list[Frame],
+    capture: Capture,
+    instants_s: NDArray[np.float64],
+    options: ExportOptions,
+    pictures: dict[int, Path] | None,
+    left_out: dict[str, int],
+) -> tuple[ExportFrame, ...]:
+    """The frames with the stamps that are written; those at the time of the one before (repeats) are left out."""
+    found: list[ExportFrame] = []
+    for frame, instant_s in zip(chosen, instants_s.tolist(), strict=True):
+        moved = frame.time_s != capture.frames[frame.index].time_s
+        time_ns = capture.stamp_0_ns + round(frame.time_s * 1e9) if moved else frame.timestamp_ns
+        time_ns += round(instant_s * 1e9) if options.stamps == "instant" else 0
+        if found and time_ns <= found[-1].time_ns:
+            left_out["repeats a picture"] = left_out.get("repeats a picture", 0) + 1
+            continue
+        exposure_s = None if pictures is not None else frame.exposure_s
+        found.append(ExportFrame(frame.index, time_ns, exposure_s, pictures[frame.index] if pictures else None))
+    return tuple(found)
+
+
+def _written_profile(
+    profile: CameraProfile, instants_s: NDArray[np.float64], options: ExportOptions
+) -> tuple[CameraProfile, float]:
+    """The profile of what is written, and the seconds from a written stamp to the instant of its picture.
+
+    Samples are on the camera's clock, so what was offset and skew is gone.  A restored picture has no rows and no
+    exposure; a raw one keeps both, and where its stamp is moved to its middle, the first row is half a readout before.
+    """
+    logged = options.stamps == "logged"
+    instant_s = float(np.median(instants_s)) if logged else 0.0
+    shutter, offset_s = profile.shutter, 0.0
+    if options.restored is not None:
+        shutter = replace(shutter, readout_time_s=0.0, timestamp="exposure_start")
+        offset_s = instant_s
+    elif not logged:
+        shutter = replace(shutter, timestamp="exposure_middle")
+        offset_s = -0.5 * shutter.readout_time_s
+    known = profile.time_offset_s is not None
+    estimates = {k: v for k, v in profile.estimates.items() if k not in ("time_offset_s", "clock_skew")}
+    written = replace(
+        profile,
+        shutter=shutter,
+        readout_known=profile.readout_known or options.restored is not None,
+        time_offset_s=offset_s if known else None,
+        clock_skew=0.0,
+        estimates=estimates,
+    )
+    return written, instant_s
+
+
+def _written_extensions(
+    profile: CameraProfile, frames: tuple[ExportFrame, ...], capture: Capture, options: ExportOptions
+) -> Extensions:
+    """What a diagnosis added, for these frames alone: their gains, the lamp's phase at the first of them.
+
+    Pulsing light and defocus are gone from a restored picture, and no frame is later than its stamp any more.
+    """
+    ext = profile.extensions
+    whole = options.restored is None
+    later_s = (frames[0].time_ns - capture.stamp_0_ns) / 1e9
+    return replace(
+        ext,
+        frame_lag_s=0.0,
+        frame_lag_frames=0,
+        gain=tuple(ext.gain[frame.index] for frame in frames) if ext.gain else (),
+        flicker_amplitude=ext.flicker_amplitude if whole else 0.0,
+        flicker_phase_rad=ext.flicker_phase_rad + 2.0 * math.pi * ext.flicker_frequency_hz * later_s,
+        defocus_sigma_px=ext.defocus_sigma_px if whole else 0.0,
+    )
+
+
+def _imu_time_ns(capture: Capture, profile: CameraProfile) -> NDArray[np.int64]:
+    """Times of the samples on the camera's clock, whole nanoseconds, rising."""
+    camera_s = (capture.imu.time_s - (profile.time_offset_s or 0.0)) / (1.0 + profile.clock_skew)
+    return np.asarray(capture.stamp_0_ns + np.rint(camera_s * 1e9).astype(np.int64), np.int64)
+
+
+def _notes(
+    capture: Capture, profile: CameraProfile, options: ExportOptions, instants_s: NDArray[np.float64]
+) -> list[str]:
+    """What a user of the export should know."""
+    notes = []
+    if profile.time_offset_s is None:
+        notes.append(
+            "the time offset between camera and IMU is unknown: samples keep their times; find it by `virest calibrate`"
+        )
+    if profile.intrinsics is None:
+        notes.append("the focal length is unknown: no camera calibration is written; give --config, or calibrate")
+    if not capture.imu.has_accelerometer:
+        notes.append("no accelerometer: its columns are nan, and tools can use the camera alone")
+    shift_ms = 1e3 * float(np.median(instants_s))
+    if options.stamps == "logged" and abs(shift_ms) > 1.0:
+        notes.append(
+            f"{INSTANT_NOTE} {shift_ms:.1f} ms after its stamp (timeshift_cam_imu); for tools that cannot shift times, "
+            "as ORB-SLAM3, export with --stamps instant"
+        )
+    return notes

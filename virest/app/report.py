@@ -1,0 +1,553 @@
+"""``virest report RUN_DIR``: runs and diagnoses, with pictures before and after, as one page that needs no network.
+
+RUN_DIR is the folder of one capture (run.json, diagnosis.json, or both), or one that holds several such folders.
+The pictures before are decoded from the capture's movie, which is looked for where the run found it and is taken only
+if it is that very movie, by size and sha256.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import shlex
+import stat
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from virest import __version__
+from virest.app.outputs import RunFolder, file_facts, write_whole
+from virest.capture.pictures import MOVIE_SUFFIXES
+from virest.capture.video import MovieIndex, probe_movie, read_frames
+from virest.errors import CaptureError, OutputError, VirestError
+from virest.report.html import (
+    CaptureRecord,
+    DiagnosisRecord,
+    Embedded,
+    FrameFacts,
+    RunRecord,
+    ShownFrame,
+    choose_frames,
+    embed_figure,
+    report_page,
+    show_frame,
+)
+
+log = logging.getLogger(__name__)
+
+REPORT = "report.html"
+RUN, DIAGNOSIS, EXTENDED, FIGURES = "run.json", "diagnosis.json", "extended.yaml", "figures"
+FIGURE = re.compile(r"(pictures|residuals|ladder|\d\d_[a-z_]+)\.png")
+"""What `diagnose` calls its figures; nothing else is looked at, whatever a diagnosis.json names."""
+FRAMES_SHOWN, MOST_FRAMES = 6, 24
+"""Of one capture, and of all captures of a page together, where no number is asked for."""
+PICTURE_BYTES = 4_200_000
+"""All frames of a page together, as text; with the figures that keeps a page below some 6 MB."""
+MAX_ACCOUNT_BYTES, MAX_PROFILE_BYTES, MAX_PICTURE_BYTES = 64 << 20, 1 << 20, 256 << 20
+MAX_COUNT, MAX_STAMP_NS = 10**9, 1 << 61
+PARTLY_FAILED = 9
+ONLY_AFTER = "the pictures before are not shown"
+
+Json = dict[str, Any]
+Model = TypeVar("Model", bound=BaseModel)
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class ReportOptions:
+    """What one ``virest report`` was asked for, beside the folder."""
+
+    out: Path | None = None
+    """RUN_DIR/report.html where it is None."""
+    frames: int | None = None
+    """How many to show of each capture."""
+    capture: Path | None = None
+    """The capture's folder, or one that holds the captures, where they are no longer where the run found them."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ReportOutcome:
+    """What came of it."""
+
+    facts: Json
+    text: str
+    exit_code: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Movie:
+    """The movie of a run, ready to be decoded."""
+
+    path: Path
+    index: MovieIndex
+
+
+# ── what run.json, parameters.jsonl and diagnosis.json have to hold ──────────────────────────────────────────────
+
+
+class _Lenient(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=False)
+
+
+_Count = Annotated[int, Field(ge=0, le=MAX_COUNT)]
+
+
+class _Input(_Lenient):
+    file: str
+    bytes: int
+    sha256: str
+
+
+class _Account(_Lenient):
+    virest_run: int
+    capture: str
+    folder: str | None = None
+    movie: str | None = None
+    version: str = ""
+    command: str = ""
+    profile: dict[str, Any] = Field(default_factory=dict)
+    profile_source: str = ""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    inputs: list[_Input] = Field(default_factory=list)
+    counts: dict[str, _Count]
+    verdict: str
+    warnings: list[str] = Field(default_factory=list)
+
+
+class _Tile(_Lenient):
+    centre_px: tuple[float, float]
+    angle_rad: float
+    length_px: float
+
+
+class _Blur(_Lenient):
+    length_px: float | None = None
+    tiles: list[_Tile] = Field(default_factory=list)
+
+
+class _Motion(_Lenient):
+    rate_rad_s: tuple[float, float, float] | None = None
+    velocity_m_s: tuple[float, float, float] | None = None
+
+
+class _Shutter(_Lenient):
+    max_displacement_px: float | None = None
+
+
+class _Deblur(_Lenient):
+    method: str = "none"
+    expected_gain_db: float | None = None
+    noise_grey_levels: float | None = None
+
+
+class _Line(_Lenient):
+    frame: _Count
+    timestamp_ns: int = Field(ge=-MAX_STAMP_NS, le=MAX_STAMP_NS)
+    status: str = Field(pattern="^(restored|copied|skipped|failed)$")
+    exposure_s: float | None = None
+    output: str | None = None
+    warnings: list[str] = Field(default_factory=list)
+    depth_m: float | str | None = None
+    motion: _Motion | None = None
+    blur: _Blur | None = None
+    shutter: _Shutter | None = None
+    deblur: _Deblur | None = None
+    valid_px: tuple[int, int, int, int] | None = None
+
+
+class _Change(_Lenient):
+    nominal: Any = None
+    estimate: Any = None
+    std: Any = None
+
+
+class _HeldOut(_Lenient):
+    quantity: str = ""
+    before: float | str | None = None
+    after: float | str | None = None
+    gain: float | None = None
+
+
+class _Rival(_Lenient):
+    name: str
+    held_out_after: float | str | None = None
+
+
+class _Cause(_Lenient):
+    name: str
+    sentence: str = ""
+    parameters: dict[str, _Change] = Field(default_factory=dict)
+    held_out: _HeldOut = Field(default_factory=_HeldOut)
+    rivals: list[_Rival] = Field(default_factory=list)
+
+
+class _Diagnosis(_Lenient):
+    schema_: str = Field(alias="schema", pattern="^virest/diagnosis/")
+    verdict: str
+    nominal: dict[str, float | str | None] = Field(default_factory=dict)
+    causes: list[_Cause] = Field(default_factory=list)
+    unexplained: dict[str, float | str | None] = Field(default_factory=dict)
+    restoration_gain: dict[str, Any] = Field(default_factory=dict)
+
+
+# ── the command ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def write_report(run_dir: Path, options: ReportOptions) -> ReportOutcome:
+    """Read what stands in RUN_DIR and write the page.
+
+    Raises CaptureError where there is nothing to report, OutputError where the page is in the way or cannot be
+    written.  Of several captures, those that cannot be read are named, left out, and lead to exit code 9.
+    """
+    target = options.out or run_dir / REPORT
+    _require_dir(run_dir)
+    _require_target(target, options.overwrite)
+    folders = find_folders(run_dir)
+    records, failures = [], []
+    for folder in folders:
+        try:
+            records.append(read_folder(folder, options, len(folders)))
+        except CaptureError as error:
+            if len(folders) == 1:
+                raise
+            failures.append({"folder": str(folder), "error": str(error)})
+            log.error("%s", error)
+    if not records:
+        raise CaptureError(f"{run_dir}: none of its {len(folders)} runs can be read", hint="see the lines above")
+    page = report_page(records, __version__).encode("utf-8", "backslashreplace")
+    write_whole(target, page)
+    facts = _facts(target, len(page), records, failures)
+    return ReportOutcome(facts, _describe(facts), PARTLY_FAILED if failures else 0)
+
+
+def _require_dir(run_dir: Path) -> None:
+    if not run_dir.is_dir():
+        what = "is no folder" if run_dir.exists() else "no such folder"
+        raise CaptureError(f"{run_dir}: {what}", hint="pass OUT/<capture> of a run, or OUT itself")
+
+
+def _require_target(target: Path, overwrite: bool) -> None:
+    """Raise OutputError, before any work, for what stands in the page's place."""
+    if target.is_dir():
+        raise OutputError(f"{target}: is a folder", hint="--out takes a file")
+    if not target.parent.is_dir():
+        raise OutputError(f"{target.parent}: no such folder", hint="make it, or choose another place with --out")
+    if (target.exists() or target.is_symlink()) and not overwrite:
+        raise OutputError(f"{target}: exists", hint="--overwrite replaces it, --out chooses another place")
+
+
+def find_folders(run_dir: Path) -> list[Path]:
+    """The folder itself where it holds a run or a diagnosis, else those of its folders that do."""
+    try:
+        inside = sorted(path for path in run_dir.iterdir() if path.is_dir())
+    except OSError as error:
+        raise CaptureError(f"{run_dir}: {error.strerror}", hint="check its permissions") from None
+    if _holds_results(run_dir):
+        return [run_dir]
+    found = [path for path in inside if _holds_results(path)]
+    if found:
+        return found
+    if any((path / ".run").exists() for path in (run_dir, *inside)):
+        raise CaptureError(f"{run_dir}: its run is not finished", hint="finish it with virest process --resume")
+    raise CaptureError(
+        f"{run_dir}: neither {RUN} nor {DIAGNOSIS}, here or one folder below",
+        hint="pass OUT/<capture> of a run, or OUT itself",
+    )
+
+
+def _holds_results(folder: Path) -> bool:
+    return any((folder / name).exists() for name in (RUN, DIAGNOSIS))
+
+
+def read_folder(folder: Path, options: ReportOptions, among: int) -> CaptureRecord:
+    """All that stands in the folder of one capture, its share of the page's bytes given by ``among`` how many."""
+    run = _read_run(folder, options, among) if (folder / RUN).exists() else None
+    diagnosis = _read_diagnosis(folder) if (folder / DIAGNOSIS).exists() else None
+    name = str(run.account["capture"]) if run else folder.resolve().name
+    return CaptureRecord(name, run, diagnosis)
+
+
+# ── files of unknown origin ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def _read_bytes(path: Path, limit: int) -> bytes:
+    """The content of a plain file of bounded size. Raises CaptureError."""
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
+            raise CaptureError(
+                f"{path}: is no plain file of at most {limit >> 20} MB", hint="was it written by virest?"
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"{path}: {error.strerror}", hint="run virest process again") from None
+
+
+def _read_model(path: Path, model: type[Model], kind: str) -> Model:
+    """A JSON file, checked. Raises CaptureError with the first thing that is wrong."""
+    try:
+        return model.model_validate(json.loads(_read_bytes(path, MAX_ACCOUNT_BYTES)))
+    except ValidationError as error:
+        raise CaptureError(
+            f"{path}: {_complaint(error)}: this is no {kind}", hint="was it written by virest?"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{path}: is no JSON ({error})", hint="run the command that wrote it again") from None
+
+
+def _complaint(error: ValidationError) -> str:
+    first = error.errors(include_url=False, include_input=False)[0]
+    place = ".".join(str(part) for part in first["loc"])
+    return f"{place + ': ' if place else ''}{first['msg'].lower()}"
+
+
+def _read_lines(folder: Path, expected: int) -> tuple[dict[int, FrameFacts], list[str]]:
+    """What the lines of parameters.jsonl tell, by line number, and a note where some cannot be read.
+
+    Tiles are not kept, a long run has millions; those of the frames shown are read again.
+    """
+    path = folder / "parameters.jsonl"
+    frames: dict[int, FrameFacts] = {}
+    bad: list[int] = []
+    for number, text in _numbered(path):
+        try:
+            frames[number] = _frame_facts(_Line.model_validate_json(text))
+        except ValidationError:
+            bad.append(number)
+    if not frames and (expected or bad):
+        raise CaptureError(f"{path}: none of its {len(bad)} lines can be read", hint="run virest process again")
+    notes = []
+    if bad or len(frames) != expected:
+        which = f"; line {bad[0]} is the first that cannot be read" if bad else ""
+        notes.append(f"parameters.jsonl tells of {len(frames)} of {expected} frames{which}: the page shows those only.")
+        log.warning("%s: %s", folder.name, notes[0])
+    return frames, notes
+
+
+def _read_tiles(folder: Path, numbers: set[int]) -> dict[int, list[_Tile]]:
+    """The tiles of the frames on these lines, by frame."""
+    lines = (_Line.model_validate_json(text) for n, text in _numbered(folder / "parameters.jsonl") if n in numbers)
+    return {line.frame: line.blur.tiles if line.blur else [] for line in lines}
+
+
+def _numbered(path: Path) -> Iterator[tuple[int, bytes]]:
+    try:
+        with path.open("rb") as file:
+            yield from ((number, text) for number, text in enumerate(file, start=1) if text.strip())
+    except OSError as error:
+        raise CaptureError(f"{path}: {error.strerror}", hint="run virest process again") from None
+
+
+# ── a run ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
+    account = _read_model(folder / RUN, _Account, "account of a run")
+    by_line, notes = _read_lines(folder, sum(account.counts.values()))
+    frames = list(by_line.values())
+    chosen = choose_frames(frames, options.frames or max(1, min(FRAMES_SHOWN, MOST_FRAMES // among)))
+    numbers = {facts.frame for facts in chosen}
+    tiles = _read_tiles(folder, {n for n, facts in by_line.items() if facts.frame in numbers})
+    movie, complaint = find_movie(account, folder, options.capture)
+    notes += [complaint] if complaint else []
+    shown = [_show(folder, facts, tiles[facts.frame], movie, PICTURE_BYTES // among // len(chosen)) for facts in chosen]
+    return RunRecord(account.model_dump(), frames, shown, tuple(notes))
+
+
+def _frame_facts(line: _Line) -> FrameFacts:
+    blur, motion = line.blur or _Blur(), line.motion or _Motion()
+    shutter, deblur = line.shutter or _Shutter(), line.deblur or _Deblur()
+    velocity = motion.velocity_m_s
+    return FrameFacts(
+        frame=line.frame,
+        timestamp_ns=line.timestamp_ns,
+        state=line.status,
+        warnings=tuple(line.warnings),
+        exposure_s=line.exposure_s,
+        blur_px=blur.length_px,
+        longest_blur_px=max((tile.length_px for tile in blur.tiles), default=blur.length_px),
+        rate_rad_s=motion.rate_rad_s,
+        shift_px=shutter.max_displacement_px,
+        depth_m=line.depth_m if isinstance(line.depth_m, float) else None,
+        speed_m_s=None if velocity is None else float(np.hypot.reduce(velocity)),
+        gain_db=deblur.expected_gain_db,
+        noise_levels=deblur.noise_grey_levels,
+        deblurred=deblur.method != "none",
+        valid_px=line.valid_px,
+    )
+
+
+def _show(folder: Path, facts: FrameFacts, tiles: Sequence[_Tile], movie: _Movie | None, max_bytes: int) -> ShownFrame:
+    """A frame with its pictures before and after; one that was copied has no after."""
+    before = None if movie is None else _recorded(movie, facts.frame)
+    after = None
+    if facts.state == "restored" or (facts.state == "copied" and before is None):
+        after = read_picture(RunFolder(folder).picture(facts.frame))
+    picture = after if after is not None else before
+    size = (1, 1) if picture is None else (picture.shape[1], picture.shape[0])
+    columns = [(*tile.centre_px, tile.angle_rad, tile.length_px) for tile in tiles]
+    return show_frame(facts, before, after, columns, size, max_bytes)
+
+
+def _recorded(movie: _Movie, frame: int) -> Picture | None:
+    """A frame of the movie; None where it cannot be decoded."""
+    try:
+        found = read_frames(movie.path, movie.index, frame, frame)
+        return next((picture for number, picture in found if number == frame), None)
+    except VirestError as error:
+        log.warning("%s: frame %d: %s", movie.path, frame, error.message)
+        return None
+
+
+def read_picture(path: Path) -> Picture | None:
+    """An RGB picture of 8 bits; None, and a warning, where it cannot be read."""
+    try:
+        data = np.frombuffer(_read_bytes(path, MAX_PICTURE_BYTES), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    except (CaptureError, cv2.error) as error:
+        log.warning("%s", str(error).strip().splitlines()[-1])
+        return None
+    if picture is None:
+        log.warning("%s: is no picture", path)
+    return None if picture is None else np.asarray(picture, np.uint8)
+
+
+# ── where the movie is ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def find_movie(account: _Account, folder: Path, hint: Path | None) -> tuple[_Movie | None, str]:
+    """The movie (or list or folder of pictures) from which the run was made, or None and what to say of that.
+
+    A file is taken only if size and sha256 are those in run.json.
+    """
+    names = _movie_names(account)
+    if not names:
+        return None, f"The run does not say which movie it was made from; {ONLY_AFTER}."
+    facts = {item.file: item for item in account.inputs}
+    other = None
+    for path in dict.fromkeys(place / name for place in _places(account, folder, hint) for name in names):
+        with suppress(OSError, ValueError, VirestError):
+            if path.is_dir() or _is_same(path, facts.get(path.name)):
+                return _Movie(path, probe_movie(path)), ""
+            other = other or (path if path.exists() else None)
+    if other is not None:
+        return None, f"{other} is not the movie that the run was made from; {ONLY_AFTER}."
+    return None, f"The capture's movie was not found (--capture says where it is); {ONLY_AFTER}."
+
+
+def _is_same(path: Path, known: _Input | None) -> bool:
+    if known is None or not path.is_file() or path.stat().st_size != known.bytes:
+        return False
+    return bool(file_facts(path)["sha256"] == known.sha256)
+
+
+def _movie_names(account: _Account) -> list[str]:
+    """Where the movie may lie inside the capture's folder: as run.json says, else each input that is named as one."""
+    if account.folder and account.movie:
+        return [os.path.relpath(account.movie, account.folder)]
+    return [item.file for item in account.inputs if Path(item.file).suffix.lower() in MOVIE_SUFFIXES]
+
+
+def _places(account: _Account, folder: Path, hint: Path | None) -> Iterator[Path]:
+    """Folders in which the capture may lie, the likeliest first."""
+    if hint is not None:
+        yield from (hint, hint / folder.resolve().name)
+        return
+    if account.folder:
+        yield Path(account.folder)
+    source = Path(account.profile_source)
+    if source.is_absolute():
+        yield source.parent
+    with suppress(ValueError):
+        for word in shlex.split(account.command)[2:]:
+            path = Path(word)
+            if path.name == account.capture or word == ".":
+                yield from (path, folder.resolve().parent / path, folder.resolve().parent.parent / path)
+
+
+# ── a diagnosis ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _read_diagnosis(folder: Path) -> DiagnosisRecord:
+    checked = _read_model(folder / DIAGNOSIS, _Diagnosis, "diagnosis")
+    profile = ""
+    with suppress(CaptureError):
+        profile = _read_bytes(folder / EXTENDED, MAX_PROFILE_BYTES).decode("utf-8", "replace")
+    return DiagnosisRecord(checked.model_dump(), list(_figures(folder / FIGURES)), profile)
+
+
+def _figures(folder: Path) -> Iterator[tuple[str, Embedded]]:
+    """The diagnosis's figures: what the causes do to pictures and residuals first, then the ladder."""
+    order = ("residuals.png", "pictures.png")
+    names = [path.name for path in _inside(folder) if FIGURE.fullmatch(path.name)]
+    for name in sorted(names, key=lambda n: (order.index(n) if n in order else len(order), n)):
+        picture = read_picture(folder / name)
+        if picture is not None:
+            yield name.removesuffix(".png"), embed_figure(picture)
+
+
+def _inside(folder: Path) -> Iterable[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return ()
+
+
+# ── what the command says ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _facts(target: Path, size: int, records: Sequence[CaptureRecord], failures: list[Json]) -> Json:
+    captures = [_capture_facts(record) for record in records]
+    counted: dict[str, int] = {}
+    for capture in captures:
+        for state, count in (capture["counts"] or {}).items():
+            counted[state] = counted.get(state, 0) + count
+    verdicts = list(dict.fromkeys(capture["verdict"] for capture in captures if capture["verdict"] is not None))
+    return {
+        "path": str(target),
+        "bytes": size,
+        "verdict": verdicts[0] if len(verdicts) == 1 else verdicts or None,
+        "counts": counted or None,
+        "captures": captures,
+        "failed": failures,
+    }
+
+
+def _capture_facts(record: CaptureRecord) -> Json:
+    run, diagnosis = record.run, record.diagnosis
+    return {
+        "capture": record.name,
+        "verdict": run.account["verdict"] if run else None,
+        "counts": run.account["counts"] if run else None,
+        "frames_shown": [frame.facts.frame for frame in run.shown] if run else [],
+        "recorded_shown": bool(run and any(frame.before for frame in run.shown)),
+        "diagnosis": diagnosis.facts["verdict"] if diagnosis else None,
+        "causes": [cause["name"] for cause in diagnosis.facts["causes"]] if diagnosis else [],
+        "notes": list(run.notes) if run else [],
+    }
+
+
+def _describe(facts: Json) -> str:
+    lines = []
+    for capture in facts["captures"]:
+        parts = []
+        if capture["counts"] is not None:
+            counted = ", ".join(f"{count} {state}" for state, count in capture["counts"].items() if count)
+            parts.append(f"{capture['verdict']} ({counted or 'no frames'})")
+        if capture["diagnosis"] is not None:
+            named = ", ".join(capture["causes"])
+            parts.append(f"diagnosis {capture['diagnosis']}{f' ({named})' if named else ''}")
+        lines.append(f"{capture['capture']}: {'; '.join(parts)}")
+        lines += [f"{capture['capture']}: {note}" for note in capture["notes"]]
+    lines.append(f"wrote {facts['path']}, {facts['bytes'] / 1e6:.1f} MB")
+    return "\n".join(" ".join(line.split()) for line in lines)

@@ -1,0 +1,110 @@
+"""What kind of recording a folder holds, told by its files and their headers, never by a name or a version.
+
+EuRoC / ASL       mav0/ with cam*/data.csv and imu0/data.csv; the sequence, its mav0, or one camera of it
+ARKit app         frames.csv, imu.csv and the movie
+MARSLogger, iOS   movie_metadata.csv with `exposure duration`, or raw_accel_gyro.csv, and the movie
+Gyroflow          a .gcsv beside the movie
+MARSLogger        movie.mp4, gyro_accel.csv, …
+pictures          pictures with stamps, gyro_accel.csv or imu.csv
+telemetry         nothing but a movie: GoPro, Sony, Insta360 keep the samples inside
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from virest.capture.euroc import LIST, find_euroc, read_euroc, read_imu_rows
+from virest.capture.gyroflow import GCSV, read_gyroflow
+from virest.capture.marslogger_android import (
+    IOS_ARKIT,
+    IOS_METADATA,
+    identify,
+    read_edge_epochs,
+    read_frame_timestamps,
+    read_gyro_accel,
+    read_movie_metadata,
+)
+from virest.capture.marslogger_folder import read_marslogger
+from virest.capture.marslogger_ios import ARKIT_FRAMES, ARKIT_IMU, RAW_GYRO, read_ios_arkit, read_ios_marslogger
+from virest.capture.picture_folder import IMU_FILES, read_picture_folder
+from virest.capture.pictures import MOVIE_SUFFIXES, find_picture_source
+from virest.capture.records import Note
+from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source, list_names
+from virest.capture.telemetry import read_telemetry
+from virest.capture.video import probe_movie
+from virest.errors import CaptureError
+
+Reader = Callable[[Path, list[Note]], Source]
+HEAD_BYTES = 4096
+HINT = "pass a capture's folder: MARSLogger's, EuRoC's, pictures with stamps, a movie with a .gcsv or telemetry inside"
+
+
+def read_source(folder: Path, notes: list[Note]) -> Source:
+    """Read a folder with the reader of its kind. Raises CaptureError where no kind fits or a file cannot be used."""
+    return choose_reader(folder)(folder, notes)
+
+
+def choose_reader(folder: Path) -> Reader:
+    """The reader of the folder's kind. Raises CaptureError, saying what is there, if it is of none."""
+    names = list_names(folder)
+    reader = _choose(folder, set(names))
+    if reader is not None:
+        return reader
+    shown = ", ".join(names[:6]) or "nothing"
+    text = f"{folder.name}: holds no {MOVIE} and no {GYRO} (but {shown})"
+    raise CaptureError(text, hint=HINT)
+
+
+def is_capture(folder: Path) -> bool:
+    """Whether a folder looks like a capture of any kind."""
+    try:
+        return folder.is_dir() and _choose(folder, set(list_names(folder))) is not None
+    except (CaptureError, OSError, ValueError):
+        return False
+
+
+def partial_readers(folder: Path) -> dict[Path, Callable[[Path], Any]]:
+    """Readers of the single files of a folder that cannot be used as a whole, to say what there is."""
+    try:
+        reader = _choose(folder, set(list_names(folder)))
+    except CaptureError:
+        reader = None
+    place = find_euroc(folder)
+    if reader is read_euroc and place is not None:
+        return {place.pictures: probe_movie, place.imu / LIST: read_imu_rows}
+    if reader in (read_gyroflow, read_telemetry, read_picture_folder, read_ios_marslogger, read_ios_arkit):
+        movies = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOVIE_SUFFIXES]
+        return dict.fromkeys(movies, probe_movie)
+    tables = {MOVIE: probe_movie, STAMPS: read_frame_timestamps, METADATA: read_movie_metadata, GYRO: read_gyro_accel}
+    return {folder / name: read for name, read in (tables | {EPOCHS: read_edge_epochs}).items()}
+
+
+def _choose(folder: Path, names: set[str]) -> Reader | None:
+    if find_euroc(folder) is not None:
+        return read_euroc
+    if {ARKIT_FRAMES, ARKIT_IMU} & names and IOS_ARKIT in (_kind(folder, ARKIT_FRAMES), _kind(folder, ARKIT_IMU)):
+        return read_ios_arkit
+    if RAW_GYRO in names or (METADATA in names and _kind(folder, METADATA) == IOS_METADATA):
+        return read_ios_marslogger
+    movies = [name for name in names if Path(name).suffix.lower() in MOVIE_SUFFIXES]
+    if any(name.lower().endswith(GCSV) for name in names) and GYRO not in names:
+        return read_gyroflow
+    if MOVIE not in names and set(IMU_FILES) & names and find_picture_source(folder) is not None:
+        return read_picture_folder
+    if len(movies) == 1 and not {GYRO, STAMPS, METADATA, EPOCHS} & names:
+        return read_telemetry
+    return read_marslogger if {MOVIE, GYRO} & names else None
+
+
+def _kind(folder: Path, name: str) -> str:
+    """What a file's first lines say that it is, '' if they cannot be read."""
+    path = folder / name
+    try:
+        if not path.is_file():
+            return ""
+        with path.open("rb") as stream:
+            return identify(stream.read(HEAD_BYTES).decode("utf-8-sig", errors="replace"))
+    except (OSError, ValueError):
+        return ""

@@ -1,0 +1,75 @@
+"""What a reader of one kind of recording hands on: the same tables for every kind, and the names of their files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from virest.camera.profile import CameraProfile
+from virest.capture.files import is_present, label
+from virest.capture.pictures import MOVIE_SUFFIXES
+from virest.capture.tables import EdgeEpochs, GyroTable, MetadataTable, StampTable
+from virest.capture.video import MovieIndex
+from virest.errors import CaptureError, VideoError
+
+MOVIE, STAMPS, METADATA = "movie.mp4", "frame_timestamps.txt", "movie_metadata.csv"
+GYRO, EPOCHS, UNFINISHED = "gyro_accel.csv", "edge_epochs.txt", ".marslogger_recording_in_progress"
+ONE_CLOCK = "one clock"
+ORIGIN_NS = 1_000_000_000_000
+"""Stamp of the first frame where a recording has no clock but its own beginning: 1000 s, so that none is negative."""
+
+
+@dataclass(frozen=True, slots=True)
+class FileNames:
+    """What messages call the files."""
+
+    movie: str = MOVIE
+    stamps: str = STAMPS
+    metadata: str = METADATA
+    gyro: str = GYRO
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A recording, read and not yet joined."""
+
+    kind: str
+    """Such as ``MARSLogger`` or ``EuRoC``."""
+    movie_path: Path
+    """The movie, the list of pictures, or the folder of pictures."""
+    movie: MovieIndex
+    gyro: GyroTable
+    stamps: StampTable | None
+    metadata: MetadataTable | None
+    epochs: EdgeEpochs
+    names: FileNames = FileNames()
+    profile: CameraProfile | None = None
+    """What the recorder says of camera and axes; None: nothing beyond the metadata."""
+    inputs: tuple[Path, ...] = ()
+    """Files that were read."""
+
+
+def list_names(folder: Path) -> list[str]:
+    """Names in a folder, sorted. Raises CaptureError where it cannot be listed."""
+    try:
+        return sorted(entry.name for entry in folder.iterdir())
+    except OSError as fault:
+        raise CaptureError(f"{folder.name}: {fault.strerror}", hint="check the folder's permissions") from None
+
+
+def find_movie(folder: Path, stem: str | None = None) -> Path:
+    """The folder's movie: movie.mp4, else the one named ``stem``, else the only one. Raises VideoError."""
+    names = [name for name in list_names(folder) if Path(name).suffix.lower() in MOVIE_SUFFIXES]
+    for name in names:
+        if (stem is None and name == MOVIE) or (stem is not None and Path(name).stem.lower() == stem.lower()):
+            return folder / name
+    if len(names) == 1:
+        return folder / names[0]
+    shown = ", ".join(names[:4]) if names else "no movie"
+    hint = "leave one movie in the folder" if names else "copy the movie into the capture's folder"
+    raise VideoError(f"{label(folder)}: holds {shown}; a capture needs one movie", hint=hint)
+
+
+def present(folder: Path, *names: str) -> tuple[Path, ...]:
+    """Those of the names that stand in the folder."""
+    return tuple(folder / name for name in names if is_present(folder / name))

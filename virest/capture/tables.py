@@ -1,0 +1,345 @@
+"""Tables of text: rows in, columns out, whatever recorder wrote them; what is dropped is counted by its reason.
+
+Times are whole nanoseconds and stay int64: seconds with decimals are split at the point, never sent through a float.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from virest.capture.files import label, scan_text
+from virest.errors import CaptureError, ClockError, ImuError
+
+ROWS_AT_ONCE = 100_000
+MAX_FIELDS = 16
+MANY_FIELDS = 64
+MAX_RATE_RAD_S = 200.0
+"""Phone gyroscopes end at 35 rad/s (2000 °/s); beyond this a row is damage, not motion."""
+
+Int64 = NDArray[np.int64]
+Float64 = NDArray[np.float64]
+
+INTEGER = re.compile(r"[+-]?(?:\d{1,18}|[0-8]\d{18}|9[01]\d{17})")
+"""A whole number that fits in 64 bits; Unix nanoseconds have 19 digits."""
+DAMAGED_TIME = r"[+-]?(?:\d+[.,]\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)"
+EXCEL_HINT = "a spreadsheet has re-saved the file and lost the nanoseconds; copy the original from the phone again"
+
+
+@dataclass(frozen=True, slots=True)
+class GyroTable:
+    """Inertial samples as a recorder wrote them (gyro_accel.csv, imu0/data.csv, …), strictly rising."""
+
+    time_ns: Int64
+    """(n,) IMU clock."""
+    gyro_rad_s: Float64
+    """(n, 3), no NaN."""
+    accel_m_s2: Float64
+    """(n, 3), NaN where there is none."""
+    rows: int
+    """Data rows read, dropped ones included."""
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class MetadataTable:
+    """What was logged for each frame (movie_metadata.csv), strictly rising; NaN: ``null``, absent or implausible."""
+
+    time_ns: Int64
+    """(n,) camera clock."""
+    fx_px: Float64
+    """(n,) along the sensor's long axis; NaN for the logger's 1.0 = unknown."""
+    fy_px: Float64
+    exposure_s: Float64
+    readout_time_s: Float64
+    iso: Float64
+    focal_length_mm: Float64
+    unix_ns: Int64 | None
+    """(n,) when the capture result came, 0 where unreadable; None: no such column."""
+    rows: int
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class StampTable:
+    """Times of the frames (frame_timestamps.txt), strictly rising."""
+
+    time_ns: Int64
+    """(n,) camera clock; MARSLogger's are whole microseconds."""
+    unix_ns: Int64 | None
+    """(n,) when the encoder handed the frame over, 0 where unreadable; None: no such column."""
+    rows: int
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeEpochs:
+    """The camera's clock against the IMU's (edge_epochs.txt)."""
+
+    source: str
+    """``REALTIME``, ``UNKNOWN`` or ``not logged``; ``one clock`` where the format has only one."""
+    differences_ns: tuple[int, ...]
+    """IMU clock − camera clock, one a row."""
+
+    @property
+    def mean_difference_ns(self) -> int | None:
+        """Mean over the rows, None without rows."""
+        return round(sum(self.differences_ns) / len(self.differences_ns)) if self.differences_ns else None
+
+
+def text_chunks(path: Path, separator: str = ",", fields: int = MAX_FIELDS) -> Iterator[pd.DataFrame]:
+    r"""The file's fields as text, ``fields`` columns, a bounded number of rows at once; absent fields are ''.
+
+    separator: a comma, or ``\s+`` for any white space.
+    """
+    options: dict[str, Any] = {
+        "header": None,
+        "sep": separator,
+        "names": list(range(fields)),
+        "index_col": False,
+        "dtype": str,
+        "keep_default_na": False,
+        "na_filter": False,
+        "quoting": 3,
+        "skipinitialspace": True,
+        "skip_blank_lines": False,
+        "encoding": "utf-8-sig",
+        "encoding_errors": "replace",
+        "on_bad_lines": "skip",
+        "chunksize": ROWS_AT_ONCE,
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pd.errors.ParserWarning)
+        try:
+            with pd.read_csv(path, **options) as reader:
+                for chunk in reader:
+                    yield chunk.fillna("")
+        except pd.errors.EmptyDataError:
+            return
+        except (pd.errors.ParserError, OSError) as fault:
+            raise CaptureError(f"{label(path)}: {fault}", hint="copy the logger's file again") from None
+
+
+def numbers(column: Any) -> Float64:
+    """Text to float64; ``null``, text and infinities become NaN."""
+    values = pd.to_numeric(column.str.strip(), errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def whole_numbers(column: Any) -> Int64:
+    """Text to int64, exactly; 0 where it is no whole number."""
+    text = column.str.strip()
+    whole = text.str.fullmatch(INTEGER).to_numpy()
+    values = np.zeros(len(text), np.int64)
+    values[whole] = text[whole].astype("int64").to_numpy()
+    return values
+
+
+def strictly_rising(times: Int64) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """Mask of rows to keep so that times rise strictly, and how many were equal or fell.
+
+    The first of equal times stays.  A single time far ahead of its successors is dropped alone: where dropping what
+    falls would cost more rows, the longest rising subsequence is kept.
+    """
+    keep = np.ones(len(times), bool)
+    if len(times) < 2:
+        return keep, {}
+    keep[1:] = np.diff(times) != 0
+    equal = int((~keep).sum())
+    rows = np.flatnonzero(keep)
+    fresh = times[rows]
+    rising = np.concatenate([[True], fresh[1:] > np.maximum.accumulate(fresh)[:-1]])
+    if not rising.all():
+        longest = _longest_rising(fresh)
+        if longest.sum() > rising.sum():
+            rising = longest
+    keep[rows] = rising
+    counts = {"time equals its predecessor's": equal, "time falls or leaps": int((~rising).sum())}
+    return keep, {reason: count for reason, count in counts.items() if count}
+
+
+def _longest_rising(values: Int64) -> NDArray[np.bool_]:
+    """Mask of a longest strictly rising subsequence (patience sorting)."""
+    tails: list[int] = []
+    tail_rows: list[int] = []
+    parent = np.full(len(values), -1, np.int64)
+    for row, value in enumerate(values.tolist()):
+        place = bisect_left(tails, value)
+        if place:
+            parent[row] = tail_rows[place - 1]
+        if place == len(tails):
+            tails.append(value)
+            tail_rows.append(row)
+        else:
+            tails[place], tail_rows[place] = value, row
+    mask = np.zeros(len(values), bool)
+    row = tail_rows[-1] if tail_rows else -1
+    while row >= 0:
+        mask[row] = True
+        row = int(parent[row])
+    return mask
+
+
+def keep_rising(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.bool_]:
+    """The mask of :func:`strictly_rising`, its losses counted. Raises ClockError where most rows would go."""
+    keep, lost = strictly_rising(times)
+    if len(times) > 2 and keep.sum() * 2 <= len(times):
+        raise ClockError(
+            f"{label(path)}: only {int(keep.sum())} of {len(times)} times rise "
+            f"({', '.join(f'{n} {reason}' for reason, n in lost.items())})",
+            hint=EXCEL_HINT,
+        )
+    dropped.update(lost)
+    return keep
+
+
+# ── any table of numbers ─────────────────────────────────────────────────────────────────────────────────────────
+
+Times = Callable[[Any, Path], tuple[Int64, NDArray[np.bool_]]]
+"""Text of the first column to (whole nanoseconds, which rows have a time)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """A table of numbers with a time in front."""
+
+    time_ns: Int64
+    """(n,) strictly rising."""
+    values: Float64
+    """(n, columns) NaN where a field is empty or no number."""
+    rows: int
+    dropped: dict[str, int]
+
+
+def exact_times_ns(text: Any, path: Path, *, whole_are_seconds: bool = False) -> tuple[Int64, NDArray[np.bool_]]:
+    """Whole nanoseconds of times written as such, or as seconds with decimals; cut, not rounded, below one.
+
+    Raises ClockError for exponents, which a spreadsheet writes after it has lost the nanoseconds.
+    """
+    text = text.str.strip()
+    spoilt = text.str.fullmatch(r"[+-]?\d+(?:[.,]\d*)?[eE][+-]?\d+").to_numpy()
+    if spoilt.any():
+        raise ClockError(f"{label(path)}: time '{text[spoilt].iloc[0][:40]}' has lost its digits", hint=EXCEL_HINT)
+    whole = text.str.fullmatch(INTEGER).to_numpy()
+    decimal = text.str.fullmatch(r"\d{1,9}\.\d*|1\d{9}\.\d*").to_numpy()
+    times = np.zeros(len(text), np.int64)
+    if whole_are_seconds:
+        decimal, whole = decimal | text.str.fullmatch(r"\d{1,9}|1\d{9}").to_numpy(), np.zeros(len(text), bool)
+    times[whole] = text[whole].astype("int64").to_numpy()
+    if decimal.any():
+        parts = text[decimal].str.partition(".")
+        times[decimal] = parts[0].astype("int64").to_numpy() * 10**9
+        times[decimal] += (parts[2] + "0" * 9).str[:9].astype("int64").to_numpy()
+    return times, whole | decimal
+
+
+def scaled_times_ns(scale_s: float) -> Times:
+    """Make a reader of times that count steps of ``scale_s`` seconds."""
+
+    def read(text: Any, _path: Path) -> tuple[Int64, NDArray[np.bool_]]:
+        values = numbers(text) * (scale_s * 1e9)
+        known = np.isfinite(values) & (np.abs(values) < 2.0**62)
+        return np.rint(np.where(known, values, 0.0)).astype(np.int64), known
+
+    return read
+
+
+def read_rows(
+    path: Path,
+    columns: Sequence[int],
+    *,
+    separator: str = ",",
+    times: Times = exact_times_ns,
+    required: int = 0,
+    error: type[CaptureError] = ImuError,
+    hint: str = "",
+) -> Rows:
+    """Read the numbers of ``columns``; the time stands in column 0.  Comments and headers (text for a time) are passed.
+
+    required: how many of the columns a row must have.  Raises ``error`` (missing, no text), ClockError (times).
+    """
+    scan = scan_text(path, error, hint)
+    dropped: Counter[str] = Counter()
+    found_ns, found = [np.zeros(0, np.int64)], [np.zeros((0, len(columns)))]
+    last_is_good, begun = False, False
+    for chunk in text_chunks(path, separator, MANY_FIELDS):
+        time_ns, good = times(chunk[0], path)
+        table = np.stack([numbers(chunk[column]) for column in columns], axis=1)
+        enough = np.isfinite(table[:, :required]).all(axis=1)
+        said = chunk[0].str.strip()
+        is_text = ((said == "") | said.str.startswith("#")).to_numpy()
+        first = int(np.argmax(good)) if good.any() else len(good)
+        head = ~good & (np.arange(len(good)) < (0 if begun else first))
+        begun = begun or bool(good.any())
+        dropped["cut or unreadable row"] += int((~(good & enough) & ~is_text & ~head).sum())
+        good &= enough
+        last_is_good = bool(good[-1]) if len(good) else last_is_good
+        found_ns.append(time_ns[good])
+        found.append(table[good])
+    time_ns, values = np.concatenate(found_ns), np.concatenate(found)
+    rows = len(time_ns) + sum(dropped.values())
+    keep = keep_rising(time_ns, path, dropped)
+    if last_is_good and not scan.ends_with_newline and len(keep) > 1 and keep[-1] and _looks_cut(path, separator):
+        keep[-1] = False  # its last number may be cut and still read as one
+        dropped["last line without its end"] += 1
+    return Rows(time_ns[keep], values[keep], rows, dict(+dropped))
+
+
+def _looks_cut(path: Path, separator: str) -> bool:
+    """Whether the last line is shorter than the one before by more than numbers vary: cut in its middle."""
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - 4096, 0))
+        lines = stream.read().decode("utf-8", errors="replace").splitlines()
+    split = re.compile(r"\s+" if separator != "," else ",")
+    last, before = (split.split(line.strip()) for line in (lines[-1], lines[-2])) if len(lines) > 1 else ([], [])
+    return len(last) != len(before) or len(last[-1]) < len(before[-1])
+
+
+def make_gyro_table(
+    path: Path, time_ns: Int64, samples: Float64, rows: int, dropped: dict[str, int], hint: str = ""
+) -> GyroTable:
+    """Inertial samples (n, 6), rad/s and m/s², without those that no gyroscope gave. Raises ImuError."""
+    counts = Counter(dropped)
+    known = np.isfinite(samples[:, :3]).all(axis=1)
+    plausible = (np.abs(np.where(np.isfinite(samples[:, :3]), samples[:, :3], 0.0)) <= MAX_RATE_RAD_S).all(axis=1)
+    counts["gyroscope null or NaN"] += int((~known).sum())
+    counts[f"rate above {MAX_RATE_RAD_S:.0f} rad/s"] += int((known & ~plausible).sum())
+    good = known & plausible
+    if good.sum() < 2:
+        raise ImuError(
+            f"{label(path)}: {int(good.sum())} usable of {rows} rows",
+            hint=hint or "the logger wrote no gyroscope data; see the counts of `virest inspect`",
+            dropped=dict(+counts),
+        )
+    return GyroTable(time_ns[good], samples[good, :3], samples[good, 3:], rows, dict(+counts))
+
+
+PLAUSIBLE = {
+    "fx_px": (1.5, 1e6),  # 1.0 is the logger's "unknown"
+    "fy_px": (1.5, 1e6),
+    "exposure_s": (1e-7, 10.0),
+    "readout_time_s": (1e-6, 0.5),  # 0 is written by phones that do not know it
+    "iso": (1e-3, 1e7),
+    "focal_length_mm": (0.1, 1000.0),
+}
+
+
+def make_metadata_table(
+    time_ns: Int64, rows: int, dropped: dict[str, int], unix_ns: Int64 | None = None, **columns: Float64
+) -> MetadataTable:
+    """What was logged for each frame; NaN for a column that is not given and for values that no camera has."""
+    values = {}
+    for name, (low, high) in PLAUSIBLE.items():
+        given = columns.get(name, np.full(len(time_ns), np.nan))
+        values[name] = np.where((given >= low) & (given <= high), given, np.nan)
+    return MetadataTable(time_ns, **values, unix_ns=unix_ns, rows=rows, dropped=dropped)

@@ -1,0 +1,98 @@
+"""Straightening by a constant velocity of the picture, found in the pictures alone: no gyroscope, no perspective.
+
+After Schubert, Demmel, Usenko, Stückler & Cremers 2018 (ECCV, Direct sparse odometry with rolling shutter): while a
+frame is read the motion is taken as constant, and each row is moved back by what it has moved since the first.  Here
+the velocity is that of the picture, affine over it, from points followed to the frames before and after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.shutter import Shutter
+from virest.motion.tracking import TrackPair
+
+Array = NDArray[np.float64]
+MIN_POINTS = 12
+REWEIGHTINGS = 12
+LEAST_SCALE_PX = 0.05
+FIXED_POINT_STEPS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class PictureVelocity:
+    """Velocity of image points, the same at all times of one frame."""
+
+    centre_px: Array
+    """(2,) picture's centre."""
+    terms: Array
+    """(3, 2): px/s at the centre, and its change per pixel of x and of y, 1/s."""
+
+    def at(self, points_px: Array) -> Array:
+        """Velocity (..., 2) in px/s at points (..., 2)."""
+        return self.terms[0] + (points_px - self.centre_px) @ self.terms[1:]
+
+
+def fit_velocity(
+    pairs: Sequence[TrackPair],
+    frame: int,
+    middle_s: Mapping[int, float],
+    shutter: Shutter,
+    width: int,
+    height: int,
+) -> PictureVelocity | None:
+    """Fit a frame's velocity to the points that it shares with its neighbours; None: too few.
+
+    d = v(p) Δt, Δt between the middles of the exposures of the rows that see the point.  middle_s: of the first row's
+    exposure, by frame.  Robust: reweighted least squares (Cauchy).
+    """
+    found = [_displacements(pair, frame, middle_s, shutter, width, height) for pair in pairs if frame in _both(pair)]
+    if not found or sum(len(points) for points, _, _ in found) < MIN_POINTS:
+        return None
+    points, moved, passed_s = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    design = np.column_stack([np.ones(len(points)), points - centre]) * passed_s[:, None]
+    weight = np.ones(len(points))
+    terms = np.zeros((3, 2))
+    for _ in range(REWEIGHTINGS):
+        root = np.sqrt(weight)[:, None]
+        terms = np.linalg.lstsq(root * design, root * moved, rcond=None)[0]
+        left = np.linalg.norm(moved - design @ terms, axis=-1)
+        weight = 1 / (1 + (left / max(2 * float(np.median(left)), LEAST_SCALE_PX)) ** 2)
+    return PictureVelocity(centre, terms)
+
+
+def velocity_map(
+    velocity: PictureVelocity, shutter: Shutter, width: int, height: int, since_reference_s: float
+) -> NDArray[np.float32]:
+    """Where each pixel of the straightened picture was recorded, (height, width, 2).
+
+    since_reference_s: from the time of the straightened picture to the middle of the first row's exposure.
+    """
+    pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
+    speed, seen = velocity.at(pixels), pixels
+    for _ in range(FIXED_POINT_STEPS):
+        passed_s = since_reference_s + shutter.readout_time_s * shutter.readout_fraction(seen, width, height)
+        seen = pixels + speed * passed_s[..., None]
+    return seen.astype(np.float32)
+
+
+def _both(pair: TrackPair) -> tuple[int, int]:
+    return pair.first, pair.second
+
+
+def _displacements(
+    pair: TrackPair, frame: int, middle_s: Mapping[int, float], shutter: Shutter, width: int, height: int
+) -> tuple[Array, Array, Array]:
+    """Points in the frame (n, 2), how far they lie from there in the other one (n, 2), and the time between (n,)."""
+    own, other = pair.points_first_px, pair.points_second_px
+    if frame != pair.first:
+        own, other = other, own
+    neighbour = pair.second if frame == pair.first else pair.first
+    fraction = [shutter.readout_fraction(points, width, height) for points in (own, other)]
+    passed_s = middle_s[neighbour] - middle_s[frame] + shutter.readout_time_s * (fraction[1] - fraction[0])
+    return own, other - own, passed_s

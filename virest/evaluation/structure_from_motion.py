@@ -1,0 +1,164 @@
+"""A camera's path from its pictures alone: COLMAP's incremental structure from motion (Schönberger & Frahm 2016).
+
+The lens is known and held, pictures are matched with their neighbours in time, and every random choice hangs on a
+seed.  Features, matching and adjustment are COLMAP's own (doi:10.1109/CVPR.2016.445); nothing here knows of gyroscopes
+or rows.
+pycolmap works on files: a folder of pictures, and a folder of its own for the database.
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from virest.camera.intrinsics import Intrinsics
+from virest.errors import SettingsError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SfmSettings:
+    """How hard COLMAP looks."""
+
+    max_features: int = 500
+    """SIFT features of a picture."""
+    overlap: int = 6
+    """Each picture is matched with so many next ones, and with those 8, 16, 32, … on."""
+    least_angle_deg: float = 6.0
+    """Least angle between the rays of the first pair; COLMAP's own 16 is for photographs, not for a short movie."""
+    threads: int = 1
+    """One: the same sums in the same order."""
+
+
+@dataclass(frozen=True, slots=True)
+class SfmPath:
+    """What one run found; axes and scale are its own."""
+
+    pictures: tuple[str, ...]
+    """Names of the pictures with a pose, in order."""
+    position: Array
+    """(n, 3) camera centres."""
+    q_world_cam: Array
+    """(n, 4) w x y z."""
+    points: int
+    """Points of the scene."""
+    reprojection_px: float
+    """Mean reprojection error."""
+
+
+def require_pycolmap() -> Any:
+    """Import pycolmap, quiet but for errors. Raises SettingsError where it is not installed."""
+    asked_to_end = signal.getsignal(signal.SIGTERM)
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise SettingsError(
+            "structure from motion needs pycolmap", hint="pip install 'virest[slam]', or give a SLAM by --command"
+        ) from error
+    # its import takes SIGTERM for a crash and prints a stack; who asks the program to end shall be heard as before
+    if asked_to_end is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, asked_to_end)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.logging.alsologtostderr = False
+    return pycolmap
+
+
+def colmap_camera(lens: Intrinsics) -> tuple[str, list[float]]:
+    """COLMAP's model and its parameters; its pixel (0.5, 0.5) is the centre of the top-left one."""
+    pinhole = [lens.fx_px, lens.fy_px, lens.cx_px + 0.5, lens.cy_px + 0.5]
+    if lens.model == "none" or not any(lens.coefficients):
+        return ("OPENCV_FISHEYE", [*pinhole, 0.0, 0.0, 0.0, 0.0]) if lens.model == "fisheye" else ("PINHOLE", pinhole)
+    if lens.model == "fisheye":
+        return "OPENCV_FISHEYE", [*pinhole, *lens.coefficients]
+    return "FULL_OPENCV", [*pinhole, *lens.coefficients, 0.0, 0.0, 0.0]
+
+
+def match_pictures(pictures: Path, work: Path, lens: Intrinsics, settings: SfmSettings) -> Path:
+    """Find features in all pictures of a folder and match neighbours by descriptor; returns the database.
+
+    No random choice is made here, so that runs with different seeds may share it.
+    """
+    colmap = require_pycolmap()
+    database = work / "matches.db"
+    model, parameters = colmap_camera(lens)
+    reader = colmap.ImageReaderOptions(camera_model=model, camera_params=",".join(f"{p:.9g}" for p in parameters))
+    extraction = colmap.FeatureExtractionOptions(num_threads=settings.threads, use_gpu=False)
+    extraction.sift.max_num_features = settings.max_features
+    extraction.sift.first_octave = 0
+    matching = colmap.FeatureMatchingOptions(
+        num_threads=settings.threads, use_gpu=False, skip_geometric_verification=True
+    )
+    pairing = colmap.SequentialPairingOptions(overlap=settings.overlap, num_threads=settings.threads)
+    cpu = colmap.Device.cpu
+    colmap.extract_features(
+        database,
+        pictures,
+        camera_mode=colmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=cpu,
+    )
+    colmap.match_sequential(database, matching, pairing, device=cpu)
+    return database
+
+
+def find_path(database: Path, work: Path, seed: int, settings: SfmSettings) -> SfmPath:
+    """Verify the matches and map, both from this seed; the largest model counts. No pictures: it found none."""
+    colmap = require_pycolmap()
+    own = work / f"seed_{seed}"
+    own.mkdir(parents=True)
+    verified = Path(shutil.copyfile(database, own / "verified.db"))
+    colmap.set_random_seed(seed)
+    verifier = colmap.GeometricVerifierOptions(num_threads=settings.threads)
+    two_view = colmap.TwoViewGeometryOptions()
+    two_view.ransac.random_seed = seed
+    colmap.geometric_verification(verified, verifier, two_view_geometry_options=two_view)
+    models = colmap.incremental_mapping(verified, own, own, _mapping(colmap, seed, settings))
+    if not models:
+        return SfmPath((), np.empty((0, 3)), np.empty((0, 4)), 0, float("nan"))
+    return _path(max(models.values(), key=lambda model: model.num_reg_images()))
+
+
+# ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _mapping(colmap: Any, seed: int, settings: SfmSettings) -> Any:
+    """Incremental mapping with the lens held."""
+    options = colmap.IncrementalPipelineOptions(
+        num_threads=settings.threads,
+        random_seed=seed,
+        multiple_models=False,
+        extract_colors=False,
+        ba_use_gpu=False,
+        ba_refine_focal_length=False,
+        ba_refine_principal_point=False,
+        ba_refine_extra_params=False,
+        ba_global_frames_ratio=1.3,
+        ba_global_points_ratio=1.3,
+    )
+    options.mapper.init_min_tri_angle = settings.least_angle_deg
+    options.mapper.abs_pose_refine_focal_length = False
+    options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    return options
+
+
+def _path(model: Any) -> SfmPath:
+    posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    rotation = [Rotation.from_matrix(image.cam_from_world().rotation.matrix()).inv() for image in posed]
+    return SfmPath(
+        tuple(image.name for image in posed),
+        np.array([image.projection_center() for image in posed]).reshape(-1, 3),
+        np.array([turn.as_quat(scalar_first=True) for turn in rotation]).reshape(-1, 4),
+        len(model.points3D),
+        float(model.compute_mean_reprojection_error()),
+    )

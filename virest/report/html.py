@@ -1,0 +1,425 @@
+"""The report: what one or several runs and diagnoses came to, as one HTML page that needs nothing but itself.
+
+Pictures travel inside the page, curves are drawn by it, and its content security policy forbids everything else: only
+this page's own style and script, known by their hashes, and pictures of the page.  All text is escaped by the
+template engine; signs that cannot be printed (control characters, marks that turn the direction of writing) are shown
+by their code.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from virest.report.charts import ArrowField, Chart, Stretch, arrow_field, band, time_chart
+from virest.report.words import (
+    Mapped,
+    Verdict,
+    camera_values,
+    cause_view,
+    diagnosis_verdict,
+    figure_words,
+    gain_words,
+    number,
+    remaining_words,
+)
+
+TEMPLATES = "templates"
+RENDITIONS = ((1280, 88), (1280, 78), (1024, 76), (800, 74), (640, 72), (480, 70), (360, 64), (240, 60), (160, 50))
+"""Longest side in pixels and WebP quality: the first that keeps to the bytes allowed is taken."""
+FIGURE_SIDE_PX, FIGURE_QUALITY = 1700, 82
+FIRST_FIGURES = ("residuals", "pictures")
+"""Figures of a diagnosis that are open to view; the others are behind a fold."""
+STATES = ("restored", "copied", "skipped", "failed")
+STATE_WORDS = {
+    "restored": "restored",
+    "copied": "copied unchanged",
+    "skipped": "left out",
+    "failed": "failed",
+    "straightened": "straightened, not deblurred",
+    "remark": "restored, with a remark",
+}
+LEFT_ALONE = ("failed", "skipped", "copied", "straightened", "remark")
+"""What the table of reasons tells, in its order."""
+Picture = NDArray[np.uint8]
+
+
+# ── what the page is made from ───────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFacts:
+    """What the page tells of one frame; None where a value is not known."""
+
+    frame: int
+    timestamp_ns: int
+    state: str
+    """``restored``, ``copied``, ``skipped`` or ``failed``."""
+    warnings: tuple[str, ...] = ()
+    exposure_s: float | None = None
+    blur_px: float | None = None
+    """At the picture's centre."""
+    longest_blur_px: float | None = None
+    """Of all tiles."""
+    rate_rad_s: tuple[float, ...] | None = None
+    shift_px: float | None = None
+    """How far the rolling shutter bent the picture."""
+    depth_m: float | None = None
+    speed_m_s: float | None = None
+    gain_db: float | None = None
+    """What deblurring was expected to gain."""
+    noise_levels: float | None = None
+    deblurred: bool = False
+    valid_px: tuple[int, int, int, int] | None = None
+    """x0, y0, x1, y1 of the real data in the restored picture; beyond them the edge is repeated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Embedded:
+    """A picture inside the page."""
+
+    uri: str
+    """A data URI."""
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class ShownFrame:
+    """A frame that the page shows."""
+
+    facts: FrameFacts
+    before: Embedded | None
+    after: Embedded | None
+    arrows: ArrowField
+    width: int
+    """Of the movie, px; the arrows' unit."""
+    height: int
+
+    @property
+    def repeats_edge(self) -> bool:
+        """Whether a part of the restored picture is no data."""
+        return self.facts.valid_px is not None and tuple(self.facts.valid_px) != (0, 0, self.width, self.height)
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """One run of ``process``."""
+
+    account: Mapped
+    """The content of run.json."""
+    frames: Sequence[FrameFacts]
+    shown: Sequence[ShownFrame]
+    notes: tuple[str, ...] = ()
+    """What the page could not show, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisRecord:
+    """One diagnosis."""
+
+    facts: Mapped
+    """The content of diagnosis.json."""
+    figures: Sequence[tuple[str, Embedded]] = ()
+    """Name without its ending, and the picture."""
+    profile: str = ""
+    """The text of extended.yaml."""
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureRecord:
+    """All that is known of one capture."""
+
+    name: str
+    run: RunRecord | None = None
+    diagnosis: DiagnosisRecord | None = None
+
+
+# ── pictures ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def embed_pictures(pictures: Sequence[Picture | None], max_bytes: int) -> list[Embedded | None]:
+    """RGB pictures as WebP data URIs, all by the same rendition: the first one that fits into max_bytes together."""
+    for side_px, quality in RENDITIONS:
+        coded = [None if picture is None else _webp(picture, side_px, quality) for picture in pictures]
+        if sum(len(item.uri) for item in coded if item) <= max_bytes:
+            break
+    return coded
+
+
+def embed_figure(picture: Picture) -> Embedded:
+    """A figure as a WebP data URI, its letters readable."""
+    return _webp(picture, FIGURE_SIDE_PX, FIGURE_QUALITY)
+
+
+def _webp(picture: Picture, side_px: int, quality: int) -> Embedded:
+    height, width = picture.shape[:2]
+    scale = min(1.0, side_px / max(height, width))
+    if scale < 1.0:
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
+    text = base64.b64encode(data.tobytes()).decode("ascii")
+    return Embedded(f"data:image/webp;base64,{text}", picture.shape[1], picture.shape[0])
+
+
+def show_frame(
+    facts: FrameFacts,
+    before: Picture | None,
+    after: Picture | None,
+    tiles: Sequence[tuple[float, float, float, float]],
+    size: tuple[int, int],
+    max_bytes: int,
+) -> ShownFrame:
+    """Make a frame ready for the page.
+
+    tiles: (x, y, angle_rad, length_px) each.  size: (width, height) of the movie.  max_bytes: of both pictures.
+    """
+    coded = embed_pictures([before, after], max_bytes)
+    columns = np.array(tiles, float).reshape(-1, 4)
+    arrows = arrow_field(columns[:, :2], columns[:, 2], columns[:, 3], *size)
+    return ShownFrame(facts, coded[0], coded[1], arrows, *size)
+
+
+def choose_frames(frames: Sequence[FrameFacts], count: int) -> list[FrameFacts]:
+    """Frames worth a look: of as many equal parts of the run, the one with the longest blur of each.
+
+    Restored frames first; where there are none, those that were copied or skipped.
+    """
+    for states in (("restored",), ("copied",), ("skipped", "failed")):
+        there = [facts for facts in frames if facts.state in states]
+        if there:
+            parts = np.array_split(np.arange(len(there)), min(count, len(there)))
+            return [max((there[k] for k in part), key=lambda f: f.longest_blur_px or 0.0) for part in parts]
+    return []
+
+
+# ── the page ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def report_page(captures: Sequence[CaptureRecord], version: str) -> str:
+    """The whole page."""
+    environment = _environment()
+    style, script = (_source(name) for name in ("page.css", "page.js"))
+    return environment.get_template("page.html").render(
+        captures=[_capture_view(record) for record in captures],
+        style=Markup(style),
+        script=Markup(script),
+        policy=content_policy(style, script),
+        version=version,
+        state_words=STATE_WORDS,
+    )
+
+
+def content_policy(style: str, script: str) -> str:
+    """Nothing from anywhere: the page's own style and script by their hashes, and pictures that it holds itself."""
+    own = {name: _sha256(text) for name, text in (("style", style), ("script", script))}
+    return (
+        f"default-src 'none'; img-src data:; style-src {own['style']}; script-src {own['script']}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def _sha256(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("virest.report", TEMPLATES),
+        autoescape=True,
+        finalize=shown,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _source(name: str) -> str:
+    """A file that goes into the page as it stands."""
+    environment = _environment()
+    assert environment.loader is not None
+    return environment.loader.get_source(environment, name)[0].strip()
+
+
+def shown(value: Any) -> Any:
+    """Text as it is shown: white space as one blank, whatever else cannot be printed by its code."""
+    if value is None:
+        return "–"
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return "".join(c if c.isprintable() else " " if c in "\t\n\r" else f"\\u{ord(c):04x}" for c in value)
+
+
+# ── one capture ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _capture_view(record: CaptureRecord) -> dict[str, Any]:
+    return {
+        "name": record.name,
+        "run": None if record.run is None else _run_view(record.run),
+        "diagnosis": None if record.diagnosis is None else _diagnosis_view(record.diagnosis),
+    }
+
+
+def _run_view(run: RunRecord) -> dict[str, Any]:
+    counts = {state: int(run.account["counts"].get(state, 0)) for state in STATES}
+    return {
+        "verdict": run_verdict(counts, str(run.account["verdict"]), run.frames),
+        "counts": counts,
+        "share": _shares(counts),
+        "warnings": [str(text) for text in run.account.get("warnings", ())],
+        "notes": run.notes,
+        "shown": run.shown,
+        "charts": time_charts(run.frames, [frame.facts.frame for frame in run.shown]),
+        "steady": steady_words(run.frames),
+        "band": band([facts.state for facts in run.frames]),
+        "left_alone": left_alone(run.frames),
+        "values": camera_values(run.account.get("profile") or {}, str(run.account.get("profile_source", ""))),
+        "account": run.account,
+    }
+
+
+def run_verdict(counts: Mapping[str, int], verdict: str, frames: Sequence[FrameFacts]) -> Verdict:
+    """The run in words."""
+    total, restored = sum(counts.values()), counts["restored"]
+    rest = ", ".join(f"{counts[s]} {STATE_WORDS[s]}" for s in ("copied", "skipped", "failed") if counts[s])
+    if not restored:
+        level, headline = "poor", "No frame was restored"
+    elif restored == total:
+        level, headline = "good", f"All {total} frames restored" if total > 1 else "The frame was restored"
+    else:
+        level, headline = "poor" if counts["failed"] else "fair", f"{restored} of {total} frames restored"
+    words = [f"{rest}." if rest else ""]
+    words += [f"{verdict[:1].upper()}{verdict[1:]}." if verdict != "restored" and not restored else ""]
+    return Verdict(level, headline, " ".join(filter(None, [*words, _motion_words(frames)])))
+
+
+def _motion_words(frames: Sequence[FrameFacts]) -> str:
+    """How blurred and bent the recorded pictures are."""
+    blur = [f.blur_px for f in frames if f.blur_px is not None]
+    longest = [f.longest_blur_px for f in frames if f.longest_blur_px is not None]
+    shift = [f.shift_px for f in frames if f.shift_px is not None]
+    words = []
+    if blur and longest:
+        words.append(f"blurred by {np.median(blur):.1f} px in their middle (median), {max(longest):.1f} px at most")
+    if shift and max(shift) > 0:
+        words.append(f"bent by the rolling shutter by up to {max(shift):.1f} px")
+    return f"The recorded frames are {' and '.join(words)}." if words else ""
+
+
+def _shares(counts: Mapping[str, int]) -> tuple[Stretch, ...]:
+    """The counts as parts of a bar."""
+    total, start, parts = max(sum(counts.values()), 1), 0, []
+    for state in STATES:
+        parts.append(Stretch(state, start / total, counts[state] / total))
+        start += counts[state]
+    return tuple(part for part in parts if part.width)
+
+
+def steady_words(frames: Sequence[FrameFacts]) -> list[str]:
+    """A sentence for the exposure where it is the same for all frames, and needs no curve."""
+    exposures = {facts.exposure_s for facts in frames}
+    if len(exposures) != 1 or None in exposures:
+        return []
+    return [f"Every frame was exposed for {number(1e3 * exposures.pop())} ms."]  # type: ignore[operator]
+
+
+def time_charts(frames: Sequence[FrameFacts], marked: Sequence[int]) -> list[Chart]:
+    """The parameters over the time since the first frame, as far as they are known."""
+    if not frames:
+        return []
+    stamps = np.array([f.timestamp_ns for f in frames], np.int64)
+    time_s = (stamps - stamps[0]) / 1e9
+    marks = [float(t) for t, facts in zip(time_s, frames, strict=True) if facts.frame in set(marked)]
+
+    def column(read: Callable[[FrameFacts], float | None]) -> list[float | None]:
+        return [read(facts) for facts in frames]
+
+    def exposure_ms(f: FrameFacts) -> float | None:
+        return None if f.exposure_s is None else 1e3 * f.exposure_s
+
+    def axis(k: int) -> Callable[[FrameFacts], float | None]:
+        return lambda f: None if f.rate_rad_s is None else f.rate_rad_s[k]
+
+    wanted = [
+        ("Blur", "px", [("longest", column(lambda f: f.longest_blur_px)), ("centre", column(lambda f: f.blur_px))]),
+        ("Rotation of the camera", "rad/s", [(name, column(axis(k))) for k, name in enumerate("xyz")]),
+        ("Bent by the rolling shutter", "px", [("largest shift", column(lambda f: f.shift_px))]),
+        ("Exposure", "ms", [] if steady_words(frames) else [("", column(exposure_ms))]),
+        ("Expected gain of deblurring", "dB", [("", column(lambda f: f.gain_db))]),
+        ("Noise", "grey levels", [("", column(lambda f: f.noise_levels))]),
+        ("Scene depth", "m", [("", column(lambda f: f.depth_m))]),
+        ("Speed of the camera", "m/s", [("", column(lambda f: f.speed_m_s))]),
+    ]
+    charts = (time_chart(title, unit, time_s, series, marks) for title, unit, series in wanted)
+    return [chart for chart in charts if chart is not None]
+
+
+# ── what was left alone ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Frames with which the same was done for the same reason."""
+
+    state: str
+    text: str
+    varies: bool
+    """The numbers in the text are those of the first such frame."""
+    count: int
+    ranges: str
+    """As ``3–9, 12``."""
+
+
+def left_alone(frames: Sequence[FrameFacts]) -> list[Reason]:
+    """Frames that were not (fully) restored and remarks on those that were, grouped by what was done and why.
+
+    Reasons that differ in their numbers only are one.
+    """
+    groups: dict[tuple[str, str], list[tuple[int, str]]] = {}
+    for facts in frames:
+        state = facts.state if facts.state != "restored" else "remark" if facts.deblurred else "straightened"
+        texts = facts.warnings if facts.warnings or state == "remark" else ("no reason is logged",)
+        for text in dict.fromkeys(texts):
+            groups.setdefault((state, re.sub(r"\d+(\.\d+)?", "#", text)), []).append((facts.frame, text))
+    reasons = [
+        Reason(state, found[0][1], len({text for _, text in found}) > 1, len(found), ranges([f for f, _ in found]))
+        for (state, _), found in groups.items()
+    ]
+    return sorted(reasons, key=lambda reason: (LEFT_ALONE.index(reason.state), -reason.count))
+
+
+def ranges(numbers: Sequence[int]) -> str:
+    """Rising numbers as ranges: ``3–9, 12``."""
+    if not len(numbers):
+        return ""
+    rising = np.unique(np.asarray(numbers))
+    runs = np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1)
+    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
+
+
+def _diagnosis_view(diagnosis: DiagnosisRecord) -> dict[str, Any]:
+    facts = diagnosis.facts
+    causes = facts.get("causes") or []
+    return {
+        "verdict": diagnosis_verdict(str(facts["verdict"]), causes, facts.get("nominal") or {}),
+        "causes": [cause_view(cause) for cause in causes],
+        "remaining": remaining_words(facts.get("unexplained") or {}, str(facts["verdict"])),
+        "gain": gain_words(facts.get("restoration_gain") or {}),
+        "figures": [(figure_words(name), picture) for name, picture in diagnosis.figures if name in FIRST_FIGURES],
+        "rungs": [(figure_words(name), picture) for name, picture in diagnosis.figures if name not in FIRST_FIGURES],
+        "profile": diagnosis.profile.splitlines(),
+    }

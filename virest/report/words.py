@@ -1,0 +1,257 @@
+"""Numbers and verdicts as people read them: a value with its unit and deviation, a cause in plain words."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+DIAGNOSIS_WORDS = {
+    "consistent": ("good", "The camera model fits this capture"),
+    "explained": ("fair", "The camera model is off, and what is wrong with it was found"),
+    "unexplained": ("poor", "The camera model is off, and no known effect explains all of it"),
+}
+CAUSE_WORDS = {
+    "time_offset": "camera and gyroscope clocks stand apart",
+    "clock_skew": "one of the two clocks runs faster",
+    "readout_time": "the rows are read in another time",
+    "readout_direction": "the rows are read in another direction",
+    "timestamp_reference": "the frame stamps mean another instant of the exposure",
+    "exposure_time": "the exposure lasts longer or shorter than logged",
+    "gyro_bias": "the gyroscope reads a rate at rest",
+    "gyro_scale": "the gyroscope reads too much or too little",
+    "imu_rotation": "the gyroscope's axes are turned against the camera's",
+    "focal_length": "the focal length is another",
+    "focal_drift": "the focal length changes while filming",
+    "radial_distortion": "the lens bends straight lines",
+    "principal_point": "the optical axis meets the picture elsewhere",
+    "stabilisation": "an optical stabiliser moves the lens",
+    "scene_depth": "the scene is at another distance",
+    "frame_lag": "pictures come later than their stamps while the recorder starts",
+    "response_curve": "the exposure curve is bent otherwise",
+    "black_level": "black is stored as grey",
+    "vignetting": "the corners get less light",
+    "flicker": "the light pulses",
+    "gain_drift": "brightness changes that exposure and ISO do not explain",
+    "defocus": "the picture is out of focus",
+}
+QUANTITY_WORDS = {
+    "geometry_rms_px": "points, px",
+    "photometric_rms": "brightness, grey levels",
+    "blur_rms_px": "blur, px",
+}
+FIGURE_WORDS = {
+    "residuals": "What is left between tracked and predicted points, over row, time, radius and rate",
+    "ladder": "What was tried on each rung of the ladder, the best on top",
+    "pictures": "A lively frame beside its simulation",
+}
+UNITS = {
+    "_rad_s": "rad/s",
+    "_m_s": "m/s",
+    "_per_s": "1/s",
+    "_px": "px",
+    "_rad": "rad",
+    "_hz": "Hz",
+    "_m": "m",
+    "_s": "s",
+}
+PARAMETER_WORDS = {
+    "time_offset_s": "Time offset",
+    "readout_time_s": "Readout time",
+    "readout_direction": "Readout direction",
+    "timestamp": "Stamps mean",
+    "exposure_scale": "Exposure scale",
+    "clock_skew": "Clock skew",
+    "gyro_bias_rad_s": "Gyroscope bias",
+    "gyro_scale": "Gyroscope scale",
+    "fx_px": "Focal length",
+    "response": "Exposure curve",
+    "depth_m": "Scene depth",
+}
+CAMERA_KEYS = (
+    ("imu", "time_offset_s"),
+    ("shutter", "readout_time_s"),
+    ("shutter", "readout_direction"),
+    ("imu", "gyro_bias_rad_s"),
+    ("intrinsics", "fx_px"),
+    ("response", "kind"),
+    ("scene", "depth_m"),
+)
+"""Places of a profile that the page shows in any case."""
+SHOWN_COMPONENTS = 4
+
+Mapped = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What it came to: how good (``good``, ``fair``, ``poor``), in few words, and in a sentence."""
+
+    level: str
+    headline: str
+    sentence: str
+
+
+# ── numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _listed(value: Any) -> list[Any] | None:
+    return list(value) if isinstance(value, list | tuple | np.ndarray) else None
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A number for people, or the word that stands in its place."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "not known"
+    if isinstance(value, bool | str):
+        return str(value).replace("inf", "infinity") if value in ("inf", "-inf") else str(value)
+    return f"{float(value):.{digits}g}".replace("-", "−") if isinstance(value, int | float) else str(value)
+
+
+def with_deviation(name: str, value: Any, std: Any = None) -> str:
+    """A value with its unit and standard deviation, both to two digits of that: ``14.91 ± 0.05 ms``.
+
+    The unit is read off the name's ending; seconds are shown as milliseconds.
+    """
+    values, spread = _listed(value), _listed(std)
+    if values is not None:
+        if len(values) > SHOWN_COMPONENTS:
+            return f"{len(values)} values"
+        stds = spread if spread is not None and len(spread) == len(values) else [std] * len(values)
+        return "; ".join(with_deviation(name, v, s) for v, s in zip(values, stds, strict=True))
+    unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return number(value)
+    factor, unit = (1e3, "ms") if unit == "s" else (1.0, unit)
+    return f"{_rounded(factor * value, None if std is None else factor * std)} {unit}".strip()
+
+
+def _rounded(value: float, std: Any) -> str:
+    if not isinstance(std, int | float) or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
+        return number(value, 5)
+    decimals = 1 - math.floor(math.log10(std))
+    if not -6 < decimals < 9:
+        return f"{number(value, 5)} ± {number(std, 2)}"
+    shown_value, shown_std = (f"{round(v, decimals):.{max(decimals, 0)}f}" for v in (value, std))
+    return f"{shown_value} ± {shown_std}".replace("-", "−")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraValue:
+    """A value of the camera that the run used."""
+
+    title: str
+    text: str
+    source: str
+    estimated: bool
+
+
+def camera_values(profile: Mapped, profile_source: str) -> list[CameraValue]:
+    """The values that matter, estimated ones with their deviation and how they were found."""
+    estimates = profile.get("estimates")
+    estimates = estimates if isinstance(estimates, Mapping) else {}
+    plain = {keys[-1] if keys[0] != "response" else "response": _inside(profile, keys) for keys in CAMERA_KEYS}
+    names = dict.fromkeys([*plain, *estimates])
+    return [_camera_value(name, plain.get(name), estimates.get(name), profile_source) for name in names]
+
+
+def _inside(mapping: Any, keys: Sequence[str]) -> Any:
+    for key in keys:
+        mapping = mapping.get(key) if isinstance(mapping, Mapping) else None
+    return mapping
+
+
+def _camera_value(name: str, value: Any, estimate: Any, profile_source: str) -> CameraValue:
+    title = PARAMETER_WORDS.get(name, name)
+    if not isinstance(estimate, Mapping):
+        source = "not known" if value is None else f"given by {profile_source}"
+        return CameraValue(title, with_deviation(name, value).replace("_", " "), source, False)
+    text = with_deviation(name, estimate.get("value"), estimate.get("std"))
+    return CameraValue(title, text, str(estimate.get("source") or "estimated"), True)
+
+
+# ── a diagnosis ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def diagnosis_verdict(verdict: str, causes: Sequence[Mapped], nominal: Mapped) -> Verdict:
+    """The diagnosis in words."""
+    level, headline = DIAGNOSIS_WORDS.get(verdict, ("fair", verdict))
+    named = ", ".join(str(cause["name"]).replace("_", " ") for cause in causes)
+    words = [f"Found: {named}." if named else ""]
+    if nominal.get("geometry_rms_px") is not None:
+        words.append(
+            f"Tracked points were off by {number(nominal['geometry_rms_px'], 3)} px, of which tracking itself makes "
+            f"{number(nominal.get('geometry_noise_px'), 3)} px ({number(nominal.get('tracks'), 9)} tracks in "
+            f"{number(nominal.get('frames'), 9)} frames)."
+        )
+    return Verdict(level, headline, " ".join(filter(None, words)))
+
+
+def cause_view(cause: Mapped) -> dict[str, Any]:
+    """One row of the table of causes."""
+    held_out = cause.get("held_out") or {}
+    before, after, gain = (held_out.get(name) for name in ("before", "after", "gain"))
+    name = str(cause["name"])
+    return {
+        "title": name.replace("_", " "),
+        "sentence": str(cause.get("sentence") or CAUSE_WORDS.get(name, "")),
+        "parameters": [
+            (
+                PARAMETER_WORDS.get(parameter, parameter),
+                with_deviation(parameter, change.get("nominal")),
+                with_deviation(parameter, change.get("estimate"), change.get("std")),
+            )
+            for parameter, change in (cause.get("parameters") or {}).items()
+        ],
+        "quantity": QUANTITY_WORDS.get(str(held_out.get("quantity")), str(held_out.get("quantity", ""))),
+        "before": number(before, 3),
+        "after": number(after, 3),
+        "left": _part(after, before),
+        "gain": f"{gain:.0%}" if isinstance(gain, int | float) else "not known",
+        "rivals": [
+            f"{str(rival.get('name')).replace('_', ' ')} ({number(rival.get('held_out_after'), 3)})"
+            for rival in cause.get("rivals") or ()
+        ],
+    }
+
+
+def _part(after: Any, before: Any) -> float | None:
+    """How much of the error is left, 0 to 1, for a bar."""
+    if not all(isinstance(v, int | float) and math.isfinite(v) for v in (after, before)) or not before > 0:
+        return None
+    return round(min(max(after / before, 0.0), 1.0), 4)
+
+
+def remaining_words(unexplained: Mapped, verdict: str) -> str:
+    """What no cause explains, in a sentence."""
+    along = str(unexplained.get("strongest_along") or "nothing in particular")
+    p_value = number(unexplained.get("p_value"), 2)
+    if verdict == "unexplained":
+        return f"What remains is more than chance (p = {p_value}) and goes most with {along}."
+    return f"What remains is of no size (p = {p_value}, most along {along})."
+
+
+def gain_words(gain: Mapped) -> list[tuple[str, str]]:
+    """What the causes do for restored frames, one line a measure."""
+    lines = []
+    if gain.get("sharpness_after") is not None:
+        shares = [number(gain.get(f"sharpness_{name}"), 3) for name in ("recorded", "before", "after")]
+        lines.append(
+            ("Sharpness", f"{shares[0]} recorded, {shares[1]} with the profile as given, {shares[2]} extended")
+        )
+    if gain.get("disagreement_after_px") is not None:
+        shares = [number(gain.get(f"disagreement_{name}_px"), 3) for name in ("before", "after")]
+        lines.append(("Restored neighbours disagree by", f"{shares[0]} px as given, {shares[1]} px extended"))
+    return lines
+
+
+def figure_words(name: str) -> str:
+    """What a figure of a diagnosis shows, by its file's name."""
+    numbered = re.fullmatch(r"\d\d_([a-z_]+)", name)
+    if numbered:
+        return f"The rung on which {numbered[1].replace('_', ' ')} entered, and what else was tried there"
+    return FIGURE_WORDS.get(name, name)
