@@ -13,7 +13,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from dataclasses import dataclass
 from itertools import chain, islice
 from multiprocessing.connection import wait as wait_for_handles
@@ -24,18 +32,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.app.cluster import ClusterExecutor
 from virest.app.memory import keep_freed_memory
 from virest.app.outputs import RunFolder, json_line, write_picture, write_whole
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
+from virest.capture.location import is_unreachable
 from virest.capture.video import MovieIndex, read_frames
-from virest.errors import OutputError, SettingsError, VirestError
+from virest.errors import OutputError, RestorationError, VirestError
 from virest.motion.optics import settling_time_s
 from virest.restoration.capture import RestorationPlan, restore_frames
 from virest.restoration.frame import RestoredFrame
 
 log = logging.getLogger(__name__)
 
+LOOK_S = 5.0
+"""How often to look after the workers while nothing comes back."""
 MIN_SEGMENT_FRAMES, USUAL_SEGMENT_FRAMES, MAX_SEGMENT_FRAMES = 5, 10, 30
 IMU_MARGIN_S = 1.0
 KEEP_MEMORY_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
@@ -102,7 +114,8 @@ def make_segment(
     frames: tuple[Frame, ...], capture: Capture, name: str, index: MovieIndex, plan: RestorationPlan, run: RunFolder
 ) -> Segment:
     """One segment as a worker takes it."""
-    return Segment(name, capture.movie, index, frames, cut_imu(capture.imu, frames, plan), plan.of(frames), run)
+    place = RunFolder(run.path.absolute())  # a worker may stand in another folder
+    return Segment(name, capture.movie, index, frames, cut_imu(capture.imu, frames, plan), plan.of(frames), place)
 
 
 # ── the work on one segment ──────────────────────────────────────────────────────────────────────────────────────
@@ -163,6 +176,8 @@ def _decoded(segment: Segment, seconds: dict[int, float]) -> Iterator[tuple[Fram
                 yield wanted.popleft(), picture
                 began = time.perf_counter()
     except VirestError as error:
+        if is_unreachable(error):
+            raise
         log.warning("%s: %s", segment.capture_name, error)
     while wanted:
         yield wanted.popleft(), None
@@ -192,7 +207,7 @@ def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[Restored
         except OutputError:
             raise
         except Exception as error:  # one frame's fault must not take the others along
-            if not fed:
+            if not fed or is_unreachable(error):
                 raise
             log.debug("frame %d", fed[0][0].index, exc_info=True)
             frame, _ = fed.popleft()
@@ -306,7 +321,16 @@ class Workers:
     @property
     def slots(self) -> int:
         """Segments in flight at once: enough to keep every worker busy, few enough to keep memory flat."""
+        if isinstance(self._executor, ClusterExecutor):
+            return self._executor.slots
         return 1 if self.jobs == 1 and self.scheduler is None else self.jobs + 1
+
+    def start(self, *places: Path) -> None:
+        """Have workers at hand that see these places. Raises SettingsError where a cluster's do not."""
+        if self._executor is None:
+            self._executor = self._start()
+        if isinstance(self._executor, ClusterExecutor):
+            self._executor.require_places(list(places))
 
     def submit(self, segment: Segment) -> Future[dict[str, int]]:
         """Hand a segment to the executor."""
@@ -322,7 +346,7 @@ class Workers:
 
     def _start(self) -> Executor:
         if self.scheduler is not None:
-            return _dask_executor(self.scheduler)
+            return ClusterExecutor(self.scheduler, verbose=self.verbose)
         if self.jobs == 1:
             return SerialExecutor()
         for variable in THREAD_VARIABLES:
@@ -331,6 +355,22 @@ class Workers:
             os.environ.setdefault(variable, KEPT_BYTES)
         context = multiprocessing.get_context("spawn")
         return ProcessPoolExecutor(self.jobs, context, initializer=_start_worker, initargs=(self.verbose,))
+
+    def check(self) -> None:
+        """Look whether anybody is still at work; called while nothing comes back. Raises RestorationError."""
+        if isinstance(self._executor, ClusterExecutor):
+            self._executor.check()
+
+    def lost(self) -> VirestError:
+        """The error of work that was called off from outside."""
+        if isinstance(self._executor, ClusterExecutor):
+            return self._executor.lost()
+        return RestorationError("the work was called off", hint="go on with --resume")
+
+    def renew(self) -> None:
+        """After a worker's death: a pool is broken and begins anew, a cluster has others."""
+        if not isinstance(self._executor, ClusterExecutor):
+            self.kill()
 
     def kill(self) -> None:
         """Stop all work now; the next submit starts anew."""
@@ -350,17 +390,6 @@ class Workers:
             self._executor = None
 
 
-def _dask_executor(address: str) -> Executor:
-    from dask.distributed import Client
-
-    try:
-        return Client(address, timeout="10s").get_executor()
-    except (OSError, ValueError) as error:
-        raise SettingsError(
-            f"--scheduler {address}: {error}", hint="start `dask scheduler`, or leave it out"
-        ) from error
-
-
 def run_segments(segments: Iterable[Segment], workers: Workers) -> Iterator[tuple[Segment, dict[str, int]]]:
     """Run segments, a bounded number at a time; yields each as it is done, with its counts by status.
 
@@ -372,10 +401,9 @@ def run_segments(segments: Iterable[Segment], workers: Workers) -> Iterator[tupl
         lost = _fill(running, waiting, workers)
         if not running and not lost:
             return
-        done = wait(running, return_when=FIRST_COMPLETED).done if running else set()
-        for future in done:
+        for future in _await_some(running, workers) if running else ():
             segment = running.pop(future)
-            counts = _collect(future, segment)
+            counts = _collect(future, segment, workers)
             if counts is None:
                 lost.append(segment)
             else:
@@ -396,15 +424,27 @@ def _fill(
     return []
 
 
-def _collect(future: Future[dict[str, int]], segment: Segment) -> dict[str, int] | None:
+def _await_some(running: Running, workers: Workers) -> set[Future[dict[str, int]]]:
+    while True:
+        done = wait(running, timeout=LOOK_S, return_when=FIRST_COMPLETED).done
+        if done:
+            return done
+        workers.check()
+
+
+def _collect(future: Future[dict[str, int]], segment: Segment, workers: Workers) -> dict[str, int] | None:
     """The counts of a finished segment; None where its worker died."""
     try:
         return future.result()
     except OutputError:
         raise
+    except CancelledError:
+        raise workers.lost() from None
     except BrokenExecutor:
         return None
     except Exception as error:  # explained in the frames' lines; the other segments go on
+        if is_unreachable(error):
+            raise
         if type(error).__name__ == "KilledWorker":
             return None
         log.debug("segment %s", segment.log_path.stem, exc_info=True)
@@ -414,7 +454,7 @@ def _collect(future: Future[dict[str, int]], segment: Segment) -> dict[str, int]
 def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator[tuple[Segment, dict[str, int]]]:
     """Collect what a broken pool still holds, then try each lost segment alone in a new one."""
     for future, segment in list(running.items()):
-        counts = _collect(future, segment)
+        counts = _collect(future, segment, workers)
         if counts is None:
             lost.append(segment)
         else:
@@ -423,10 +463,10 @@ def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator
     for segment in sorted(lost, key=lambda s: s.frames[0].index):
         frames = f"frames {segment.frames[0].index}-{segment.frames[-1].index}"
         log.warning("%s: a worker died on %s or its neighbours; trying again", segment.capture_name, frames)
-        workers.kill()
-        counts = _collect(workers.submit(segment), segment)
+        workers.renew()
+        counts = _collect(workers.submit(segment), segment, workers)
         yield (
             segment,
             fail_segment(segment, "the worker process died twice on this segment") if counts is None else counts,
         )
-    workers.kill()
+    workers.renew()

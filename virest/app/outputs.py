@@ -6,6 +6,8 @@ A run's folder tells its own state::
     .run              it is not: the request it was started with; --resume continues it
     .segments/        logs of the finished segments of an unfinished run
     .lock             held (flock) by the process that works here; the system lets go of it when that dies
+
+Behind an address (``s3://…``) every file is put there by one request, the folders are only names, and there is no lock.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.png import png_bytes
+from virest.capture.location import RemotePath, is_remote, locate, read_each, remove_files
 from virest.errors import OutputError, RestorationError
 
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
@@ -64,6 +67,12 @@ def output_error(path: Path, error: OSError) -> OutputError:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file so that it appears whole or not at all. Raises OutputError."""
+    if isinstance(path, RemotePath):
+        try:
+            path.write_whole(data)
+        except OSError as error:
+            raise output_error(path, error) from error
+        return
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:
         _write_bytes(part, data)
@@ -132,7 +141,8 @@ def capture_name(path: str) -> str:
 
     Raises OutputError for a name that could not be a plain folder name.
     """
-    name = os.path.basename(os.path.abspath(path))
+    place = locate(path)
+    name = place.name if is_remote(place) else os.path.basename(os.path.abspath(place))
     if not name or name in (".", "..") or any(ord(c) < 32 or ord(c) == 127 for c in name) or "/" in name:
         raise OutputError(
             f"{path!r}: no usable name for an output folder: {name!r}", hint="rename the capture's folder"
@@ -281,7 +291,7 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
     except OSError as error:
         raise output_error(run.path, error) from error
     try:
-        with _locked(run):
+        with nullcontext() if is_remote(run.path) else _locked(run):
             found = check_run(run, request, mode)
             try:
                 if found != "finished" or mode == "overwrite":
@@ -327,7 +337,7 @@ def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
     """Bring the folder to the state from which segments can be written, whatever a killed run left."""
     try:
         if mode == "overwrite":
-            shutil.rmtree(run.segments, ignore_errors=True)
+            _remove_segments(run)
         if mode == "overwrite" or not run.state.exists():
             write_whole(run.state, json.dumps(plain(request), allow_nan=False, indent=1).encode())
         run.frames.mkdir(exist_ok=True)
@@ -342,13 +352,21 @@ def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
 def _remove_own(run: RunFolder) -> None:
     """Remove what a run made, except its state, and nothing else."""
     for folder in (run.path, run.frames):
-        for file in folder.iterdir():
-            if OWN_FILES.fullmatch(file.name) and file != run.state and not file.is_dir():
-                file.unlink(missing_ok=True)
+        own = [file for file in folder.iterdir() if OWN_FILES.fullmatch(file.name) and file != run.state]
+        remove_files([file for file in own if is_remote(file) or not file.is_dir()])
+
+
+def _remove_segments(run: RunFolder) -> None:
+    if is_remote(run.path):
+        remove_files(list(run.segments.iterdir()))
+    else:
+        shutil.rmtree(run.segments, ignore_errors=True)
 
 
 def remove_parts(run: RunFolder) -> None:
-    """Remove the half-written files of writers that were killed."""
+    """Remove the half-written files of writers that were killed; a store has none."""
+    if is_remote(run.path):
+        return
     for folder in (run.path, run.frames, run.segments):
         for file in folder.iterdir() if folder.is_dir() else ():
             if PART.fullmatch(file.name):
@@ -372,25 +390,39 @@ def _leave(run: RunFolder) -> None:
 def remove_stray_pictures(run: RunFolder, keep: Iterable[int]) -> None:
     """Remove pictures of segments that were not finished."""
     kept = {run.picture(frame).name for frame in keep}
-    for file in run.frames.iterdir():
-        if OWN_FILES.fullmatch(file.name) and file.name not in kept:
-            file.unlink(missing_ok=True)
+    names = (file for file in run.frames.iterdir() if OWN_FILES.fullmatch(file.name))
+    remove_files([file for file in names if file.name not in kept])
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """The records of a JSON-lines file."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+    return parse_lines(path.read_bytes())
 
 
-def read_segment_log(run: RunFolder, frames: tuple[int, ...]) -> list[dict[str, Any]] | None:
-    """The lines of a finished segment; None where it is not finished, or its pictures are gone."""
+def parse_lines(data: bytes) -> list[dict[str, Any]]:
+    """The records of JSON lines. Raises ValueError for what is none."""
+    return [json.loads(line) for line in data.decode("utf-8").splitlines() if line]
+
+
+def finished_segments(run: RunFolder, segments: Iterable[tuple[int, ...]]) -> set[tuple[int, ...]]:
+    """Those of the segments, each given by its frames, whose log is whole and whose pictures are there."""
     try:
-        lines = read_lines(run.segment_log(frames[0], frames[-1]))
-    except (OSError, ValueError):
-        return None
-    if tuple(line.get("frame") for line in lines) != frames:
-        return None
-    return lines if all((run.path / line["output"]).is_file() for line in lines if line["output"]) else None
+        logs = {file.name for file in run.segments.iterdir()}
+        pictures = {f"frames/{file.name}" for file in run.frames.iterdir()} if logs else set()
+        begun = [frames for frames in segments if run.segment_log(frames[0], frames[-1]).name in logs]
+        contents = read_each(run.segment_log(frames[0], frames[-1]) for frames in begun)
+        return {frames for frames, data in zip(begun, contents, strict=True) if _is_finished(frames, data, pictures)}
+    except OSError as error:
+        raise output_error(run.path, error) from error
+
+
+def _is_finished(frames: tuple[int, ...], data: bytes, pictures: set[str]) -> bool:
+    try:
+        lines = parse_lines(data)
+        said = [line["output"] for line in lines if line["output"]]
+        return tuple(line["frame"] for line in lines) == frames and pictures.issuperset(said)
+    except (ValueError, KeyError, TypeError):
+        return False
 
 
 def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any]) -> None:
@@ -399,13 +431,16 @@ def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any]) ->
         _join(run.parameters, logs)
         write_whole(run.run_json, (json.dumps(plain(account), allow_nan=False, indent=2) + "\n").encode())
         run.state.unlink(missing_ok=True)
-        shutil.rmtree(run.segments, ignore_errors=True)
+        _remove_segments(run)
     except OSError as error:
         raise output_error(run.path, error) from error
 
 
 def _join(path: Path, logs: Iterable[Path]) -> None:
-    """Copy the logs one after the other into one file, without holding them all."""
+    """Copy the logs one after the other into one file, without holding them all; an address takes it in one piece."""
+    if is_remote(path):
+        write_whole(path, b"".join(read_each(logs)))
+        return
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:
         with part.open("xb") as file:

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import logging
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app import console
+from virest.app.cluster import is_lost
 from virest.app.jobs import Segment, Workers, cut_frames, make_segment, run_segments
 from virest.app.outputs import (
     Mode,
@@ -27,11 +27,11 @@ from virest.app.outputs import (
     check_run,
     file_facts,
     finish_run,
+    finished_segments,
     opened_run,
     output_error,
+    parse_lines,
     plain,
-    read_lines,
-    read_segment_log,
     remove_parts,
     remove_stray_pictures,
 )
@@ -42,6 +42,7 @@ from virest.capture.folder import (
     read_capture,
     resolve_profile,
 )
+from virest.capture.location import locate, read_each
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, OutputError, SettingsError
@@ -52,6 +53,8 @@ log = logging.getLogger(__name__)
 
 PARTLY_FAILED = 9
 STATUSES = ("restored", "copied", "skipped", "failed")
+SHOWN_CHARACTERS = 200
+"""Of a name that is longer, in messages."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 
 
@@ -116,6 +119,8 @@ def process_captures(paths: list[str], options: ProcessOptions) -> int:
     codes: list[int] = []
     workers = Workers(options.jobs, options.scheduler, verbose=options.verbose)
     try:
+        if options.scheduler is not None:
+            workers.start()  # before any reading, so that a wrong address costs nothing
         for path, name in zip(paths, names, strict=True):
             try:
                 outcomes.append(process_capture(path, name, options, workers))
@@ -125,6 +130,8 @@ def process_captures(paths: list[str], options: ProcessOptions) -> int:
                     raise
                 codes.append(console.report_error(error, name))
             except Exception as error:  # a failed capture is a normal, explained outcome of a batch
+                if is_lost(error):
+                    raise
                 codes.append(console.report_error(error, name))
     finally:
         workers.kill()
@@ -154,9 +161,7 @@ def _require_out(out: Path) -> None:
 def process_capture(path: str, name: str, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
     """Process one capture into OUT/<name>."""
     began = time.perf_counter()
-    if not os.path.isdir(path):
-        what = "is no folder" if os.path.exists(path) else "no such folder"
-        raise CaptureError(f"{path}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
+    _require_capture(path)
     run = RunFolder(options.out / name)
     if options.mode == "new":
         check_run(run, {}, "new")
@@ -168,15 +173,29 @@ def process_capture(path: str, name: str, options: ProcessOptions, workers: Work
     plan = _plan(job, index, options.settings)
     with opened_run(run, job.request, options.mode):
         try:
+            workers.start(job.capture.movie, run.path)
             return _run(job, index, plan, options, workers, began)
         except BaseException:
             workers.kill()
             raise
 
 
+def _require_capture(path: str) -> None:
+    """Raise CaptureError where the path names no folder."""
+    place = locate(path)
+    try:
+        if place.is_dir():
+            return
+        what = "is no folder" if place.exists() else "no such folder"
+    except (OSError, ValueError) as fault:  # a name too long, an address that does not answer
+        what = getattr(fault, "strerror", None) or str(fault)
+    shown = path if len(path) <= SHOWN_CHARACTERS else f"{path[:SHOWN_CHARACTERS]}…"
+    raise CaptureError(f"{shown}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
+
+
 def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> _Job:
     """Read the capture and the profile, select frames, and note down the request."""
-    capture = read_capture(Path(path))
+    capture = read_capture(locate(path))
     for note in capture.notes:
         log.log(logging.INFO if note.severity == "info" else logging.WARNING, "%s: %s", name, note.text)
     profile, source = resolve_profile(capture, options.config)
@@ -246,7 +265,7 @@ def _run(
     """Run the segments that are not done yet, then finish the run's folder."""
     parts = cut_frames(job.selected, job.capture.keyframes or index.keyframes)
     numbers = [tuple(frame.index for frame in part) for part in parts]
-    done = {n: lines for n in numbers if (lines := read_segment_log(job.run, n)) is not None}
+    done = finished_segments(job.run, numbers)
     _clean(job.run, [frame for n in done for frame in n])
     if done:
         log.info("%s: %d of %d segments were done before", job.name, len(done), len(parts))
@@ -255,7 +274,7 @@ def _run(
         for part, n in zip(parts, numbers, strict=True)
         if n not in done
     )
-    give = _in_order(job.run, numbers, set(done)) if options.json_lines else None
+    give = _in_order(job.run, numbers, done) if options.json_lines else None
     _work(todo, workers, give, len(job.selected), sum(map(len, done)), job.name, options.quiet)
     logs = [job.run.segment_log(n[0], n[-1]) for n in numbers]
     totals = _totals(logs)
@@ -307,7 +326,7 @@ def _in_order(
             finished.add(number)
         while waiting and waiting[-1] in finished:
             ready = waiting.pop()
-            for line in run.segment_log(ready[0], ready[-1]).read_text(encoding="utf-8").splitlines():
+            for line in run.segment_log(ready[0], ready[-1]).read_text("utf-8").splitlines():
                 console.emit(line)
 
     return give
@@ -317,8 +336,8 @@ def _totals(logs: list[Path]) -> dict[str, Any]:
     """Counts by status, warnings by text, and seconds by stage, over all lines."""
     counts: Counter[str] = Counter()
     seconds: Counter[str] = Counter()
-    for path in logs:
-        for line in read_lines(path):
+    for content in read_each(logs):
+        for line in parse_lines(content):
             counts[line["status"]] += 1
             seconds.update({stage: line["seconds"].get(stage, 0.0) for stage in STAGES})
     return {"counts": {status: counts[status] for status in STATUSES}, "seconds": dict(seconds)}
@@ -387,7 +406,7 @@ def _repeat_finished(job: _Job, options: ProcessOptions) -> CaptureOutcome:
     log.info("%s: was finished before; nothing to do", job.name)
     account = json.loads(job.run.run_json.read_bytes())
     if options.json_lines:
-        for line in job.run.parameters.read_text(encoding="utf-8").splitlines():
+        for line in job.run.parameters.read_text("utf-8").splitlines():
             console.emit(line)
     return CaptureOutcome(job.name, job.run.path, account["counts"], account["verdict"], 0.0)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -24,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.files import label, require_regular_file
+from virest.capture.location import RemotePath, unreachable
 from virest.capture.pictures import PictureList, first_size, is_picture_source, read_picture_list, read_pictures
 from virest.errors import VideoError
 
@@ -103,7 +105,7 @@ def probe_movie(path: Path) -> MovieIndex:
     if size == 0:
         raise VideoError(f"{label(path)}: is empty", hint="the recording was not stopped cleanly, or the copy failed")
     try:
-        with _open(path) as container:
+        with _opened(path) as container:
             stream = _video_stream(container, path)
             width, height = stream.codec_context.width, stream.codec_context.height
             _check_size(width, height, path)
@@ -144,9 +146,21 @@ def _reason(fault: Exception) -> str:
     return (getattr(fault, "strerror", None) or str(fault)).lower()
 
 
-def _open(path: Path) -> Any:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The movie's container. Raises `unreachable` where an address gives no bytes, for the movie may be sound."""
+    if isinstance(path, RemotePath):
+        try:
+            with path.open_at_random() as stream, av.open(stream, format=CONTAINER, metadata_errors="replace") as found:
+                yield found
+        except av.FFmpegError:
+            raise
+        except OSError as fault:
+            raise unreachable(path, fault) from None
+        return
     # An absolute path cannot be taken for a protocol ("http:...").
-    return av.open(str(path.absolute()), format=CONTAINER, metadata_errors="replace")
+    with av.open(str(path.absolute()), format=CONTAINER, metadata_errors="replace") as container:
+        yield container
 
 
 def _video_stream(container: Any, path: Path) -> Any:
@@ -210,7 +224,7 @@ def _read(
     require_regular_file(path, VideoError, "a capture needs its movie.mp4")
     for run in _runs(index, frames):
         try:
-            with _open(path) as container:
+            with _opened(path) as container:
                 stream = _video_stream(container, path)
                 stream.thread_type = "NONE"
                 stream.codec_context.thread_count = 1

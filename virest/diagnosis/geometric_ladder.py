@@ -501,7 +501,7 @@ def findings_of(verdict: GeometricVerdict) -> list[Finding]:
     found = []
     for entry in verdict.accepted:
         changes = changes_of(verdict, entry)
-        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, verdict.noise_px)
+        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, min(verdict.noise_px, verdict.final_rms_px))
         sentence = _sentence(entry, changes)
         found.append(Finding(entry.name, changes, held_out, entry.rivals, entry.p_value, sentence))
     return sorted(found, key=lambda f: f.held_out.after**2 - f.held_out.before**2)

@@ -347,16 +347,37 @@ def _covariance(
     white: Array = inverse * max(float(np.sum(weight * residual**2) / np.sum(weight)), 1.0)
     doubt = MEMORY_DOUBT * _memory(values) * _pull_of_memory(normal)
     lag = LAG_DOUBT * _changes(effects, values)
-    model = np.outer(doubt, doubt) + np.diag(lag**2 + _resolution(effects) ** 2)
+    model = np.outer(doubt, doubt) + np.diag(lag**2) + _resolution(observations, profile, effects, values)
     return _at_least(inverse @ spread @ inverse, white) + model
 
 
-def _resolution(effects: Sequence[PhotometricEffect]) -> Array:
-    """RESOLUTION of each value and of the memory; of a flicker only the amplitude has one."""
-    parts = [np.full(len(effect.parameters), RESOLUTION[effect.name]) for effect in effects]
-    for effect, part in zip(effects, parts, strict=True):
-        part[1:] *= effect.per_frame
-    return np.concatenate([*parts, [0.0]])
+def _resolution(
+    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array
+) -> Array:
+    """Covariance (k + 1, k + 1) that RESOLUTION adds to that of the values and the memory."""
+    added, start = np.zeros((len(values), len(values))), 0
+    for effect in effects:
+        own = slice(start, start + len(effect.parameters))
+        square = RESOLUTION[effect.name] ** 2
+        if effect.name == "flicker":
+            added[own, own] = square * _pulse_resolution(observations, profile, float(values[start]))
+        else:
+            added[own, own] = np.diag(np.full(len(effect.parameters), square))
+        start = own.stop
+    return added
+
+
+def _pulse_resolution(observations: PhotometricObservations, profile: CameraProfile, amplitude: float) -> Array:
+    """What an error ε of a flicker's complex amplitude does to (amplitude, frequency, phase), (3, 3), over ε².
+
+    Across the amplitude it turns the phase at the capture's middle by ε / amplitude.  If it changes on the way, as an
+    encoder's does, with the same mean, it turns the frequency by √12 / (2π duration) of that; the phase at time 0 too.
+    """
+    time_s = observations.row_time_s(profile)
+    middle, duration = float(time_s.mean()), max(float(np.ptp(time_s)), 0.1)
+    at_middle = 1 / max(abs(amplitude), RESOLUTION["flicker"])
+    drift = at_middle * np.sqrt(12) / (2 * np.pi * duration) * np.array([0.0, 1.0, -2 * np.pi * middle])
+    return np.diag([1.0, 0.0, at_middle**2]) + np.outer(drift, drift)
 
 
 def _changes(effects: Sequence[PhotometricEffect], values: Array) -> Array:

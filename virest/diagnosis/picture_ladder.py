@@ -34,6 +34,8 @@ Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 MAX_P = 1e-5
 MIN_GAIN = 0.15
 """Least part of the excess over the noise that a cause of brightness must take away on held-out blocks."""
+LEAST_FALL = 0.02
+"""Least part of the held-out mean square that it takes away, where the noise measured leaves no excess."""
 MAX_RUNGS = 3
 MIN_OBSERVATIONS = 300
 VARIED_LIGHT = 0.25
@@ -108,7 +110,7 @@ def _climb(verdict: PictureVerdict, observations: PhotometricObservations, movie
         verdict.rungs.append(rung[0])
         if rung[1] is None:
             break
-        accepted, plain = [*accepted, rung[1]], rung[2]
+        accepted, plain = _still_needed(observations, nominal, [*accepted, rung[1]], rung[2])
     if not accepted:
         verdict.observations = observations.with_memory(plain.memory)
         return
@@ -143,9 +145,23 @@ def _rung(
             continue
         held_out = judge(observations, nominal, [*accepted, effect])
         log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
-        if held_out.gain > MIN_GAIN:
+        if held_out.gain > MIN_GAIN and held_out.after**2 < (1 - LEAST_FALL) * held_out.before**2:
             return replace(nothing, entered=name), effect, fits[name]
     return nothing, None, plain
+
+
+def _still_needed(
+    observations: PhotometricObservations,
+    nominal: CameraProfile,
+    accepted: list[PhotometricEffect],
+    fitted: PhotometricFit,
+) -> tuple[list[PhotometricEffect], PhotometricFit]:
+    """Without causes that a later one made superfluous: free gains take up whatever else changes frames' brightness."""
+    for effect in accepted[:-1]:
+        if significance(fitted, effect.name, observations)[1] > MAX_P:
+            accepted = [other for other in accepted if other is not effect]
+            fitted = fit_photometry(observations, nominal, accepted)
+    return accepted, fitted
 
 
 def _finding(

@@ -29,9 +29,9 @@ from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHU
 
 def process(
     captures: Captures,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="One folder a capture goes in here.")] = Path(
-        "virest-out"
-    ),
+    out: Annotated[
+        str, typer.Option("--out", metavar="DIR", help="One folder a capture goes in here; an s3:// address too.")
+    ] = "virest-out",
     config: Config = None,
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings, as configs/balanced.yaml.")] = None,
     frames: Annotated[
@@ -89,6 +89,7 @@ def process(
     one_thread_each()
     from virest.app.process import ProcessOptions, process_captures
     from virest.app.settings import compose_settings
+    from virest.capture.location import locate
 
     composed = compose_settings(
         settings,
@@ -99,7 +100,7 @@ def process(
         keep_start_up=keep_start_up or None,
     )
     options = ProcessOptions(
-        out,
+        locate(out),
         composed,
         config,
         chosen,
