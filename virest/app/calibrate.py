@@ -13,7 +13,7 @@ import numpy as np
 
 from virest.app.console import table
 from virest.app.outputs import output_error, write_whole
-from virest.calibration.geometry import OPTIONAL, CalibratedValue, GeometryCalibration, calibrate_geometry
+from virest.calibration.geometry import FRAME_LAG, OPTIONAL, CalibratedValue, GeometryCalibration, calibrate_geometry
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
 from virest.camera.profile import CameraProfile, format_profile, load_yaml_mapping, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
@@ -24,7 +24,6 @@ from virest.errors import CalibrationError, OutputError
 from virest.motion.alignment import choose_pairs
 from virest.motion.tracking import track_pairs
 
-FRAME_LAG = "frame-lag"
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
 """What ``--with`` takes."""
 MAX_FRAMES = 400
@@ -106,7 +105,7 @@ def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str
     """Read the capture and its profile, and choose the frames. Raises CaptureError, SettingsError, CalibrationError."""
     capture = read_capture(path)
     profile, source = resolve_profile(capture, config)
-    frames = choose_frames(capture, profile, FRAME_LAG in extra and FRAME_LAG in OPTIONAL)
+    frames = choose_frames(capture, profile, FRAME_LAG in extra)
     if not frames:
         raise CalibrationError(
             f"{capture.name}: no frame can be used: {capture.frames[0].skip_reason}",
@@ -210,7 +209,7 @@ def _profile_text(facts: Json, profile: CameraProfile) -> str:
 
 def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise | None) -> Json:
     """Everything that was found, as one mapping."""
-    values = [_value_facts(value) for value in (*found.values, *_not_fitted(plan, found))]
+    values = [_value_facts(value) for value in found.values]
     undetermined = [value["name"] for value in values if not value["determined"]]
     return {
         "capture": plan.capture.name,
@@ -251,14 +250,6 @@ def _value_facts(value: CalibratedValue) -> Json:
         "determined": value.determined,
         "note": value.note,
     }
-
-
-def _not_fitted(plan: CalibrationPlan, found: GeometryCalibration) -> list[CalibratedValue]:
-    """What was asked for and is not among the values: not determined, never silently left out."""
-    if FRAME_LAG not in plan.extra or any("lag" in value.name for value in found.values):
-        return []
-    start = plan.profile.extensions.frame_lag_s
-    return [CalibratedValue("lag_s", start, start, None, False, "not fitted: start-up frames were left out")]
 
 
 def _imu_facts(noise: ImuNoise | None) -> Json | None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.calibration.start_up import StartUpLag, fit_start_up_lag
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -65,7 +66,9 @@ OPTIONAL = {
     "clock-skew": terms_of.CLOCK_SKEW,
     "exposure-scale": terms_of.EXPOSURE_SCALE,
 }
-"""What ``--with`` adds."""
+"""What ``--with`` adds to the fit of points."""
+FRAME_LAG = "frame-lag"
+"""The start-up's lag, which ``--with`` adds too."""
 MAX_STD = {
     "time_offset": 0.002,
     "readout_time": 0.002,
@@ -148,6 +151,10 @@ def calibrate_geometry(
     """
     say = progress or (lambda _: None)
     observed = observe_tracks(capture, pairs, profile)
+    lag = None
+    if FRAME_LAG in extra and len(observed.pairs) >= MIN_PAIRS:
+        lag = fit_start_up_lag(capture, observed, profile)
+        observed = _at_true_times(capture, observed, lag)
     coarse, skew = _require_coarse(observed, capture.imu, profile, "clock-skew" in extra)
     unknown_focal = profile.intrinsics is None
     start = replace(_started(profile, observed, coarse), clock_skew=skew)
@@ -171,7 +178,22 @@ def calibrate_geometry(
         if not astray:
             break
     say("joint")
-    return _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out)
+    found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out)
+    return found if lag is None else _with_lag(found, lag)
+
+
+def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) -> ObservedTracks:
+    """The pairs with the stamps that a lag gives them; without one those of the start-up are left out."""
+    if lag.determined:
+        return replace(observed, stamp_s=observed.stamp_s + np.array(lag.by_frame_s))
+    usable = np.array([frame.skip_reason is None for frame in capture.frames])
+    return observed.chosen(np.array([usable[pair.first] and usable[pair.second] for pair in observed.pairs]))
+
+
+def _with_lag(found: GeometryCalibration, lag: StartUpLag) -> GeometryCalibration:
+    extensions = replace(found.profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
+    value = CalibratedValue("lag_s", 0.0, lag.lag_s, lag.std_s if lag.determined else None, lag.determined, lag.note)
+    return replace(found, profile=replace(found.profile, extensions=extensions), values=(*found.values, value))
 
 
 def _for_table(scene: Motion | None, table: TrackTable) -> Motion | None:

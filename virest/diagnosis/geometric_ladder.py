@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
@@ -31,7 +32,6 @@ from virest.diagnosis.geometric_evidence import (
     loss,
     relief_loss,
 )
-from virest.diagnosis.start_up import Schedule
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable
 from virest.motion.tracking_bias import bias_std

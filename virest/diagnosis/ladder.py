@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from virest.calibration.start_up import Schedule, lag_schedules
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
@@ -36,7 +37,6 @@ from virest.diagnosis.findings import (
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, FarClock, GeometricVerdict, climb, findings_of, varies
 from virest.diagnosis.picture_ladder import Reader, climb_blur, climb_photometry, judge_curve
-from virest.diagnosis.start_up import Schedule, lag_schedules
 from virest.diagnosis.structure import Structure, structures
 from virest.errors import CaptureError
 from virest.motion import profile_terms as terms_of

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from motion.synthetic_tracks import Recording, Setup
 
+from virest.calibration.start_up import EXTRA_PERIODS, fit_start_up_lag, lag_schedules
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, CaptureMetadata, Frame
-from virest.diagnosis.start_up import EXTRA_PERIODS, lag_schedules
 
 PERIOD_S = 0.04
 
@@ -45,3 +47,20 @@ def test_a_recording_that_ends_while_it_lags_may_lag_longer() -> None:
     base = np.array([2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 0, 0])
     for extra, (_, _, seconds) in zip(EXTRA_PERIODS, found, strict=True):
         np.testing.assert_allclose(seconds, PERIOD_S * (base + extra), atol=1e-12)
+
+
+def test_turns_tell_whether_the_repeats_are_a_lag() -> None:
+    """Two periods late at first, one from slot 9, none from 14: found; the same repeats on time: not believed."""
+    recording = Recording(Setup(seed=71, frames=40, points=20, gyro_noise_rad_s=0.001))
+    stamp_s, period_s = recording.stamp_s, 1 / 29.7
+    late_s = period_s * np.array([2] * 9 + [1] * 5 + [0] * 26)
+    shown = replace(capture(40), repeats=(9, 14), imu=recording.imu)
+    for shift_s, believed in ((late_s, True), (0 * late_s, False)):
+        logged_s = stamp_s - shift_s
+        frames = tuple(Frame(k, 0, float(t)) for k, t in enumerate(logged_s))
+        lag = fit_start_up_lag(
+            replace(shown, frames=frames), replace(recording.observed, stamp_s=logged_s), recording.profile
+        )
+        assert lag.determined == believed
+        assert lag.lag_s == pytest.approx(2 * period_s if believed else 0.0)
+        assert lag.frames == (14 if believed else 0)

@@ -1,0 +1,143 @@
+"""The same segments on a Dask cluster: the same bytes, whoever dies meanwhile."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cluster_processes import Cluster, running_cluster
+
+from virest.app import jobs
+from virest.app.cluster import is_lost
+from virest.app.jobs import Workers
+from virest.errors import RestorationError
+
+Virest = Callable[..., "subprocess.CompletedProcess[str]"]
+SLOW = ("--preset", "best", "--deblur", "wiener")
+SIMULATED = "--width 180 --height 240 --frames 60 --exposure-ms 12 --rate 2 --seed 11"
+
+
+def content(run: Path) -> dict[str, Any]:
+    """Everything in a run's folder, without what a clock or the command line decides."""
+    found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
+    lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
+    found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+    account = json.loads(found["run.json"])
+    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
+    return found
+
+
+def wait_until(condition: Callable[[], bool], process: "subprocess.Popen[str]") -> None:
+    """Wait for something while a process runs."""
+    end = time.monotonic() + 120
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def turning(virest: Virest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of a phone that turns, to be restored."""
+    folder = tmp_path_factory.mktemp("captures") / "turning"
+    done = virest("simulate", folder, "-q", *SIMULATED.split())
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(virest: Virest, turning: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What a local run of one process leaves."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    done = virest("process", turning, "--out", out, *SLOW, "--jobs", 1)
+    assert done.returncode == 0, done.stderr
+    return content(out / "turning")
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    """A scheduler and two workers."""
+    with running_cluster(tmp_path / "cluster", 2) as found:
+        yield found
+
+
+def start(turning: Path, out: Path, address: str, *options: str) -> "subprocess.Popen[str]":
+    """Start a run on a cluster."""
+    command = [sys.executable, "-m", "virest", "process", str(turning), "--out", str(out), *SLOW]
+    command += ["--scheduler", address, *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finished_segments(run: Path) -> int:
+    """Count the logs of segments."""
+    return len(list((run / ".segments").glob("*.jsonl"))) if (run / ".segments").is_dir() else 0
+
+
+@pytest.mark.scenario
+def test_a_killed_worker_costs_its_segments_only(
+    turning: Path, undisturbed: dict[str, Any], cluster: Cluster, tmp_path: Path
+) -> None:
+    """One of two is killed in the middle: the other does its segments, and the folder is that of a local run."""
+    with start(turning, tmp_path / "out", cluster.address) as process:
+        wait_until(lambda: finished_segments(tmp_path / "out/turning") > 0, process)
+        os.kill(cluster.workers[0].pid, signal.SIGKILL)
+        _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert content(tmp_path / "out/turning") == undisturbed
+    assert undisturbed["run.json"]["counts"]["restored"] > 50
+
+
+@pytest.mark.scenario
+def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
+    turning: Path, undisturbed: dict[str, Any], cluster: Cluster, tmp_path: Path
+) -> None:
+    """Exit 7; what was done stays; on another cluster, --resume ends as if nothing had happened."""
+    run = tmp_path / "out/turning"
+    with start(turning, tmp_path / "out", cluster.address) as process:
+        wait_until(lambda: finished_segments(run) > 0, process)
+        cluster.scheduler.kill()
+        output, errors = process.communicate(timeout=120)
+    lines = [line for line in errors.splitlines() if "error" in line.lower()]
+    assert process.returncode == 7, errors
+    assert "Traceback" not in errors
+    assert len(lines) == 1, errors
+    assert "gone" in lines[0]
+    assert "--resume" in lines[0]
+    assert output == ""
+    kept = finished_segments(run)
+    assert kept
+    with (
+        running_cluster(tmp_path / "another", 1) as other,
+        start(turning, tmp_path / "out", other.address, "--resume") as process,
+    ):
+        output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert content(run) == undisturbed
+
+
+def test_a_wrong_address_is_one_line(virest: Virest, tmp_path: Path) -> None:
+    """Exit 3, before anything is read."""
+    result = virest("process", tmp_path, "--out", tmp_path / "out", "--scheduler", "tcp://127.0.0.1:1")
+    assert result.returncode == 3
+    assert "--scheduler tcp://127.0.0.1:1" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_work_that_is_called_off_is_not_written_down_as_failed() -> None:
+    """A lost scheduler cancels what was sent; that is no fault of the frames."""
+    future: Future[dict[str, int]] = Future()
+    future.cancel()
+    future.set_running_or_notify_cancel()
+    with pytest.raises(RestorationError, match="called off"):
+        jobs._collect(future, None, Workers(1))  # type: ignore[arg-type]
+    assert isinstance(CancelledError(), Exception)
+    assert is_lost(RestorationError("gone", cluster_lost=True))
+    assert not is_lost(RestorationError("kernel is singular"))

@@ -1,0 +1,213 @@
+"""The same segments on a Dask cluster: an executor over ``Client.get_executor()``, and plain words where it fails.
+
+Dask gives a segment whose worker died to another one by itself, and gives up after some deaths.  What is left to do
+here: look at the workers before any work, know how many segments keep them busy, notice that the scheduler or all
+workers are gone, and let no worker write on after the program has left.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+import uuid
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from virest import __version__
+from virest.capture.location import is_remote
+from virest.errors import RestorationError, SettingsError
+
+log = logging.getLogger(__name__)
+
+CONNECT_S = 10.0
+FIRST_WORKER_S = 30.0
+"""How long to wait for a cluster's first worker, and, once all are gone, for one to come back."""
+LOOK_S = 2.0
+"""How old the count of workers may be."""
+LAST_SEGMENT_S = 120.0
+"""How long to wait for segments that are being worked on when the program leaves."""
+LIBRARIES = ("numpy", "opencv-python-headless", "av", "isal")
+"""Those that decide the bytes of a picture."""
+
+
+def is_lost(error: BaseException) -> bool:
+    """Whether an error says that the scheduler, or every worker, is gone: no fault of a capture, and none is left."""
+    return isinstance(error, RestorationError) and bool(error.facts.get("cluster_lost"))
+
+
+def worker_facts() -> dict[str, str]:
+    """What is installed where this is called."""
+    return {"virest": __version__, **{name: version(name) for name in LIBRARIES}}
+
+
+def missing_places(places: list[str]) -> list[str]:
+    """Which of the places are not there where this is called."""
+    return [place for place in places if not Path(place).exists()]
+
+
+def _being_worked_on(run: str, dask_worker: Any) -> int:
+    return sum(str(key).startswith(run) for key in dask_worker.active_threads.values())
+
+
+class ClusterExecutor(Executor):
+    """Hands work to the workers of a Dask scheduler. Raises SettingsError where they cannot do it."""
+
+    def __init__(self, address: str, *, verbose: bool = False) -> None:
+        self.address = address
+        self._run = f"virest-{uuid.uuid4().hex[:12]}"
+        self._sent = 0
+        self._client = _connect(address, verbose)
+        self._executor = self._client.get_executor(pure=False)
+        self._looked_s, self._slots = 0.0, 0
+        self._alone_since_s: float | None = None
+        try:
+            self._require_alike()
+        except BaseException:
+            self._client.close(timeout=CONNECT_S)
+            raise
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Send a call to a worker. The future is cancelled if the scheduler is lost."""
+        self._sent += 1
+        key = f"{self._run}-{self._sent}"
+        try:
+            return self._executor.submit(fn, *args, key=key, **kwargs)  # type: ignore[no-any-return]
+        except Exception as error:  # Dask has a type of its own for a client that closed itself
+            raise self.lost() from error
+
+    @property
+    def slots(self) -> int:
+        """Segments that keep every thread of every worker busy, and one more a worker while its answer travels."""
+        if time.monotonic() - self._looked_s > LOOK_S:
+            threads = self._threads()
+            self._slots = max(sum(threads.values()) + len(threads), 2)
+            self._looked_s = time.monotonic()
+        return self._slots
+
+    def check(self) -> None:
+        """Raise RestorationError if no worker has been there for a while."""
+        if self._threads():
+            self._alone_since_s = None
+            return
+        if self._alone_since_s is None:
+            self._alone_since_s = time.monotonic()
+            log.warning("the scheduler %s has no workers; waiting %.0f s for one", self.address, FIRST_WORKER_S)
+        if time.monotonic() - self._alone_since_s > FIRST_WORKER_S:
+            raise RestorationError(
+                f"the scheduler {self.address} has had no workers for {FIRST_WORKER_S:.0f} s",
+                hint="start workers, then go on with --resume",
+                cluster_lost=True,
+            )
+
+    def lost(self) -> RestorationError:
+        """The error of a scheduler that does not answer any more."""
+        return RestorationError(
+            f"the scheduler {self.address} is gone; the segments that are done stay",
+            hint="start it again, then go on with --resume",
+            cluster_lost=True,
+        )
+
+    def require_places(self, places: list[Path]) -> None:
+        """Raise SettingsError unless every worker sees these files and folders of a shared disk."""
+        shared = [str(place.absolute()) for place in places if not is_remote(place)]
+        if not shared:
+            return
+        for worker, missing in self._ask(missing_places, shared).items():
+            if missing:
+                raise SettingsError(
+                    f"the worker {worker} does not see {missing[0]}",
+                    hint="captures and --out have to lie on a disk that all share, or behind an address such as s3://",
+                )
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let go of the cluster; nothing of ours is being written any more afterwards."""
+        if self._client.status == "running":
+            self._executor.shutdown(wait=wait and not cancel_futures)
+            self._await_last()
+        self._client.close(timeout=CONNECT_S)
+
+    # ── asking ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+    def _threads(self) -> dict[str, int]:
+        """Threads of each worker, as the scheduler knows them."""
+        try:
+            if self._client.status == "running":
+                return dict(self._client.sync(self._client.scheduler.ncores, callback_timeout=CONNECT_S))
+        except OSError as error:
+            raise self.lost() from error
+        raise self.lost()
+
+    def _ask(self, fn: Callable[..., Any], *args: Any) -> dict[str, Any]:
+        try:
+            return dict(self._client.run(fn, *args))
+        except Exception as error:  # whatever the worker raised, or Dask's own complaint
+            raise SettingsError(
+                f"--scheduler {self.address}: a worker cannot do the work: {type(error).__name__}: {_line(error)}",
+                hint=f"install virest {__version__} with its extra [cluster] on every worker",
+            ) from error
+
+    def _require_alike(self) -> None:
+        """Refuse workers with another version of this program; say where a library differs."""
+        ours = worker_facts()
+        for worker, theirs in self._ask(worker_facts).items():
+            if theirs["virest"] != ours["virest"]:
+                raise SettingsError(
+                    f"--scheduler {self.address}: the worker {worker} has virest {theirs['virest']}, here is "
+                    f"{ours['virest']}",
+                    hint="install the same version everywhere",
+                )
+            other = [f"{name} {theirs[name]}, here {ours[name]}" for name in LIBRARIES if theirs[name] != ours[name]]
+            if other:
+                log.warning("the worker %s has %s: bytes may differ from a local run", worker, "; ".join(other))
+
+    def _await_last(self) -> None:
+        """Wait for what workers are in the middle of: a segment that was called off is still written to its end."""
+        end_s = time.monotonic() + LAST_SEGMENT_S
+        while time.monotonic() < end_s:
+            try:
+                if not any(self._client.run(_being_worked_on, self._run, on_error="ignore").values()):
+                    return
+            except Exception:  # the scheduler went away meanwhile; nobody is left to ask
+                return
+            time.sleep(0.1)
+        log.warning("a worker is still writing a segment that was called off; wait before --overwrite")
+
+
+def _connect(address: str, verbose: bool) -> Any:
+    import dask
+    from dask.distributed import Client
+
+    if not verbose:  # what it has to say about lost connections is said here in one line
+        for name in ("distributed", "tornado", "asyncio"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECT_S}s"})
+    try:
+        asyncio.run(_knock(address))  # a client that cannot connect would complain at length when it is taken away
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise SettingsError(
+            f"--scheduler {address}: {_line(error)}", hint="start `dask scheduler`, or leave it out"
+        ) from error
+    try:
+        client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+    except OSError:
+        client.close(timeout=CONNECT_S)
+        raise SettingsError(
+            f"--scheduler {address}: has no workers", hint=f"start some: dask worker {address} --nthreads 1"
+        ) from None
+    return client
+
+
+async def _knock(address: str) -> None:
+    from distributed.comm import connect
+
+    comm = await connect(address, timeout=CONNECT_S)
+    await comm.close()
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]
