@@ -10,6 +10,7 @@ software encoders put it whatever they tag; at the price of half a pixel of chro
 
 from __future__ import annotations
 
+import ctypes
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -32,7 +33,12 @@ from virest.errors import VideoError
 log = logging.getLogger(__name__)
 
 MAX_SIDE_PX = 16384
+MAX_PIXELS = 40_000_000
+"""8K and a margin; held against the size that the pictures themselves say, too, before memory is asked for."""
 MAX_FRAMES = 2_000_000
+"""Eighteen hours at 30 frames/s."""
+MAX_BLOCK_BYTES = 1 << 28
+"""The largest piece of memory that FFmpeg may ask for: tables of contents promise millions of frames in a few bytes."""
 CONTAINER = "mov"
 """MP4, QuickTime and 3GP. Named, so that no playlist in a movie's clothes makes the reader open other files."""
 KR_KB = {
@@ -148,19 +154,36 @@ def _reason(fault: Exception) -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The movie's container. Raises `unreachable` where an address gives no bytes, for the movie may be sound."""
+    """The movie's container, with bounds on memory. Raises `unreachable` where an address gives no bytes, for the movie may be sound."""
+    _bound_memory()
+    bounds = {"max_pixels": str(MAX_PIXELS)}
     if isinstance(path, RemotePath):
         try:
-            with path.open_at_random() as stream, av.open(stream, format=CONTAINER, metadata_errors="replace") as found:
-                yield found
+            with (
+                path.open_at_random() as stream,
+                av.open(stream, format=CONTAINER, metadata_errors="replace", options=bounds) as container,
+            ):
+                yield container
         except av.FFmpegError:
             raise
         except OSError as fault:
             raise unreachable(path, fault) from None
         return
     # An absolute path cannot be taken for a protocol ("http:...").
-    with av.open(str(path.absolute()), format=CONTAINER, metadata_errors="replace") as container:
+    with av.open(str(path.absolute()), format=CONTAINER, metadata_errors="replace", options=bounds) as container:
         yield container
+
+
+@lru_cache(maxsize=1)
+def _bound_memory() -> bool:
+    """Have FFmpeg refuse blocks above MAX_BLOCK_BYTES; False where its library cannot be told apart (not Linux)."""
+    try:
+        mapped = Path("/proc/self/maps").read_text().splitlines()
+        library = next(line.split(maxsplit=5)[-1] for line in mapped if "/libavutil" in line)
+        ctypes.CDLL(library).av_max_alloc(ctypes.c_size_t(MAX_BLOCK_BYTES))
+    except (OSError, StopIteration, AttributeError):
+        return False
+    return True
 
 
 def _video_stream(container: Any, path: Path) -> Any:
@@ -173,8 +196,8 @@ def _video_stream(container: Any, path: Path) -> Any:
 
 
 def _check_size(width: int, height: int, path: Path) -> None:
-    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
-        text = f"{label(path)}: picture size {width}x{height}, at most {MAX_SIDE_PX} px a side"
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and width * height <= MAX_PIXELS):
+        text = f"{label(path)}: picture size {width}x{height}, at most {MAX_SIDE_PX} px a side and {MAX_PIXELS} in all"
         raise VideoError(text, hint="is it damaged?")
 
 
@@ -228,6 +251,7 @@ def _read(
                 stream = _video_stream(container, path)
                 stream.thread_type = "NONE"
                 stream.codec_context.thread_count = 1
+                stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
                 for frame_index, frame in _in_order(run, _decoded(container, stream, index, run[0])):
                     usable = frame is not None and (frame.width, frame.height) == (index.width, index.height)
                     yield frame_index, convert(frame) if usable else None

@@ -67,6 +67,10 @@ class MixingEvidence:
 
     pair: Indices
     """(n,) number of the pair of frames."""
+    pixels: Array
+    """(n,) pixels that took part, every second one along both sides."""
+    noise: Array
+    """(n,) robust standard deviation of what remains, grey levels."""
     stiffness: dict[str, Array]
     """Effect → (n,) squared length of its pattern in noises, per unit of the effect squared."""
     score: dict[str, Array]
@@ -76,6 +80,8 @@ class MixingEvidence:
         """Only the chosen tiles."""
         return MixingEvidence(
             self.pair[use],
+            self.pixels[use],
+            self.noise[use],
             {name: v[use] for name, v in self.stiffness.items()},
             {name: v[use] for name, v in self.score.items()},
         )
@@ -111,12 +117,14 @@ def observe_mixing(
         if sharp in pictures and blurred in pictures:
             pair = (by_index[sharp], pictures[sharp]), (by_index[blurred], pictures[blurred])
             rows += [(number, row) for row in _compare(*pair, trajectory, profile, settings)]
-    table = np.array([row for _, row in rows]).reshape(-1, 8)
+    table = np.array([row for _, row in rows]).reshape(-1, 10)
     names = tuple(STEPS)
     return MixingEvidence(
         np.array([number for number, _ in rows], np.intp),
-        {name: table[:, 4 * i] for i, name in enumerate(names)},
-        {name: table[:, 4 * i + 1 : 4 * i + 4] for i, name in enumerate(names)},
+        table[:, 0],
+        table[:, 1],
+        {name: table[:, 4 * i + 2] for i, name in enumerate(names)},
+        {name: table[:, 4 * i + 3 : 4 * i + 6] for i, name in enumerate(names)},
     )
 
 
@@ -203,7 +211,7 @@ def _compare(
     profile: CameraProfile,
     settings: MixingSettings,
 ) -> list[Array]:
-    """Stiffness and scores (8,) of each usable tile of one pair."""
+    """Pixels, noise, stiffness and scores (10,) of each usable tile of one pair."""
     height, width = blurred[1].shape[:2]
     here, there = (Follower(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
     where = seen_elsewhere(here, there, trajectory, profile, _nodes(width, height))
@@ -260,7 +268,7 @@ def _tile_scores(
         noise = 1.4826 * float(np.median(np.abs(left))) + 0.2
         weight = 1 / np.sqrt(1 + (left / (2.5 * noise)) ** 2)
     base = np.linalg.qr(weight[:, None] * free)[0]
-    row = []
+    row = [float(len(target)), noise]
     for level, pattern in zip(levels, patterns, strict=True):
         own = weight * pattern
         own = own - base @ (base.T @ own)

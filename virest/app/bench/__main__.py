@@ -21,6 +21,7 @@ from virest.app.bench.curves import curves_section
 from virest.app.bench.diagnosis import diagnosis_section
 from virest.app.bench.memory import memory_section
 from virest.app.bench.quality import quality_section
+from virest.app.bench.real import real_section
 from virest.app.bench.shutter import shutter_section
 from virest.app.bench.speed import speed_section
 from virest.app.bench.workload import Scale
@@ -34,6 +35,7 @@ SECTIONS: dict[str, Section] = {
     "memory": memory_section,
     "curves": curves_section,
     "diagnosis": diagnosis_section,
+    "real": real_section,
 }
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image")
 

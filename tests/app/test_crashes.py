@@ -1,0 +1,97 @@
+"""A run that is killed at any moment, and continued, ends as if nothing had happened.
+
+VIREST_KILLS sets how many moments are tried (a handful in the suite).
+"""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Virest = Callable[..., "subprocess.CompletedProcess[str]"]
+KILLS = int(os.environ.get("VIREST_KILLS", "2"))
+CHANGES = ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "shutil.rmtree")
+"""Audit events that change a folder, beside files that are opened for writing."""
+DIES = """
+import os, signal, sys
+place, step, left = sys.argv[1], int(sys.argv[2]), 0
+
+def count(event, arguments):
+    global left
+    writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    if (writes or event in {changes!r}) and str(arguments[0]).startswith(place):
+        left += 1
+        if left == step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+from virest.app.cli import run
+import virest.app.process
+sys.addaudithook(count)
+code = run(sys.argv[3:])
+print(left)
+sys.exit(code)
+""".replace("{changes!r}", repr(set(CHANGES)))
+
+
+def content(run: Path) -> dict[str, Any]:
+    """Everything in a run's folder, without what a clock or the command line decides."""
+    found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
+    lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
+    found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+    account = json.loads(found["run.json"])
+    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
+    return found
+
+
+def run_dying(step: int, tiny: Path, out: Path, *options: str) -> "subprocess.CompletedProcess[str]":
+    """Run with one process that kills itself at its ``step``-th change of the output folder; 0 never."""
+    arguments = [str(out), str(step), "process", str(tiny), "--out", str(out), "--preset", "fast", "--jobs", "1"]
+    command = [sys.executable, "-c", DIES, *arguments, "-q", *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.scenario
+def test_killed_before_any_change_of_the_folder_resume_ends_the_same(tiny: Path, tmp_path: Path) -> None:
+    """Steps drawn from all: making folders, opening parts, renaming them, the end's clearing away."""
+    done = run_dying(0, tiny, tmp_path / "undisturbed")
+    assert done.returncode == 0, done.stderr
+    steps, expected = int(done.stdout.splitlines()[-1]), content(tmp_path / "undisturbed/tiny")
+    assert steps > 24 * 2
+    rng = random.Random(42)
+    chosen = [*range(steps, 1, -1)][: max(KILLS // 4, 1)] + [rng.randint(1, steps) for _ in range(KILLS)]
+    for step in chosen:
+        out = tmp_path / f"killed-{step}"
+        assert run_dying(step, tiny, out).returncode == -signal.SIGKILL
+        again = run_dying(0, tiny, out, "--resume")
+        assert again.returncode == 0, (step, again.stderr)
+        assert content(out / "tiny") == expected, step
+        assert sorted(p.name for p in out.iterdir()) == ["tiny"]
+
+
+@pytest.mark.scenario
+def test_killed_at_random_times_with_workers_resume_ends_the_same(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """The parent dies and its workers with it, or one worker alone: then nothing has to be continued."""
+    options = ("--preset", "fast", "--jobs", "2", "-q")
+    began = time.monotonic()
+    assert virest("process", tiny, "--out", tmp_path / "undisturbed", *options).returncode == 0
+    whole_s, expected = time.monotonic() - began, content(tmp_path / "undisturbed/tiny")
+    rng = random.Random(7)
+    for number in range(max(KILLS // 2, 1)):
+        out = tmp_path / f"killed-{number}"
+        command = [sys.executable, "-m", "virest", "process", str(tiny), "--out", str(out), *options]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+            time.sleep(rng.uniform(0.3, 1.0) * whole_s)
+            process.kill()
+            process.communicate(timeout=60)  # returns when the last worker has let go of the pipe
+        ended = (out / "tiny/run.json").exists() and not (out / "tiny/.run").exists()
+        again = virest("process", tiny, "--out", out, *options, "--resume")
+        assert again.returncode == 0, (number, ended, again.stderr)
+        assert content(out / "tiny") == expected, number

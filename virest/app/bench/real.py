@@ -1,0 +1,74 @@
+"""Measured captures (the folder named by VIREST_REALDATA): what calibrate and diagnose say of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from virest.app.bench.tables import table
+from virest.app.bench.workload import Scale
+from virest.app.calibrate import plan_calibration
+from virest.app.diagnose import open_source
+from virest.calibration.geometry import calibrate_geometry
+from virest.camera.profile import CameraProfile
+from virest.capture.video import probe_movie, read_gray
+from virest.diagnosis.findings import Diagnosis
+from virest.diagnosis.geometric_ladder import shown
+from virest.diagnosis.ladder import diagnose_capture
+from virest.errors import VirestError
+from virest.motion.tracking import track_pairs
+
+CALIBRATED = {"lhaippp_car": (), "nexus5_162941": ("clock-skew",), "gopro_karma": (), "gopro_hero7": ()}
+DIAGNOSED = ("lhaippp_car", "nexus5_162941", "honor_v10", "gopro_hero7")
+ON_TIME = ("nexus5_162941",)
+"""Whose unknown offset is given as 0, for the diagnosis to find."""
+Row = list[str]
+
+
+def real_section(_work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
+    """Calibrate and diagnose the captures that are there."""
+    root = Path(os.environ.get("VIREST_REALDATA") or "/nonexistent")
+    if not root.is_dir():
+        return {
+            "skipped": "VIREST_REALDATA names no folder"
+        }, "Measured captures: skipped, VIREST_REALDATA names no folder"
+    calibrated = [row for name, extra in CALIBRATED.items() for row in _calibrated(root / name, extra)]
+    diagnosed = [row for name in DIAGNOSED for row in _diagnosed(root / name, name in ON_TIME)]
+    text = table(["calibrate", "value", "found", "std", "determined"], calibrated)
+    text += "\n\n" + table(["diagnose", "verdict", "cause", "found", "std", "before", "after", "rivals"], diagnosed)
+    return {"calibrate": calibrated, "diagnose": diagnosed}, f"Measured captures\n{text}"
+
+
+def _calibrated(folder: Path, extra: tuple[str, ...]) -> list[Row]:
+    try:
+        plan = plan_calibration(folder, None, extra)
+        movie = plan.capture.movie
+        pairs = track_pairs(read_gray(movie, probe_movie(movie), plan.frames))
+        found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
+    except VirestError as error:
+        return [[folder.name, "refused", str(error), "", ""]]
+    wanted = [value for value in found.values if value.name in ("time_offset_s", "readout_time_s", "clock_skew")]
+    return [
+        [folder.name, v.name, shown(v.value), "" if v.std is None else shown(v.std), "yes" if v.determined else "no"]
+        for v in wanted
+    ]
+
+
+def _diagnosed(folder: Path, on_time: bool) -> list[Row]:
+    source = open_source(folder)
+    profile: CameraProfile = replace(source.profile, time_offset_s=0.0) if on_time else source.profile
+    return _rows(folder.name, diagnose_capture(source.capture, profile, source.pictures, source.gray))
+
+
+def _rows(name: str, found: Diagnosis) -> list[Row]:
+    rows = [
+        [
+            name, found.verdict, cause.name, shown(change.estimate), "" if change.std is None else shown(change.std),
+            shown(cause.held_out.before), shown(cause.held_out.after), ", ".join(r.name for r in cause.rivals),
+        ]
+        for cause in found.causes
+        for change in list(cause.parameters.values())[:1]
+    ]  # fmt: skip
+    return rows or [[name, found.verdict, "none", "", "", "", "", ""]]

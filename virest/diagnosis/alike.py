@@ -1,0 +1,122 @@
+"""Causes that look alike: what one kind of evidence cannot tell apart, settled by another, or named as rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.shutter import STAMP_FRACTION
+from virest.diagnosis import picture_ladder
+from virest.diagnosis.findings import Finding, ParameterChange, Rival
+from virest.diagnosis.geometric_ladder import GeometricVerdict, varies
+
+Array = NDArray[np.float64]
+COINCIDENCE_SIGMA = 3.5
+
+
+def stamped(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
+    """At constant exposure an offset of just half or one exposure is another meaning of the stamp."""
+    if varies(exposure_s) or float(np.median(exposure_s)) <= 0:
+        return findings
+    nominal = geometric.nominal.profile
+    exposure = nominal.shutter.true_exposure_s(float(np.median(exposure_s)))
+    result = []
+    for finding in findings:
+        if finding.name == "timestamp_reference":
+            known = tuple(rival for rival in finding.rivals if rival.name != "time_offset")
+            result.append(replace(finding, rivals=(Rival("time_offset", finding.held_out.after), *known)))
+            continue
+        if finding.name != "time_offset":
+            result.append(finding)
+            continue
+        change = finding.parameters["time_offset_s"]
+        shift, std = change.estimate - (change.nominal or 0.0), float(change.std)
+        others = [rival for rival in finding.rivals if rival.name != "timestamp_reference"]
+        meaning = _meaning(nominal.shutter.timestamp, shift, exposure, std)
+        if meaning is None:
+            result.append(finding)
+            continue
+        result.append(
+            replace(
+                finding,
+                name="timestamp_reference",
+                parameters={"timestamp": ParameterChange(nominal.shutter.timestamp, meaning, None)},
+                rivals=(Rival("time_offset", finding.held_out.after), *others),
+                sentence=f"a frame's stamp means its {meaning}; or the clocks differ by {shift:.4g} s",
+            )
+        )
+        shutter = replace(geometric.model.profile.shutter, timestamp=meaning)
+        geometric.model = replace(
+            geometric.model,
+            profile=replace(geometric.model.profile, shutter=shutter, time_offset_s=nominal.time_offset_s),
+        )
+    return result
+
+
+def _meaning(now: str, shift_s: float, exposure_s: float, std_s: float) -> str | None:
+    """The stamp's meaning that an offset amounts to: its first row starts later by (now − meaning) exposures."""
+    for meaning, fraction in STAMP_FRACTION.items():
+        expected = (STAMP_FRACTION[now] - fraction) * exposure_s
+        if meaning != now and abs(shift_s - expected) < COINCIDENCE_SIGMA * std_s:
+            return meaning
+    return None
+
+
+def exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array) -> float | None:
+    """The exposure scale whose longer or shorter middle would look like the time offset found."""
+    exposure = float(np.median(exposure_s))
+    for finding in findings:
+        if finding.name == "time_offset" and not varies(exposure_s) and exposure > 0:
+            change = finding.parameters["time_offset_s"]
+            return 1.0 + 2.0 * (change.estimate - (change.nominal or 0.0)) / exposure
+    return None
+
+
+def as_exposure(findings: Sequence[Finding], scale: float, exposure_s: float) -> Finding:
+    """Put an offset down to the exposure: the points tell its size better than the blur."""
+    finding = next(f for f in findings if f.name == "time_offset")
+    std = 2.0 * float(finding.parameters["time_offset_s"].std) / exposure_s
+    return replace(
+        finding,
+        name="exposure_time",
+        parameters={"exposure_scale": ParameterChange(1.0, scale, std)},
+        rivals=(Rival("time_offset", finding.held_out.after),),
+        sentence=picture_ladder.SENTENCES["exposure_time"].format(exposure_scale=f"{scale:.3g}"),
+    )
+
+
+def one_exposure(blurred: picture_ladder.PictureVerdict) -> picture_ladder.PictureVerdict:
+    """The blur's verdict without an exposure of its own: the points have told it."""
+    blurred.findings = [finding for finding in blurred.findings if finding.name != "exposure_time"]
+    return blurred
+
+
+def exposed(profile: CameraProfile, scale: float) -> CameraProfile:
+    """The profile with its exposures longer by a factor."""
+    shutter = profile.shutter
+    return replace(profile, shutter=replace(shutter, exposure_scale=shutter.exposure_scale * scale))
+
+
+def merged(
+    moved: CameraProfile,
+    lit: CameraProfile,
+    blurred: CameraProfile,
+    is_exposure: bool,
+) -> CameraProfile:
+    """Every cause in one profile: geometry from the first, light from the second, blur from the third."""
+    light = lit.extensions
+    extensions = replace(
+        moved.extensions,
+        vignetting_corner_loss=light.vignetting_corner_loss,
+        flicker_amplitude=light.flicker_amplitude,
+        flicker_frequency_hz=light.flicker_frequency_hz,
+        flicker_phase_rad=light.flicker_phase_rad,
+        gain=light.gain,
+        defocus_sigma_px=blurred.extensions.defocus_sigma_px,
+    )
+    shutter = moved.shutter if is_exposure else replace(moved.shutter, exposure_scale=blurred.shutter.exposure_scale)
+    return replace(moved, response=lit.response, extensions=extensions, shutter=shutter)

@@ -1,0 +1,209 @@
+"""The points of a capture: tracked, with what the profile leaves open, ready for their ladder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.calibration.start_up import Schedule
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.capture.records import Capture, Frame
+from virest.degradation.light import flicker
+from virest.diagnosis.geometric_evidence import make_evidence
+from virest.diagnosis.geometric_ladder import FarClock, GeometricVerdict, climb
+from virest.diagnosis.picture_ladder import Reader
+from virest.motion import profile_terms as terms_of
+from virest.motion.coarse_alignment import align_coarsely, align_with_skew
+from virest.motion.integration import integrate_gyro
+from virest.motion.observed_tracks import CELLS, ObservedTracks
+from virest.motion.track_fit import Term
+from virest.motion.track_noise import step_noise_px
+from virest.motion.turns import gyro_turns
+
+Array = NDArray[np.float64]
+MIN_PAIRS = 6
+MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
+AXIS_EXPLAINED = 0.6
+"""Least squared correlation about one axis."""
+WELL_EXPLAINED = 0.98
+"""Turns that agree so well leave no other clock rate to look for far off."""
+STRAY_PART = 0.1
+"""More of the points than this gone their own way is no chance."""
+TOGETHER = 0.3
+"""Least intraclass correlation of points that move together."""
+NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 2).ravel()
+"""Number of the block of two by two cells that each cell lies in."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedPoints:
+    """Tracked points and where their ladder begins."""
+
+    capture: Capture
+    observed: ObservedTracks
+    start: CameraProfile
+    null_terms: tuple[Term, ...]
+    schedules: Sequence[Schedule]
+    far: FarClock
+    rungs_allowed: int
+
+    def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
+        """The ladder's end, climbed again without the parts of the picture that move together on their own."""
+        found = self._climbed(self.observed, progress)
+        if not self.rungs_allowed:
+            return found
+        cells = self.observed.astray_cells(found.table.first_px, found.fit.distance)
+        place = self.observed.cells(found.table.first_px)
+        there, astray = cells[place], float(cells[place].mean())
+        neighbours = len(cells) * found.table.pair + NEIGHBOURHOOD[place]
+        calm = found.fit.difference_px * found.fit.weight[:, None]
+        if astray < STRAY_PART or _together(calm[there], neighbours[there]) < TOGETHER:
+            return found
+        rest = self.observed.without_cells(cells)
+        again = self._climbed(replace(rest, noise_px=step_noise_px(rest.pairs)), progress)
+        again.astray = astray
+        again.notes.append(f"{astray:.0%} of the points lie in parts of the picture that go their own way: left out")
+        return again
+
+    def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
+        evidence = make_evidence(self.capture.imu, observed)
+        return climb(evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed)
+
+
+def _together(difference_px: Array, group: NDArray[np.intp]) -> float:
+    """How much of the differences (n, 2) neighbours of one moment share: their intraclass correlation.
+
+    Neighbours that are badly tracked share nothing; a thing that moves is shared by its points.
+    """
+    count = np.bincount(group)
+    ordered = float((count * (count - 1)).sum())
+    squared = float((difference_px**2).sum())
+    common = sum(float((np.bincount(group, column) ** 2).sum()) for column in difference_px.T) - squared
+    return common / max(ordered, 1.0) / max(squared / max(len(group), 1), 1e-12)
+
+
+def at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]:
+    """Frames that can be looked at, with the stamps that the model gives them."""
+    lag = geometric.model.lag
+    frames = []
+    for frame in capture.frames:
+        if frame.skip_reason is None or (frame.only_startup and lag):
+            shift = lag[frame.index] if lag else 0.0
+            frames.append(replace(frame, time_s=frame.time_s + shift, skip_reason=None, skip_codes=()))
+    return frames
+
+
+# ── light that pulls at points ───────────────────────────────────────────────────────────────────────────────────
+
+
+def pulses(profile: CameraProfile) -> bool:
+    """Whether light changes between frames, which pulls at the points that are followed."""
+    return bool(profile.extensions.flicker_amplitude or profile.extensions.gain)
+
+
+def pulsing(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:
+    """The profile with the lamps' flicker: it moves the mean time of each row's light."""
+    light = lit.extensions
+    extensions = replace(
+        profile.extensions,
+        flicker_amplitude=light.flicker_amplitude,
+        flicker_frequency_hz=light.flicker_frequency_hz,
+        flicker_phase_rad=light.flicker_phase_rad,
+    )
+    return replace(profile, extensions=extensions)
+
+
+def evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Reader:
+    """The same pictures without flicker and gain, to follow points by."""
+    by_index = {frame.index: frame for frame in frames}
+    curve = profile.response or ResponseCurve("srgb")
+    height, width, shutter = profile.height, profile.width, profile.shutter
+    along = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    fraction = shutter.readout_fraction(along[:, :1] if not shutter.reads_columns else along[:1], width, height)
+
+    def even(wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        for index, picture in gray(wanted):
+            frame = by_index.get(index)
+            if picture is None or frame is None:
+                yield index, picture
+                continue
+            exposure_s = shutter.true_exposure_s(frame.exposure_s or 0.0)
+            start_s = profile.imu_time_s(shutter.first_row_start_s(frame.time_s, frame.exposure_s or 0.0))
+            light = flicker(profile, start_s + fraction * shutter.readout_time_s + 0.5 * exposure_s, exposure_s)
+            gain = profile.extensions.gain[index] if index < len(profile.extensions.gain) else 1.0
+            linear = curve.linear_table()[picture] / (light * gain)
+            yield index, np.clip(np.rint(255 * curve.encode(linear)), 0, 255).astype(np.uint8)
+
+    return even
+
+
+# ── what the profile leaves open ─────────────────────────────────────────────────────────────────────────────────
+
+
+def with_null_values(
+    observed: ObservedTracks, capture: Capture, profile: CameraProfile
+) -> tuple[CameraProfile, list[Term], list[str], FarClock, bool]:
+    """The profile with unknown values begun somewhere, terms to fit on every rung, and far-off starts of the clocks.
+
+    The last: whether the turns of pictures and gyroscope agree at any offset, as far as the camera turns.
+    """
+    terms: list[Term] = []
+    notes: list[str] = []
+    if profile.intrinsics is None:
+        profile = replace(profile, intrinsics=observed.lens)
+        terms.append(terms_of.FOCAL)
+        notes.append("focal length unknown: fitted on every rung, from a guess")
+    if not profile.readout_known:
+        terms.append(terms_of.READOUT)
+    far = _agree_at(observed, capture, profile)
+    agree = far is not None or _hardly_turns(observed, profile) or _one_axis_agrees(observed, capture, profile)
+    if profile.time_offset_s is not None:
+        return profile, terms, notes, far or FarClock(), agree
+    if far is None:
+        notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
+        return replace(profile, time_offset_s=0.0), terms, notes, FarClock(), agree
+    terms.append(terms_of.TIME_OFFSET)
+    begun = replace(profile, time_offset_s=far.offset_s)
+    return begun, terms, notes, FarClock(0.0, far.skewed_offset_s - far.offset_s, far.skew), agree
+
+
+def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:
+    """Whether the pictures' turns are too small to be compared with a gyroscope's."""
+    if len(observed.pairs) < MIN_PAIRS:
+        return True
+    turns = observed.turns(profile)
+    changing = turns.detrended(turns.vector_rad)
+    return float(np.sqrt(np.mean((changing**2).sum(axis=-1)))) * observed.lens.fx_px < MIN_MOTION_PX
+
+
+def _one_axis_agrees(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> bool:
+    """Whether turns about some axis follow the gyroscope's by any factor: a stabiliser takes most of pitch and yaw."""
+    profile = replace(profile, time_offset_s=profile.time_offset_s or 0.0)
+    turns = observed.covered(capture.imu, profile).turns(profile)
+    if len(turns.vector_rad) < MIN_PAIRS:
+        return False
+    times = (np.asarray(profile.imu_time_s(s)) for s in (turns.first_s, turns.second_s))
+    told = turns.detrended(gyro_turns(integrate_gyro(capture.imu, profile), *times))
+    seen = turns.detrended(turns.vector_rad)
+    product = (seen * told).sum(axis=0) ** 2
+    square = np.maximum((seen**2).sum(axis=0) * (told**2).sum(axis=0), 1e-30)
+    return bool(np.max(product / square) > AXIS_EXPLAINED)
+
+
+def _agree_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> FarClock | None:
+    """Changes of the profile's clocks at which turns agree best; None where they agree nowhere."""
+    if len(observed.pairs) < MIN_PAIRS:
+        return None
+    turns, given_s = observed.turns(profile), profile.time_offset_s or 0.0
+    coarse = align_coarsely(turns, capture.imu, profile)
+    if coarse is None or coarse.explained < MIN_EXPLAINED or coarse.at_end:
+        return None
+    far = FarClock(coarse.time_offset_s - given_s)
+    if coarse.explained < WELL_EXPLAINED and (other := align_with_skew(turns, capture.imu, profile)) is not None:
+        skewed, skew = other
+        far = replace(far, skewed_offset_s=skewed.time_offset_s - given_s, skew=skew - profile.clock_skew)
+    return far

@@ -1,0 +1,155 @@
+"""What is left once every cause is in: structure along row, time, radius, rate, brightness or place, or noise."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from virest.diagnosis import picture_ladder
+from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
+from virest.diagnosis.geometric_ladder import GeometricVerdict
+from virest.diagnosis.points import STRAY_PART
+from virest.diagnosis.structure import Structure, structures
+from virest.motion.track_model import seen_s
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
+"""Structure of this size, and of this part of the noise, has a cause."""
+STRUCTURE_P = 1e-4
+TRACKING_BIAS_PX = 0.02
+SCALE_EXCESS = 1.25
+"""Differences this many times their noise, measured without the model, are not all noise."""
+LEAST_IN_PAIR = 8
+STRAY_DISTANCE = 6.0
+CALM = 40.0
+"""Brightness this many typical deviations off counts half: a band of the sensor is evidence, a passer-by is not."""
+PHOTOMETRIC_STRUCTURE = 1.5
+"""Grey levels."""
+
+
+def remaining_structure(geometric: GeometricVerdict, photometric: picture_ladder.PictureVerdict) -> Remaining:
+    """The strongest structure, in the points first, then in brightness."""
+    geometric_left = points_left(geometric)
+    if geometric_left.significant or photometric.observations is None:
+        return geometric_left
+    light_left = _light_left(photometric)
+    return light_left if light_left.significant else geometric_left
+
+
+def points_left(geometric: GeometricVerdict) -> Remaining:
+    """Structure and noise beyond tracking's in the points of the final model."""
+    fitted, table = geometric.fit, geometric.table
+    profile, lens = fitted.profile, fitted.profile.intrinsics
+    assert lens is not None
+    noise = geometric.noise_px
+    from_centre = table.second_px - np.array([lens.cx_px, lens.cy_px])
+    radius = np.linalg.norm(from_centre, axis=-1)
+    outwards = from_centre / np.maximum(radius, 1.0)[:, None]
+    radial = (fitted.difference_px * outwards).sum(axis=-1)
+    difference = np.concatenate([fitted.difference_px, radial[:, None]], axis=-1)
+    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    covariates = {
+        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
+        "radius": radius,
+        "x": table.second_px[:, 0],
+        "y": table.second_px[:, 1],
+        "rate": np.linalg.norm(fitted.ground.trajectory.rate_rad_s(second_s), axis=-1),
+    }
+    found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
+    found.append(_along_time(fitted.difference_px, fitted.weight, table.pair))
+    strongest = max(found, key=lambda s: s.size)
+    stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.astray)
+    limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
+    excess = geometric.final_rms_px / max(noise, 1e-9)
+    log.debug("left: %s, limit %.3f, excess %.3f, stray %.3f", found, limit, excess, stray)
+    structured = strongest.size > limit and strongest.p_value < STRUCTURE_P
+    significant = structured or excess > SCALE_EXCESS or stray > STRAY_PART
+    along = strongest.along
+    size = strongest.size
+    if not structured and excess > SCALE_EXCESS:
+        size = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
+    if not structured and stray > STRAY_PART:
+        along = "place"
+    p_value = strongest.p_value
+    if not structured and significant:
+        p_value = min(s.p_value for s in found)
+        p_value = min(p_value, *_more_than_noise(fitted.distance, table.pair, noise / geometric.step_noise_px))
+    sentence = f"{size:.3f} px remain, strongest along {along}" if significant else ""
+    return Remaining(p_value, along, size, GEOMETRY, significant, sentence)
+
+
+def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> tuple[float, float]:
+    """Probabilities that pairs' whitened distances are noise alone, and that so many points stray by chance.
+
+    One-sided t tests over the pairs: of their capped mean squares against 2 noise² (SCALE_EXCESS allowed for), and of
+    their parts of strays against STRAY_PART.
+    """
+    count = np.maximum(np.bincount(pair), 1)
+    used = np.bincount(pair) > LEAST_IN_PAIR
+    square = np.bincount(pair, np.minimum(distance, STRAY_DISTANCE) ** 2) / count
+    stray = np.bincount(pair, distance > STRAY_DISTANCE) / count
+    tests = ((square, 2 * (SCALE_EXCESS * noise) ** 2), (stray, STRAY_PART))
+    first, second = (float(stats.ttest_1samp(v[used], mean, alternative="greater").pvalue) for v, mean in tests)
+    return first, second
+
+
+def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Structure:
+    """Between the pairs: how much more their mean differences scatter than their points do."""
+    total = np.maximum(np.bincount(pair, weight), 1e-9)
+    excess, chi2, freedom = 0.0, 0.0, 0
+    for column in difference.T:
+        mean = np.bincount(pair, weight * column) / total
+        variance = np.bincount(pair, (weight * (column - mean[pair])) ** 2) / total**2
+        used = np.bincount(pair) > LEAST_IN_PAIR
+        spread = 2 * variance[used] + TRACKING_BIAS_PX**2
+        excess += float(np.mean(np.maximum(mean[used] ** 2 - spread, 0.0)))
+        chi2 += float(np.sum(mean[used] ** 2 / spread))
+        freedom += int(used.sum())
+    return Structure("time", float(np.sqrt(excess / 2)), float(stats.chi2.sf(chi2, max(freedom, 1))))
+
+
+def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
+    observations = photometric.observations
+    assert observations is not None
+    left = picture_ladder.residual_levels(observations, photometric.profile)
+    covariates = {
+        name: values
+        for name, values in observations.covariates(photometric.profile).items()
+        if name in ("row", "radius", "brightness", "row_fraction", "x_px", "y_px")
+    }
+    weight = 1.0 / (1.0 + (left / (CALM * max(float(np.median(np.abs(left))) / 0.6745, 1.0))) ** 2)
+    found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)
+    strongest = max(found, key=lambda s: s.size)
+    log.debug("light left: %s", found)
+    significant = strongest.size > PHOTOMETRIC_STRUCTURE and strongest.p_value < STRUCTURE_P
+    sentence = f"{strongest.size:.1f} grey levels remain, strongest along {strongest.along}" if significant else ""
+    return Remaining(strongest.p_value, strongest.along, strongest.size, PHOTOMETRY, significant, sentence)
+
+
+def residuals(geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
+    """Differences (px) and what they may run along."""
+    fitted = geometric.nominal_fit if nominal else geometric.fit
+    table = geometric.nominal_table if nominal else geometric.table
+    profile, lens = fitted.profile, fitted.profile.intrinsics
+    assert lens is not None
+    centre = np.array([lens.cx_px, lens.cy_px])
+    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    rate = np.linalg.norm(fitted.ground.trajectory.rate_rad_s(second_s), axis=-1)
+    return {
+        "x_px": fitted.difference_px[:, 0],
+        "y_px": fitted.difference_px[:, 1],
+        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
+        "time": second_s,
+        "radius": np.linalg.norm(table.second_px - centre, axis=-1),
+        "rate": rate,
+        "column": table.second_px[:, 0],
+        "line": table.second_px[:, 1],
+        "pair": table.pair.astype(float),
+        "weight": fitted.weight,
+        "distance": fitted.distance,
+    }
