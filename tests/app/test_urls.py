@@ -78,6 +78,13 @@ def without_clocks(files: dict[str, bytes]) -> dict[str, Any]:
     return found
 
 
+def fail_after_a_segment(run: RunFolder) -> None:
+    """Write one frame and its segment's log, then fail."""
+    write_whole(run.picture(0), b"png")
+    write_whole(run.segment_log(0, 0), b'{"frame": 0, "output": "frames/000000.png"}\n')
+    raise RuntimeError
+
+
 def local_files(run: Path) -> dict[str, bytes]:
     """All files of a run's folder."""
     return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
@@ -216,7 +223,7 @@ def test_files_are_written_listed_fetched_and_removed(bucket: str) -> None:
 
 def test_a_bucket_that_is_not_there_is_an_output_error(bucket: str) -> None:
     """What cannot be written says where."""
-    with pytest.raises(OutputError, match="s3://no-such-bucket/run.json"):
+    with pytest.raises(OutputError, match=r"s3://no-such-bucket/run\.json"):
         write_whole(locate("s3://no-such-bucket/run.json"), b"{}")
 
 
@@ -226,11 +233,8 @@ def test_the_state_of_a_run_is_told_in_a_bucket_as_in_a_folder(bucket: str) -> N
     with pytest.raises(RuntimeError), opened_run(run, REQUEST, "new"):
         raise RuntimeError
     assert everything("s3://trips/out") == {}
-    line = b'{"frame": 0, "output": "frames/000000.png"}\n'
     with pytest.raises(RuntimeError), opened_run(run, REQUEST, "new"):
-        write_whole(run.picture(0), b"png")
-        write_whole(run.segment_log(0, 0), line)
-        raise RuntimeError
+        fail_after_a_segment(run)
     with pytest.raises(OutputError, match="unfinished"), opened_run(run, REQUEST, "new"):
         pass
     with opened_run(run, REQUEST, "resume") as found:

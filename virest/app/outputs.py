@@ -21,6 +21,7 @@ import os
 import re
 import secrets
 import shutil
+import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ PART = re.compile(r".*\.[0-9a-f]{8}\.part")
 BESIDE = ("diagnosis.json", "extended.yaml", "figures", "report.html")
 """What `diagnose` writes into the same folder: no obstacle for a run, and none of its files."""
 REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs")
+UNPRINTABLE = ("Cc", "Zl", "Zp")
+"""Control characters and separators of lines, by their Unicode category."""
 SIGNIFICANT_DIGITS = 10
 
 Mode = Literal["new", "resume", "overwrite"]
@@ -143,7 +146,7 @@ def capture_name(path: str) -> str:
     """
     place = locate(path)
     name = place.name if is_remote(place) else os.path.basename(os.path.abspath(place))
-    if not name or name in (".", "..") or any(ord(c) < 32 or ord(c) == 127 for c in name) or "/" in name:
+    if not name or name in (".", "..") or any(unicodedata.category(c) in UNPRINTABLE for c in name) or "/" in name:
         raise OutputError(
             f"{path!r}: no usable name for an output folder: {name!r}", hint="rename the capture's folder"
         )
@@ -245,6 +248,8 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
 
 def _read_request(path: Path) -> dict[str, Any] | None:
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return None
         content = json.loads(path.read_bytes())
     except (FileNotFoundError, NotADirectoryError):
         return None

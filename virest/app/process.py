@@ -128,11 +128,11 @@ def process_captures(paths: list[str], options: ProcessOptions) -> int:
             except (BrokenPipeError, SettingsError, MemoryError) as error:
                 if isinstance(error, BrokenPipeError) or len(paths) == 1:
                     raise
-                codes.append(console.report_error(error, name))
+                codes.append(console.report_error(error, _shown(name)))
             except Exception as error:  # a failed capture is a normal, explained outcome of a batch
                 if is_lost(error):
                     raise
-                codes.append(console.report_error(error, name))
+                codes.append(console.report_error(error, _shown(name)))
     finally:
         workers.kill()
     if outcomes and not options.json_lines:
@@ -180,6 +180,10 @@ def process_capture(path: str, name: str, options: ProcessOptions, workers: Work
             raise
 
 
+def _shown(name: str) -> str:
+    return name if len(name) <= SHOWN_CHARACTERS else f"{name[:SHOWN_CHARACTERS]}…"
+
+
 def _require_capture(path: str) -> None:
     """Raise CaptureError where the path names no folder."""
     place = locate(path)
@@ -189,8 +193,7 @@ def _require_capture(path: str) -> None:
         what = "is no folder" if place.exists() else "no such folder"
     except (OSError, ValueError) as fault:  # a name too long, an address that does not answer
         what = getattr(fault, "strerror", None) or str(fault)
-    shown = path if len(path) <= SHOWN_CHARACTERS else f"{path[:SHOWN_CHARACTERS]}…"
-    raise CaptureError(f"{shown}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
+    raise CaptureError(f"{_shown(path)}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
 
 
 def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> _Job:

@@ -433,11 +433,10 @@ def find_movie(account: _Account, folder: Path, hint: Path | None) -> tuple[_Mov
     names = _movie_names(account)
     if not names:
         return None, f"The run does not say which movie it was made from; {ONLY_AFTER}."
-    facts = {item.file: item for item in account.inputs}
     other = None
     for path in dict.fromkeys(place / name for place in _places(account, folder, hint) for name in names):
         with suppress(OSError, ValueError, VirestError):
-            if path.is_dir() or _is_same(path, facts.get(path.name)):
+            if path.is_dir() or any(_is_same(path, item) for item in account.inputs):
                 return _Movie(path, probe_movie(path)), ""
             other = other or (path if path.exists() else None)
     if other is not None:
@@ -445,8 +444,8 @@ def find_movie(account: _Account, folder: Path, hint: Path | None) -> tuple[_Mov
     return None, f"The capture's movie was not found (--capture says where it is); {ONLY_AFTER}."
 
 
-def _is_same(path: Path, known: _Input | None) -> bool:
-    if known is None or not path.is_file() or path.stat().st_size != known.bytes:
+def _is_same(path: Path, known: _Input) -> bool:
+    if Path(known.file).name != path.name or not path.is_file() or path.stat().st_size != known.bytes:
         return False
     return bool(file_facts(path)["sha256"] == known.sha256)
 

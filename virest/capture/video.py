@@ -154,7 +154,10 @@ def _reason(fault: Exception) -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The movie's container, with bounds on memory. Raises `unreachable` where an address gives no bytes, for the movie may be sound."""
+    """The movie's container, with bounds on memory.
+
+    Raises `unreachable` where an address gives no bytes, for the movie may be sound.
+    """
     _bound_memory()
     bounds = {"max_pixels": str(MAX_PIXELS)}
     if isinstance(path, RemotePath):

@@ -8,6 +8,12 @@ counts.  A path in a wrong direction is not: correct the geometry first.  Each c
 the curve of no light; what is compared is the luma of both sides, but not where colours change: movies keep those at
 half the resolution.
 
+An encoder of few bits smooths grey levels, not light.  That mixes as under a straighter curve, in the same sense in all
+pairs of frames, so scatter does not show it: what the encoder leaves in a tile agrees with a change of the curve by a
+part of its size, whatever the blur.  A real change agrees the more the more a tile's light is mixed.
+
+Nothing in a picture is much darker than its black level, which bounds the black level before anything is compared.
+
 What a gamma and a black level do this way is nearly the same: each is estimated as if the other were nominal, and they
 are rivals.  Only exposures × ISO that change as logged tell them apart (photometry_fit).
 """
@@ -37,10 +43,18 @@ Plane = NDArray[np.float32]
 ReadRgb = Callable[[Sequence[int]], Iterable[tuple[int, Rgb | None]]]
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
-STEPS = {"response_curve": np.log([0.8, 1.0, 1.25]), "black_level": np.array([0.0, 0.04, 0.08])}
-"""Where residuals are taken: added to the logarithm of the profile's gamma, or to its black level."""
+GAMMA_STEPS = np.log([0.8, 1.0, 1.25])
+"""Where residuals are taken for a gamma: added to the logarithm of the profile's."""
+LARGEST_BLACK = 0.08
+"""Residuals are taken at no more black level, half of it and none, but never beyond what the darkest greys allow."""
+LEAST_BLACK = 0.01
+FLOOR_QUANTILE, FLOOR_PART = 0.001, 0.5
+"""This quantile of the greys excludes a black level of which it is less than this part: noise and undershoots."""
 DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 """(absolute, relative) deviation that encoders of few bits leave, beside the scatter between pairs of frames."""
+AGREEMENT = 0.07
+"""How well what an encoder leaves may agree with a change of the curve: their correlation, of movies with 0.1 to 0.4
+bits a pixel whose curve is the profile's."""
 _MIN_TILE_PIXELS = 400
 _MARGIN_PX = 24
 _NODE_PX = 16
@@ -68,13 +82,19 @@ class MixingEvidence:
     pair: Indices
     """(n,) number of the pair of frames."""
     pixels: Array
-    """(n,) pixels that took part, every second one along both sides."""
+    """(n,) pixels that took part, every second one along both sides, by their weights."""
     noise: Array
     """(n,) robust standard deviation of what remains, grey levels."""
+    darkest: float
+    """Grey level that next to nothing in these pictures is darker than."""
+    steps: dict[str, Array]
+    """Effect → (3,) changes at which the scores are taken."""
     stiffness: dict[str, Array]
     """Effect → (n,) squared length of its pattern in noises, per unit of the effect squared."""
     score: dict[str, Array]
-    """Effect → (n, 3) scores at STEPS; the estimate is where their sum crosses zero."""
+    """Effect → (n, 3) scores at the steps; the estimate is where their sum crosses zero."""
+    rest: dict[str, Array]
+    """Effect → (n,) squared length of what no such change explains in the tile, in noises."""
 
     def subset(self, use: Mask) -> MixingEvidence:
         """Only the chosen tiles."""
@@ -82,9 +102,31 @@ class MixingEvidence:
             self.pair[use],
             self.pixels[use],
             self.noise[use],
+            self.darkest,
+            self.steps,
             {name: v[use] for name, v in self.stiffness.items()},
             {name: v[use] for name, v in self.score.items()},
+            {name: v[use] for name, v in self.rest.items()},
         )
+
+    @property
+    def largest_black(self) -> float:
+        """Black level that the darkest greys allow."""
+        return self.darkest / 255.0 / FLOOR_PART
+
+    def mean_square(self, effect_name: str, change: float) -> tuple[float, float]:
+        """Of the tiles' differences after a change of the curve, and of what no change explains; grey levels squared.
+
+        Each tile's free registration, brightness and length of path are taken off.
+        """
+        at = np.array([np.polyval(parabola, change) for parabola in self._parabolas(effect_name)])
+        square, stiffness = self.noise**2, np.maximum(self.stiffness[effect_name], 1e-12)
+        rest = float(np.sum(square * self.rest[effect_name]))
+        total = float(self.pixels.sum())
+        return (rest + float(np.sum(square * at**2 / stiffness))) / total, rest / total
+
+    def _parabolas(self, effect_name: str) -> Array:
+        return np.polyfit(self.steps[effect_name], self.score[effect_name].T, 2).T
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,26 +154,38 @@ def observe_mixing(
     wanted = sorted({k for pair in pairs for k in pair})
     pictures = {index: rgb for index, rgb in read_rgb(wanted) if rgb is not None}
     by_index = {frame.index: frame for frame in frames}
+    darkest = _darkest(list(pictures.values()))
+    steps = _steps(darkest)
     rows: list[tuple[int, Array]] = []
     for number, (sharp, blurred) in enumerate(pairs):
         if sharp in pictures and blurred in pictures:
             pair = (by_index[sharp], pictures[sharp]), (by_index[blurred], pictures[blurred])
-            rows += [(number, row) for row in _compare(*pair, trajectory, profile, settings)]
-    table = np.array([row for _, row in rows]).reshape(-1, 10)
-    names = tuple(STEPS)
+            rows += [(number, row) for row in _compare(*pair, trajectory, profile, settings, steps)]
+    table = np.array([row for _, row in rows]).reshape(-1, 12)
+    names = tuple(steps)
     return MixingEvidence(
         np.array([number for number, _ in rows], np.intp),
         table[:, 0],
         table[:, 1],
-        {name: table[:, 4 * i + 2] for i, name in enumerate(names)},
-        {name: table[:, 4 * i + 3 : 4 * i + 6] for i, name in enumerate(names)},
+        darkest,
+        steps,
+        {name: table[:, 5 * i + 2] for i, name in enumerate(names)},
+        {name: table[:, 5 * i + 3 : 5 * i + 6] for i, name in enumerate(names)},
+        {name: table[:, 5 * i + 6] for i, name in enumerate(names)},
     )
 
 
-def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_name: str) -> MixingEstimate | None:
-    """Gamma or black level, the other as in the profile, std by leaving pairs out; None with fewer than 3 pairs.
+def _steps(darkest: float) -> dict[str, Array]:
+    """Changes at which residuals are taken; beyond its darkest greys a picture would only be clipped."""
+    most = float(np.clip(darkest / 255.0 / FLOOR_PART, LEAST_BLACK, LARGEST_BLACK))
+    return {"response_curve": GAMMA_STEPS, "black_level": np.array([0.0, 0.5, 1.0]) * most}
 
-    A black level below 0 is no black level: its p value is 1.
+
+def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_name: str) -> MixingEstimate | None:
+    """Gamma or black level, the other as in the profile; None with fewer than 3 pairs of frames.
+
+    std: by leaving pairs out, and AGREEMENT over how large the change is in noises at a pixel.  A black level below 0
+    or brighter than the darkest greys is none: its p value is 1.
     """
     pairs = np.unique(evidence.pair)
     if len(pairs) < 3:
@@ -139,8 +193,9 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
     change = _root(evidence, effect_name)
     left_out = np.array([_root(evidence.subset(evidence.pair != k), effect_name) for k in pairs])
     jackknife = (len(pairs) - 1) / len(pairs) * float(np.sum((left_out - left_out.mean()) ** 2))
+    strength = float(np.sqrt(evidence.stiffness[effect_name].sum() / evidence.pixels.sum()))
     absolute, relative = DOUBT[effect_name]
-    std = float(np.sqrt(jackknife + absolute**2))
+    std = float(np.sqrt(jackknife + absolute**2 + (AGREEMENT / max(strength, 1e-6)) ** 2))
     p_value = float(2 * stats.t.sf(abs(change) / std, len(pairs) - 1))
     std = float(np.hypot(std, relative * change))
     curve = profile.response or ResponseCurve("srgb")
@@ -148,31 +203,29 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
         value = curve.extra_gamma * float(np.exp(change))
         return MixingEstimate(value, std * value, p_value, len(pairs))
     value = curve.black_level + change
-    return MixingEstimate(value, std, p_value if value > 0 else 1.0, len(pairs))
+    return MixingEstimate(value, std, p_value if 0 < value <= evidence.largest_black else 1.0, len(pairs))
 
 
 def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOut | None:
-    """Find the change on half the pairs and judge it on the others; in units of the effect, RMS over pairs."""
+    """Find the change on half the pairs of frames and judge it on the others, and the reverse.
+
+    RMS of the luma that one frame's light, blurred and encoded, differs by from the other's, grey levels.
+    """
     pairs = np.unique(evidence.pair)
     if len(pairs) < 4:
         return None
-    before, after, noise = [], [], []
+    squares = []
     for odd in (0, 1):
         change = _root(evidence.subset(np.isin(evidence.pair, pairs[odd::2])), effect_name)
-        for k in pairs[1 - odd :: 2]:
-            own = evidence.subset(evidence.pair == k)
-            alone, stiffness = _root(own, effect_name), own.stiffness[effect_name]
-            scatter = own.score[effect_name][:, 1] + stiffness * (0.0 - alone)
-            before.append(alone)
-            after.append(alone - change)
-            noise.append(float(np.sqrt(np.sum(scatter**2))) / float(np.sum(stiffness)))
-    rms = [float(np.sqrt(np.mean(np.square(v)))) for v in (before, after, noise)]
-    return HeldOut(rms[0], rms[1], rms[2], "pairs")
+        held = evidence.subset(np.isin(evidence.pair, pairs[1 - odd :: 2]))
+        squares.append((held.mean_square(effect_name, 0.0)[0], *held.mean_square(effect_name, change)))
+    before, after, noise = np.sqrt(np.mean(squares, axis=0))
+    return HeldOut(float(before), float(after), float(noise), "pairs")
 
 
 def _root(evidence: MixingEvidence, effect_name: str) -> float:
     """Where the parabola through the three summed scores crosses zero nearest to no change."""
-    x = STEPS[effect_name]
+    x = evidence.steps[effect_name]
     total = evidence.score[effect_name].sum(axis=0)
     straight = -total[1 if effect_name == "response_curve" else 0] * (x[2] - x[0]) / (total[2] - total[0])
     roots = np.roots(np.polyfit(x, total, 2))
@@ -204,14 +257,20 @@ def _choose_pairs(
     return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[: settings.pairs]]
 
 
+def _darkest(pictures: Sequence[Rgb]) -> float:
+    """Grey level that next to nothing is darker than, 0 without pictures."""
+    return float(np.median([np.quantile(rgb[::2, ::2], FLOOR_QUANTILE) for rgb in pictures])) if pictures else 0.0
+
+
 def _compare(
     sharp: tuple[Frame, Rgb],
     blurred: tuple[Frame, Rgb],
     trajectory: Trajectory,
     profile: CameraProfile,
     settings: MixingSettings,
+    steps: dict[str, Array],
 ) -> list[Array]:
-    """Pixels, noise, stiffness and scores (10,) of each usable tile of one pair."""
+    """Pixels, noise, and for each effect stiffness, scores and rest, (12,) in all, of each usable tile of one pair."""
     height, width = blurred[1].shape[:2]
     here, there = (Follower(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
     where = seen_elsewhere(here, there, trajectory, profile, _nodes(width, height))
@@ -238,17 +297,21 @@ def _compare(
     nominal, grey = difference(curve)
     gammas = [
         difference(replace(curve, extra_gamma=curve.extra_gamma * float(np.exp(s))))[0]
-        for s in STEPS["response_curve"][[0, 2]]
+        for s in steps["response_curve"][[0, 2]]
     ]
-    blacks = [difference(replace(curve, black_level=curve.black_level + float(s)))[0] for s in STEPS["black_level"][1:]]
+    blacks = [difference(replace(curve, black_level=curve.black_level + float(s)))[0] for s in steps["black_level"][1:]]
     stacks = [gammas[0], nominal, gammas[1]], [nominal, *blacks]
     nuisance = _nuisances(grey)
-    rows = (_tile_scores(stacks, nuisance, tile, usable[tile]) for tile in tiles)
+    rows = (_tile_scores(stacks, tuple(steps.values()), nuisance, tile, usable[tile]) for tile in tiles)
     return [row for row in rows if row is not None]
 
 
 def _tile_scores(
-    stacks: tuple[list[Plane], list[Plane]], nuisance: list[Plane], tile: tuple[slice, slice], usable: Mask
+    stacks: tuple[list[Plane], list[Plane]],
+    steps: tuple[Array, ...],
+    nuisance: list[Plane],
+    tile: tuple[slice, slice],
+    usable: Mask,
 ) -> Array | None:
     """Scores of one tile with everything projected out that is no change of the curve; robust weights per pixel."""
     if usable.sum() < 2 * _MIN_TILE_PIXELS:
@@ -259,7 +322,7 @@ def _tile_scores(
         return None
     free = np.stack([plane[tile][usable] for plane in nuisance], axis=-1).astype(float)
     levels = [np.stack([plane[tile][usable] for plane in stack], axis=-1).astype(float) for stack in stacks]
-    patterns = [(level[:, 2] - level[:, 0]) / (x[2] - x[0]) for level, x in zip(levels, STEPS.values(), strict=True)]
+    patterns = [(level[:, 2] - level[:, 0]) / (x[2] - x[0]) for level, x in zip(levels, steps, strict=True)]
     design, target = np.column_stack([patterns[0], free]), levels[0][:, 1]
     weight, noise = np.ones(len(target)), 1.0
     for _ in range(3):
@@ -268,12 +331,19 @@ def _tile_scores(
         noise = 1.4826 * float(np.median(np.abs(left))) + 0.2
         weight = 1 / np.sqrt(1 + (left / (2.5 * noise)) ** 2)
     base = np.linalg.qr(weight[:, None] * free)[0]
-    row = [float(len(target)), noise]
-    for level, pattern in zip(levels, patterns, strict=True):
+    row = [float(np.sum(weight**2)), noise]
+    for level, pattern, nominal in zip(levels, patterns, (1, 0), strict=True):
         own = weight * pattern
         own = own - base @ (base.T @ own)
-        row += [float(own @ own) / noise**2, *((own @ (weight[:, None] * level)) / noise**2)]
+        stiffness, score = float(own @ own) / noise**2, own @ (weight[:, None] * level) / noise**2
+        row += [stiffness, *score, max(_length2(weight * target, base) / noise**2 - score[nominal] ** 2 / stiffness, 0)]
     return np.array(row)
+
+
+def _length2(values: Array, base: Array) -> float:
+    """Squared length of what is left of values (n,) without the orthonormal base (n, k)."""
+    left = values - base @ (base.T @ values)
+    return float(left @ left)
 
 
 def _nuisances(grey: Plane) -> list[Plane]:

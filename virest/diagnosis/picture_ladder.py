@@ -41,8 +41,6 @@ MIN_OBSERVATIONS = 300
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
 MIXING_P, MIXING_GAMMA, MIXING_BLACK = 1.5e-3, 0.05, 0.02
-FLOOR_QUANTILE, FLOOR_PART = 0.001, 0.6
-"""Greys darker than this part of a black level exclude it."""
 BLUR_Z = 3.6
 MIN_DEFOCUS_PX = 0.5
 MIN_EXPOSURE_CHANGE = 0.08
@@ -254,9 +252,8 @@ def _mixing(
         return
     is_gamma = gamma.p_value < MIXING_P and abs(np.log(gamma.value)) > MIXING_GAMMA
     is_black = black.p_value < MIXING_P and black.value > MIXING_BLACK
-    if is_black and is_gamma:
-        is_black = _floor_allows(pictures, usable, black.value)
-        is_gamma = not is_black
+    if is_black:
+        is_gamma = False
     name = "black_level" if is_black else "response_curve" if is_gamma else None
     if name is None:
         return
@@ -274,17 +271,6 @@ def _mixing(
     curve = replace(curve, black_level=value) if is_black else replace(curve, extra_gamma=value)
     verdict.profile = replace(verdict.profile, response=curve)
     verdict.rungs.append(Rung(name, {name: gain.after}, gain.before, PHOTOMETRY))
-
-
-def _floor_allows(pictures: Reader, frames: Sequence[Frame], black_level: float) -> bool:
-    """Whether nothing is much darker than a black level would be."""
-    picked = [frames[int(k)].index for k in np.linspace(0, len(frames) - 1, min(8, len(frames)))]
-    darkest = [
-        float(np.quantile(picture, FLOOR_QUANTILE))
-        for _, picture in pictures(sorted(set(picked)))
-        if picture is not None
-    ]
-    return bool(darkest) and float(np.median(darkest)) > FLOOR_PART * black_level * GREY_LEVELS
 
 
 def residual_levels(observations: PhotometricObservations, profile: CameraProfile) -> Array:
