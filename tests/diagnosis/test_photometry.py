@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile, Extensions, read_profile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
-from virest.capture.video import probe_movie, read_frames, read_gray
+from virest.capture.video import probe_movie, read_frames
 from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
 from virest.diagnosis.photometry_effects import (
     BlackLevel,
@@ -25,8 +26,10 @@ from virest.diagnosis.photometry_effects import (
     photometric_effects,
 )
 from virest.diagnosis.photometry_fit import RESOLUTION, fit_photometry, judge, significance, time_blocks
-from virest.diagnosis.photometry_mixing import estimate_mixing, judge_mixing, observe_mixing
+from virest.diagnosis.photometry_mixing import MixingEvidence, estimate_mixing, judge_mixing, observe_mixing
+from virest.diagnosis.photometry_noise import measured_noise
 from virest.diagnosis.photometry_patches import observe_photometry
+from virest.diagnosis.picture_ladder import PictureVerdict, climb_observations
 from virest.motion.integration import integrate_gyro
 
 FRAMES, NOISE = 60, 0.5
@@ -141,6 +144,70 @@ def test_the_memory_of_an_encoder_does_not_weaken_flicker(rng: np.random.Generat
     np.testing.assert_array_less(np.abs(fit.values - (0.2, 100.0, 1.0)), 3 * fit.std)
 
 
+@pytest.mark.parametrize("seen", [1.0, 0.3])
+def test_noise_is_not_what_changes_the_light(rng: np.random.Generator, seen: float) -> None:
+    """Light that changes by a third from frame to frame, a lamp and an unknown curve are no noise.
+
+    Nor where patches are seen for a part of the movie only, each at other exposures.
+    """
+    lamp = {"flicker_amplitude": 0.2, "flicker_frequency_hz": 120.0}
+    observed = made_observations(hidden(1.2, 0.05, vignetting_corner_loss=0.3, **lamp), rng, 0.3)
+    first = rng.integers(0, FRAMES, 150)[observed.place]
+    observed = observed.subset((observed.frame - first) % FRAMES < seen * FRAMES)
+    found = measured_noise(observed, NOMINAL.response).noise
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(NOISE, rel=0.25)
+    assert np.quantile(found, 0.95) < 2 * NOISE
+
+
+def test_gains_do_not_take_what_the_curve_explains(rng: np.random.Generator) -> None:
+    """A gamma under exposures that change is one cause, although a free gain for every frame removes as much."""
+    observed = measured_noise(made_observations(hidden(1.15), rng, 0.2), NOMINAL.response)
+    verdict = PictureVerdict(NOMINAL)
+    climb_observations(verdict, observed, FRAMES)
+    (cause,) = verdict.findings
+    assert cause.name == "response_curve"
+    assert cause.parameters["gamma"].estimate == pytest.approx(1.15, abs=3 * cause.parameters["gamma"].std)
+    assert cause.held_out.noise <= cause.held_out.after < cause.held_out.before
+
+
+# ── what blur mixes ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def mixing_evidence(rng: np.random.Generator, strength: float, gamma: float, agreement: float) -> MixingEvidence:
+    """Tiles of ten pairs of frames in which a change of the curve is ``strength`` noises at a pixel.
+
+    agreement: correlation of what the encoder left with such a change.
+    """
+    pair, steps = np.repeat(np.arange(10), 40), np.log([0.8, 1.0, 1.25])
+    pixels = np.full(len(pair), 1000.0)
+    stiffness = pixels * (strength * rng.uniform(0.6, 1.4, len(pair))) ** 2
+    pull = np.sqrt(stiffness) * (rng.normal(size=len(pair)) + agreement * np.sqrt(pixels))
+    score = stiffness[:, None] * (steps - np.log(gamma)) - pull[:, None]
+    rows = {"response_curve": steps}
+    return MixingEvidence(
+        pair, pixels, np.full(len(pair), 1.5), 30.0, rows, {"response_curve": stiffness}, {"response_curve": score},
+        {"response_curve": pixels},
+    )  # fmt: skip
+
+
+def test_an_encoder_that_mixes_grey_is_no_gamma(rng: np.random.Generator) -> None:
+    """What agrees a little with a gamma in every pair is one only where light is mixed enough to outweigh it."""
+    false = mixing_evidence(rng, 0.12, 1.0, 0.07)
+    found = estimate_mixing(false, NOMINAL, "response_curve")
+    assert found is not None
+    assert found.value > 1.5
+    assert found.p_value > 0.05
+    true = mixing_evidence(rng, 1.5, 1.25, 0.07)
+    found, held = estimate_mixing(true, NOMINAL, "response_curve"), judge_mixing(true, "response_curve")
+    assert found is not None
+    assert held is not None
+    assert found.p_value < 1.5e-3
+    assert found.value == pytest.approx(1.25, abs=2 * found.std)
+    # 1.5 noises of 1.5 levels at a pixel, times the change of log gamma, beside those 1.5 levels
+    assert held.before == pytest.approx(1.5 * np.sqrt(1 + 1.05 * (1.5 * np.log(1.25) + 0.07) ** 2), rel=0.02)
+    assert held.after == pytest.approx(1.5, rel=0.02)
+
+
 def test_blocks_are_contiguous_and_of_several_lengths(rng: np.random.Generator) -> None:
     """Time blocks never split a frame, follow one another, and do not repeat one length."""
     observed = made_observations(NOMINAL, rng)
@@ -226,13 +293,18 @@ def test_blur_shows_the_curve_at_constant_exposure(tmp_path: Path) -> None:
     index = probe_movie(capture.movie)
     nominal, true = read_profile(folder / "camera.yaml"), read_profile(folder / "truth" / "camera.yaml")
     trajectory = integrate_gyro(capture.imu, nominal)
+
+    def rgb(wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        return (one for one in read_frames(capture.movie, index, 0, 29) if one[0] in wanted)
+
     found = []
     for profile in (nominal, true):
-        evidence = observe_mixing(lambda k: read_gray(capture.movie, index, k), capture.frames, trajectory, profile)
+        evidence = observe_mixing(rgb, capture.frames, trajectory, profile)
         found.append(estimate_mixing(evidence, profile, "response_curve"))
         held = judge_mixing(evidence, "response_curve")
         assert held is not None
-        assert (held.after < 0.6 * held.before) == (profile is nominal)
+        assert (held.gain > 0.7) == (profile is nominal)
+        assert held.noise <= held.after
     hidden_gamma, nothing = found
     assert hidden_gamma is not None
     assert nothing is not None

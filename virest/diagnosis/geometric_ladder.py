@@ -370,11 +370,7 @@ def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile
     model = replace(candidate.model, terms=(*candidate.model.terms, *candidate.added))
     model, fitted = _refitted(evidence, model, JUDGE_POINTS)
     if candidate.name == "scene_depth":
-        depth_m, std = depth_of(fitted, evidence.table(model, JUDGE_POINTS))
-        given_m = before.depth_m or np.inf
-        nearer = 1 / depth_m - 1 / given_m
-        certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
-        p_value = float(stats.chi2.sf((nearer / max(certain, 1e-9)) ** 2, 1))
+        p_value = depth_p(fitted, evidence.table(model, JUDGE_POINTS), before.depth_m)
     elif candidate.effect is None or candidate.effect.term is None:
         p_value = SURE
     elif not is_plausible(candidate.effect, model.profile, total_change(candidate.effect, before, model.profile)):
@@ -382,6 +378,15 @@ def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile
     else:
         p_value = p_of(fitted, candidate.effect, model.profile, before, evidence.typical_px)
     return (model if p_value < MAX_P else None), p_value
+
+
+def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float:
+    """Probability of so large a change of the inverse depth by chance."""
+    depth_m, std = depth_of(fitted, table)
+    given_m = given_m or np.inf
+    nearer = 1 / depth_m - 1 / given_m
+    certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
+    return float(stats.chi2.sf((nearer / max(certain, 1e-9)) ** 2, 1))
 
 
 def is_plausible(effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
@@ -418,21 +423,22 @@ def _conclude(
     nominal: CameraProfile,
 ) -> GeometricVerdict:
     """Fit everything together from the nominal profile on, and let go of what is no longer significant."""
+    entered = len(accepted)
     while True:
         model, fitted = _refitted(evidence, model, FINAL_POINTS)
+        table = evidence.table(model, FINAL_POINTS)
         weak = [
             entry
             for entry in accepted
-            if entry.effect is not None
-            and entry.effect.term is not None
-            and p_of(fitted, entry.effect, model.profile, nominal_model.profile, evidence.typical_px) > MAX_P
+            if _doubt(evidence, fitted, table, entry, model.profile, nominal_model.profile) > MAX_P
         ]
         if not weak:
             break
         log.debug("no longer significant: %s", [entry.name for entry in weak])
         accepted = [entry for entry in accepted if entry is not weak[0]]
-        model = _without(model, nominal_model, weak[0], accepted)
-    table = evidence.table(model, FINAL_POINTS)
+        model = _without(model, nominal_model, weak[0])
+    if len(accepted) < entered:
+        accepted = [_rejudged(evidence, model, nominal_model, entry, fitted) for entry in accepted]
     nominal_table = evidence.table(nominal_model, FINAL_POINTS)
     nominal_fit = evidence.fit(nominal_model, nominal_model.terms, nominal_table)
     typical = evidence.typical_px
@@ -441,6 +447,28 @@ def _conclude(
         model, fitted, table, accepted, rungs, nominal_model, nominal_fit, nominal_table,
         before, capped_rms(fitted.distance) * typical, evidence.noise_px(fitted), typical,
     )  # fmt: skip
+
+
+def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted, fitted: TrackFit) -> Accepted:
+    """The cause with what it gains held out beside those that stayed: rungs with a departed one told otherwise."""
+    if entry.effect is None or entry.effect.term is None:
+        return entry
+    less, _ = _refitted(evidence, _without(model, nominal, entry), SCREEN_POINTS)
+    before, after = (
+        _judge(evidence, Candidate("", m, (), None), fitted.scale, fitted.depth_spread_per_m) for m in (less, model)
+    )
+    return replace(entry, before=before.rms * evidence.typical_px, after=after.rms * evidence.typical_px, rivals=())
+
+
+def _doubt(
+    evidence: Evidence, fitted: TrackFit, table: TrackTable, entry: Accepted, found: CameraProfile, given: CameraProfile
+) -> float:
+    """Probability that an accepted cause is nothing, now that the others are in; 0 for a word."""
+    if entry.name == "scene_depth":
+        return depth_p(fitted, table, given.depth_m)
+    if entry.effect is None or entry.effect.term is None:
+        return 0.0
+    return p_of(fitted, entry.effect, found, given, evidence.typical_px)
 
 
 def total_change(effect: GeometricEffect, nominal: CameraProfile, found: CameraProfile) -> Array:
@@ -485,8 +513,10 @@ def rotation_between(nominal: CameraProfile, found: CameraProfile) -> Array:
     return skew * (np.arcsin(min(sine, 1.0)) / sine if sine > 1e-12 else 1.0)
 
 
-def _without(model: Model, nominal: Model, leaving: Accepted, kept: list[Accepted]) -> Model:
+def _without(model: Model, nominal: Model, leaving: Accepted) -> Model:
     """The nominal model with the kept causes' terms, to be fitted anew from where they stand."""
+    if leaving.name == "scene_depth":
+        return replace(model, scene=nominal.scene)
     assert leaving.effect is not None
     assert leaving.effect.term is not None
     name = leaving.effect.term.name

@@ -27,7 +27,9 @@ _PASSES = 4
 _SOLVER_STEPS = 60
 
 
-def measured_noise(observations: PhotometricObservations, curve: ResponseCurve | None = None) -> PhotometricObservations:
+def measured_noise(
+    observations: PhotometricObservations, curve: ResponseCurve | None = None
+) -> PhotometricObservations:
     """The observations with their noise: a factor per frame and one per patch, from what the free fields leave.
 
     curve: of the profile; takes off what the logged exposure × ISO does, so that a smooth field can do the rest.
@@ -118,7 +120,9 @@ def _basis(observations: PhotometricObservations, chosen: Indices, level: Array)
     x = (observations.x_px[chosen] - observations.width / 2) / size
     y = (observations.y_px[chosen] - observations.height / 2) / size
     part = level / 128.0
-    smooth = np.column_stack([np.ones_like(part), part**2, part[:, None] * np.column_stack([x, y, x * x, x * y, y * y])])
+    smooth = np.column_stack(
+        [np.ones_like(part), part**2, part[:, None] * np.column_stack([x, y, x * x, x * y, y * y])]
+    )
     columns = np.column_stack([part, smooth, part**3])
     terms = int(len(np.unique(observations.place[chosen])) / _PLACES_PER_TERM)
     knots = min(terms - columns.shape[1] + 2, _MOST_ROW_KNOTS)

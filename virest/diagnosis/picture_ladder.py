@@ -21,8 +21,14 @@ from virest.diagnosis import local_blur, local_blur_fit
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
 from virest.diagnosis.photometry_effects import PhotometricEffect, photometric_effects
-from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judge, significance
-from virest.diagnosis.photometry_mixing import estimate_mixing, judge_mixing, observe_mixing
+from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
+from virest.diagnosis.photometry_mixing import (
+    MixingEstimate,
+    MixingEvidence,
+    estimate_mixing,
+    judge_mixing,
+    observe_mixing,
+)
 from virest.diagnosis.photometry_patches import observe_photometry
 from virest.motion.trajectory import Trajectory
 
@@ -40,7 +46,10 @@ MAX_RUNGS = 3
 MIN_OBSERVATIONS = 300
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
-MIXING_P, MIXING_GAMMA, MIXING_BLACK = 1.5e-3, 0.05, 0.02
+MIXING_P = 1.5e-3
+MIXING_LEAST = {"response_curve": 0.05, "black_level": 0.02}
+"""Smallest change of the curve that is named from mixing: of the logarithm of gamma, of black level."""
+MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
 BLUR_Z = 3.6
 MIN_DEFOCUS_PX = 0.5
 MIN_EXPOSURE_CHANGE = 0.08
@@ -91,11 +100,12 @@ def climb_photometry(
     if len(observations) < MIN_OBSERVATIONS:
         verdict.notes.append("too few flat patches are seen again: brightness not judged")
     else:
-        _climb(verdict, observations, len(capture.frames))
+        climb_observations(verdict, observations, len(capture.frames))
     return verdict
 
 
-def _climb(verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int) -> None:
+def climb_observations(verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int) -> None:
+    """Enter into the verdict what the brightness of patches says."""
     nominal = verdict.profile
     verdict.photometric_rms = normalised_rms(observations, nominal)[0]
     effects = photometric_effects(observations, movie_frames)
@@ -244,33 +254,43 @@ def _mixing(
         return
     usable = [frame for frame in frames if frame.exposure_s]
     evidence = observe_mixing(pictures, usable, trajectory, verdict.profile)
-    found = {name: estimate_mixing(evidence, verdict.profile, name) for name in ("response_curve", "black_level")}
-    gamma, black = found["response_curve"], found["black_level"]
-    log.debug("mixing: gamma %s, black %s", gamma, black)
-    if gamma is None or black is None:
+    found = {name: _mixed(evidence, verdict.profile, name) for name in MIXING_LEAST}
+    if not any(found.values()):
         verdict.notes.append("no blurred frames beside sharp ones: the curve was not judged at constant exposure")
         return
-    is_gamma = gamma.p_value < MIXING_P and abs(np.log(gamma.value)) > MIXING_GAMMA
-    is_black = black.p_value < MIXING_P and black.value > MIXING_BLACK
-    if is_black:
-        is_gamma = False
-    name = "black_level" if is_black else "response_curve" if is_gamma else None
-    if name is None:
+    log.debug("mixing: %s", found)
+    sure = {name: one for name, one in found.items() if one and _is_sure(one, name, verdict.profile)}
+    if not sure:
         return
-    estimate = black if is_black else gamma
-    key, before = ("black_level", 0.0) if is_black else ("gamma", 1.0)
-    changes = {key: ParameterChange(before, estimate.value, estimate.std)}
-    held = judge_mixing(evidence, name)
-    gain = HeldOutGain(PHOTOMETRY, held.before, held.after, min(held.noise, held.after)) if held else None
-    gain = gain or HeldOutGain(PHOTOMETRY, abs(estimate.value - before), estimate.std, estimate.std)
-    other = "response_curve" if is_black else "black_level"
-    rivals = (Rival(other, gain.after),) if (black if not is_black else gamma).p_value < MIXING_P else ()
+    name = min(sure, key=lambda k: sure[k][1].after)
+    estimate, held = sure[name]
+    rivals = tuple(Rival(other, sure[other][1].after) for other in sure if other != name)
+    before = _value_of_curve(verdict.profile, name)
+    changes = {MIXING_PARAMETER[name]: ParameterChange(before, estimate.value, estimate.std)}
+    gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
     verdict.findings.append(Finding(name, changes, gain, rivals, estimate.p_value, _sentence(name, changes)))
     curve = _curve(verdict.profile)
-    value = estimate.value
-    curve = replace(curve, black_level=value) if is_black else replace(curve, extra_gamma=value)
+    is_black = name == "black_level"
+    curve = replace(curve, black_level=estimate.value) if is_black else replace(curve, extra_gamma=estimate.value)
     verdict.profile = replace(verdict.profile, response=curve)
-    verdict.rungs.append(Rung(name, {name: gain.after}, gain.before, PHOTOMETRY))
+    verdict.rungs.append(Rung(name, {k: one[1].after for k, one in found.items() if one}, held.before, PHOTOMETRY))
+
+
+def _mixed(evidence: MixingEvidence, profile: CameraProfile, name: str) -> tuple[MixingEstimate, HeldOut] | None:
+    estimate, held = estimate_mixing(evidence, profile, name), judge_mixing(evidence, name)
+    return (estimate, held) if estimate is not None and held is not None else None
+
+
+def _is_sure(found: tuple[MixingEstimate, HeldOut], name: str, profile: CameraProfile) -> bool:
+    """Whether a change of the curve is significant, worth naming, and gains where it was not fitted."""
+    estimate, held = found
+    now = _value_of_curve(profile, name)
+    size = estimate.value - now if name == "black_level" else abs(np.log(estimate.value / now))
+    return bool(estimate.p_value < MIXING_P and size > MIXING_LEAST[name] and held.gain > MIN_GAIN)
+
+
+def _value_of_curve(profile: CameraProfile, name: str) -> float:
+    return _curve(profile).black_level if name == "black_level" else _curve(profile).extra_gamma
 
 
 def residual_levels(observations: PhotometricObservations, profile: CameraProfile) -> Array:

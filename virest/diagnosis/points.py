@@ -13,6 +13,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.degradation.light import flicker
+from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import FarClock, GeometricVerdict, climb
 from virest.diagnosis.picture_ladder import Reader
@@ -158,7 +159,7 @@ def with_null_values(
         terms.append(terms_of.FOCAL)
         notes.append("focal length unknown: fitted on every rung, from a guess")
     if not profile.readout_known:
-        terms.append(terms_of.READOUT)
+        terms.append(terms_of.READOUT if profile.time_offset_s is None else PLAIN_READOUT)
     far = _agree_at(observed, capture, profile)
     agree = far is not None or _hardly_turns(observed, profile) or _one_axis_agrees(observed, capture, profile)
     if profile.time_offset_s is not None:

@@ -28,7 +28,7 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "principal_point": (0.2, 0.2),
     "stabilisation": (0.002, 0.02, 0.0, 0.0),
     "clock_skew": (1e-5,),
-    "exposure_time": (0.03,),
+    "exposure_time": (0.015,),
     "scene_depth": (0.004,),
 }
 """At the typical noise, in the units of the terms of profile_terms; a depth's relative."""
