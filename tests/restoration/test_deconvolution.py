@@ -184,17 +184,6 @@ def test_hyper_laplacian_fills_what_has_no_weight(rng: np.random.Generator) -> N
     np.testing.assert_allclose(found, 0.5, atol=5e-3)
 
 
-def test_a_ceiling_is_a_lower_bound_only() -> None:
-    """Where the observation is only a bound, light above it stays, and light below it is pulled up."""
-    observed = np.full((5, 8), 1.0, np.float32)
-    start = np.full_like(observed, 3.0)
-    ones = np.ones_like(observed)
-    above = hyper_laplacian(observed, np.copy, np.copy, start, ones, ones, 1e4, 1.0, (1.0,), 20, ones)
-    np.testing.assert_allclose(above, 3.0, atol=1e-3)
-    below = hyper_laplacian(observed, np.copy, np.copy, 0 * start, ones, ones, 1e4, 1.0, (1.0,), 20, ones)
-    np.testing.assert_allclose(below, 1.0, atol=1e-2)
-
-
 def test_solvers_leave_their_input_alone(rng: np.random.Generator) -> None:
     """Neither start nor observation is written into."""
     _, apply, adjoint = _matrix(rng)

@@ -9,6 +9,7 @@ from laws import texture
 from numpy.typing import NDArray
 
 from virest.degradation.kernels import KernelField
+from virest.restoration import statistics as statistics_room
 from virest.restoration.statistics import PictureStatistics, measure_picture, on_spectrum
 
 HEIGHT, WIDTH = 420, 560
@@ -133,3 +134,14 @@ def test_a_picture_clipped_all_over_gives_finite_statistics() -> None:
     for found in (luma, chroma):
         assert np.isfinite(found.noise_levels)
         assert np.isfinite(found.expected_gain_db)
+
+
+def test_detail_that_a_coder_took_away_is_taken_to_fall_as_a_pictures_does() -> None:
+    """Where the noise comes near what passes, the sharp picture keeps at least its last clear ring's fall; no less."""
+    frequency = (np.arange(24) + 0.5) / 48
+    signal, noise, passed = 40.0 * frequency**-3, np.full(24, 900.0), np.linspace(0.9, 0.1, 24)
+    cut = np.where(frequency > 0.3, 1e-3 * signal, signal)
+    found = statistics_room._as_detail_falls(frequency, cut, passed, noise)
+    np.testing.assert_allclose(found, signal, rtol=1e-9)
+    clear = statistics_room._as_detail_falls(frequency, signal, passed, np.full(24, 1e-3))
+    np.testing.assert_array_equal(clear, signal)

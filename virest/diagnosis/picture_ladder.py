@@ -94,6 +94,9 @@ def climb_photometry(
     if not frames:
         verdict.notes.append("no frame at a known time: brightness not judged")
         return verdict
+    if all(frame.exposure_s is None for frame in frames):
+        verdict.notes.append("exposures unknown: what changes brightness between frames cannot be told; not judged")
+        return verdict
     by_index = {frame.index: frame for frame in frames}
     pictures = ((by_index[k], picture) for k, picture in rgb([frame.index for frame in frames]))
     observations = observe_photometry(pictures, trajectory, profile, intra_frames=capture.keyframes)

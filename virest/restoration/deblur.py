@@ -32,9 +32,12 @@ COLOUR_TILE_PX = 384
 """Colour differences hold so little detail that kernels need not follow the paths as closely."""
 CODEC_REACH_PX = 2.5
 """A lamp's edge is smeared about so far by the movie's codec."""
-FEW_ITERATIONS = 2
+FEW_ITERATIONS, FEW_SCALE = 2, 0.6
+"""Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
 COARSE_OVERLAP, FINE_OVERLAP = 6, 4
 """Tiles overlap by this part of their side, with few iterations and with more."""
+START_ITERATIONS, SETTLED_BETA = 5, 0.3
+"""The whole-picture method starts from that many steps of the tiled one, so its penalties can start higher."""
 BAND_ROWS = 64
 """Of a picture, that stay in the cache."""
 BORDER_NOISE_TO_SIGNAL = 0.003
@@ -320,7 +323,7 @@ def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSetti
 def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> Image:
     deconvolution = _luma_tiles(blurred, settings)
     statistics = blurred.statistics
-    unit = statistics.gradient_scale
+    unit = statistics.gradient_scale * (FEW_SCALE if settings.iterations <= FEW_ITERATIONS else 1.0)
     noise = settings.strength * np.array([statistics.noise_levels, _border_noise(blurred)])
     trust, guarded = (float(t) for t in (unit / noise) ** 2)
     gradients = tiles.gradient_power(deconvolution.size)
@@ -389,11 +392,11 @@ def _pull_along(
     pull_behind -= gradient
 
 
-def _beta_schedule(iterations: int) -> tuple[float, ...]:
+def _beta_schedule(iterations: int, first: float = 0.05) -> tuple[float, ...]:
     """Rising penalties of the half-quadratic splitting, in units of the gradients' own scale."""
     if iterations <= FEW_ITERATIONS:
         return (0.2, 2.0)[-max(iterations, 1) :]
-    return tuple(float(b) for b in np.geomspace(0.05, 12.0, iterations))
+    return tuple(float(b) for b in np.geomspace(first, 12.0, iterations))
 
 
 # ── over the whole picture ───────────────────────────────────────────────────────────────────────────────────────
@@ -421,47 +424,35 @@ def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) 
 
 
 def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
-    """Hyper-Laplacian over the whole operator; censored pixels have no weight, but where all is clipped, as a bound.
+    """Luma over the whole operator, where censored pixels have no weight; colour as in tiles, all that a movie stores.
 
     Near clipped light the tiles' solution stays: its lamps were found with light held positive.
     """
     operator, near = _whole_operator(blurred), near_clipped(blurred)
-    statistics = blurred.statistics
-    first = _by_tile_hyper_laplacian(blurred, replace(settings, iterations=5))
-    reach = _path_reach(blurred) if any(c is not None for c in blurred.clipped) else None
-    sharp = []
-    for channel, (light, start) in enumerate(zip(blurred.light, first, strict=True)):
-        slope = blurred.slopes(channel)
-        weight, bound = _data_weight(slope, blurred.dark[channel], blurred.clipped[channel], reach)
-        result = hyper_laplacian(
-            light,
-            operator.apply,
-            operator.adjoint,
-            _extended(start, operator.border),
-            weight,
-            _extended(slope, operator.border),
-            (settings.strength * statistics.noise_levels) ** -2,
-            statistics.gradient_scale,
-            _beta_schedule(settings.iterations),
-            settings.inner_iterations,
-            bound,
-        )
-        inner = _inner(result, operator.border)
-        inner = inner if bound is None else np.where(bound > 0, np.maximum(inner, light), inner)
-        sharp.append(inner if near is None else inner + near * (start - inner))
-    return sharp
+    statistics, slope = blurred.statistics, blurred.slopes(1)
+    start = _tile_hyper_laplacian(blurred, replace(settings, iterations=START_ITERATIONS))
+    result = hyper_laplacian(
+        _luma(blurred.light),
+        operator.apply,
+        operator.adjoint,
+        _extended(start, operator.border),
+        _data_weight(slope, blurred),
+        _extended(slope, operator.border),
+        (settings.strength * statistics.noise_levels) ** -2,
+        statistics.gradient_scale,
+        _beta_schedule(settings.iterations, SETTLED_BETA),
+        settings.inner_iterations,
+    )
+    sharp = _inner(result, operator.border)
+    return _with_colour(blurred, sharp if near is None else sharp + near * (start - sharp), settings)
 
 
-def _data_weight(
-    slope: Image, dark: Image | None, clipped: Image | None, reach: NDArray[np.uint8] | None
-) -> tuple[Image, Image | None]:
-    """Weight of each pixel's light, and where it is only a lower bound: all along the blur path is clipped there."""
-    weight = slope if dark is None else slope * (1 - dark)
-    if clipped is None or reach is None:
-        return weight, None
-    bound = cv2.erode(clipped, reach)
-    unseen = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) - bound
-    return weight * (1 - unseen), bound
+def _data_weight(slope: Image, blurred: BlurredPicture) -> Image:
+    """Weight of each pixel's luma: none where any channel is clipped, with its neighbours, or all are too dark."""
+    holes, dark = _holes(blurred), [mask for mask in blurred.dark if mask is not None]
+    if holes is not None:
+        slope = slope * (1 - cv2.dilate(holes, np.ones((3, 3), np.uint8)))
+    return slope * (1 - np.minimum.reduce(dark)) if len(dark) == len(blurred.dark) else slope
 
 
 def _inner(picture: Image, border: int) -> Image:

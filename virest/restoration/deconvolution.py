@@ -131,25 +131,20 @@ def hyper_laplacian(
     gradient_unit: float,
     betas: tuple[float, ...],
     inner: int,
-    ceiling: Image | None = None,
 ) -> Image:
     """min over f of data_weight/2 Σ weight² (A f − g)² + Σ |s ∇f / u|^⅔, by half-quadratic splitting.
 
     Krishnan & Fergus 2009, over any operator A and with weights.  observed, weight: shape of A f; start, slope
     s: shape of f.  s is the curve's slope (grey levels per light), so that gradients and noise count as they are
     seen; u = gradient_unit is the grey level that a gradient of 1 stands for.  betas: rising penalties; inner:
-    conjugate-gradient steps for each.  ceiling: True-like (1.0) where the observation is only a lower bound (clipped
-    at the top): there A f may exceed it freely and is pulled up where it stays below.
+    conjugate-gradient steps for each.
     """
     unit_slope = slope / np.float32(gradient_unit)
     squared = unit_slope * unit_slope
     sharp = start
     for beta in betas:
         table = shrinkage_table(beta)
-        active = weight
-        if ceiling is not None:
-            active = np.where(ceiling > 0, weight * (apply(sharp) < observed), weight)
-        data = np.float32(data_weight / beta) * active * active
+        data = np.float32(data_weight / beta) * weight * weight
         right = adjoint(data * observed)
         for axis in (0, 1):
             target = shrink(unit_slope * difference(sharp, axis), table)
@@ -161,7 +156,7 @@ def hyper_laplacian(
                 result += difference_adjoint(squared * difference(x, axis), axis)
             return result
 
-        typical = float(np.median(active)) ** 2 / max(float(np.median(slope)) ** 2, 1e-12)
+        typical = float(np.median(weight)) ** 2 / max(float(np.median(slope)) ** 2, 1e-12)
         precondition = 1.0 / (slope * slope * np.float32(data_weight / beta * typical) + 4 * squared)
         sharp = conjugate_gradients(normal, right, sharp, precondition, inner)
     return sharp

@@ -31,7 +31,7 @@ from virest.restoration.deblur import (
 )
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
-from virest.restoration.statistics import PictureStatistics, measure_picture
+from virest.restoration.statistics import PictureStatistics, falling_power, measure_picture
 
 LOG_TILE_PX = 128
 """Spacing of the tiles in the log."""
@@ -41,12 +41,10 @@ SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
 MIN_GAIN_DB = 0.03
 """A picture of which the measured noise promises less is left alone."""
-FULL_TRUST_DB = 0.8
-"""From this expected gain on, a restored picture is taken whole."""
-MIN_SHARE = 0.25
-"""A picture of which no more would be taken is left alone."""
-FULL_TRUST_NOISE = 1.8
-"""Up to this multiple of the gradients' scale, noise does not lessen the trust."""
+LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
+"""Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
+FULL_TRUST_SCALE = 1.2
+"""Gradients of so many times the noise are not wiped out with it."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -288,8 +286,8 @@ def _deblurred(
     curve = motion.profile.response or ResponseCurve("srgb")
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
     luma, chroma = _measured(picture, samples, clipped_anywhere(picture, curve))
-    share = 1.0 if anchor != 0.5 else _trusted_share(luma, settings.deblur)
-    why_not = _too_little_to_gain(luma, share)
+    share = 1.0 if anchor != 0.5 else _trusted_share(luma)
+    why_not = _too_little_to_gain(luma)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(
@@ -341,7 +339,7 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
     drowned = drowned[drowned > 0]
     if len(drowned):
         last = drowned[0] - 1
-        signal[last + 1 :] = signal[last] * (frequency[last] / frequency[last + 1 :]) ** 3
+        signal[last + 1 :] = falling_power(frequency, signal, last)[last + 1 :]
     return replace(defocused, signal=signal, passed=defocused.passed * left)
 
 
@@ -359,14 +357,12 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
 
 
-def _too_little_to_gain(luma: PictureStatistics, share: float) -> str:
+def _too_little_to_gain(luma: PictureStatistics) -> str:
     """Why the picture is better left as it was recorded; empty: it is not."""
     if not luma.measured:
         return "picture too small for its blur to be measured, left alone"
     if luma.expected_gain_db < MIN_GAIN_DB:
         return f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
-    if share < MIN_SHARE:
-        return f"noise of {luma.noise_levels:.1f} grey levels drowns the detail, left alone"
     return ""
 
 
@@ -389,16 +385,15 @@ def _share_map(blurred: BlurredPicture, share: float) -> NDArray[np.float32] | n
     return np.float32(share) if near is None else np.float32(share) + np.float32(1.0 - share) * near
 
 
-def _trusted_share(luma: PictureStatistics, method: str) -> float:
+def _trusted_share(luma: PictureStatistics) -> float:
     """How much of a restored picture to take, the rest being the recorded one.
 
     Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
-    both pictures is better than either.  A whole-picture solution errs less than a tiled one.  Under noise far above
-    the picture's own gradients (a coarsely coded movie) the prior wipes out texture that the recorded picture has.
+    both pictures is better than either.  Under noise about as large as the picture's own gradients (a very coarsely
+    coded movie) the prior wipes out texture that the recorded picture has.
     """
-    least = 0.7 if method == "hyper-laplacian-global" else 0.5
-    share = float(np.clip(least + (1 - least) * luma.expected_gain_db / FULL_TRUST_DB, least, 1.0))
-    return share * min(1.0, FULL_TRUST_NOISE * luma.gradient_scale / luma.noise_levels)
+    share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
+    return float(share * min(1.0, luma.gradient_scale / (FULL_TRUST_SCALE * luma.noise_levels)))
 
 
 class _Clock:

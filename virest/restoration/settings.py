@@ -34,7 +34,7 @@ class RestorationSettings:
     """Of the whole-picture method: conjugate-gradient steps in each iteration."""
     tile_px: int = 128
     """Side of a tile; each has a kernel of its own."""
-    strength: float = 0.7
+    strength: float = 1.0
     """Multiplies the measured noise in the regularisation: 1 trusts it, more is smoother."""
     min_blur_px: float = 1.0
     """Frames whose longest blur path is shorter are not deblurred."""
@@ -43,9 +43,9 @@ class RestorationSettings:
 
 
 PRESETS: dict[str, RestorationSettings] = {
-    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144),
+    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144, strength=0.85),
     "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5, tile_px=104),
     "best": RestorationSettings(
-        "best", "hyper-laplacian-global", iterations=6, inner_iterations=6, tile_px=104, strength=0.6
+        "best", "hyper-laplacian-global", iterations=4, inner_iterations=5, tile_px=104, strength=0.9
     ),
 }

@@ -31,8 +31,14 @@ _CELLS = 64
 _MAX_TILES = 12
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
-_NOISE_SLOPE = 0.7
-"""Towards low frequencies the power of a coded movie's error grows about like f^−0.7."""
+_STEEPEST_NOISE, _LEVEL_BELOW = 2.0, 0.08
+"""A coded movie's error grows towards low frequencies like f⁻² at most, and below 0.08 cycles per pixel no more."""
+_SLOPE_SPAN = 3.0
+"""The noise's growth is measured from the lowest determined ring to so many times its frequency."""
+_CLEAR_SIGNAL = 3.0
+"""What comes through the blur is clear where it has so many times the noise's power."""
+_DETAIL_SLOPE = 3.0
+"""The power of a natural picture falls with frequency about like f⁻³."""
 _MAX_CLIPPED = 0.002
 """Tiles with a larger part of clipped pixels are taken only where there are none better."""
 _ON_PATH = 2e-3
@@ -40,6 +46,8 @@ _ON_PATH = 2e-3
 _FILLING_PX = (5, 15, 45, 135)
 _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
+_EDGES_BEYOND = 2.0
+"""A picture's edges stand out of its spectrum by so much: rings of tiles have the mean of edge and plain surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +79,11 @@ class PictureStatistics:
 
     @property
     def gradient_scale(self) -> float:
-        """Unit u of the prior exp(−|∇f/u|^⅔) that has the sharp picture's mean square gradient."""
+        """Unit u of the prior exp(−|∇f/u|^⅔): of edges, that stand out of the sharp picture's mean square gradient."""
         # forward differences pass 4 sin²(π f_x); its mean over a ring's directions is 2 − 2 J0(2π f)
         gain = 2 - 2 * _bessel_j0(2 * np.pi * self.frequency)
         area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0])
-        return float(np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
+        return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
 
     @property
     def expected_gain_db(self) -> float:
@@ -253,13 +261,46 @@ def _settled(
     if determined.any():
         noise = np.interp(frequency, frequency[determined], noise[determined])
         noise = np.maximum.accumulate(noise[::-1])[::-1]
-        noise *= np.maximum(frequency[determined][0] / frequency, 1.0) ** _NOISE_SLOPE
+        noise *= _growth_downwards(frequency, noise, determined)
     else:
         noise = np.full(RINGS, max(min(float(observed[-3:].mean()), 2 * white_levels**2), _ROUNDING_POWER))
     through = np.maximum(observed - noise, 0.05 * observed) / np.maximum(passed, 0.05)
     signal = np.where(determined, signal, through)
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
+    signal = _as_detail_falls(frequency, signal, passed, noise)
     return PictureStatistics(frequency, signal, noise, passed)
+
+
+def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.bool_]) -> Array:
+    """How many times larger the noise is below the determined rings, (RINGS,): it goes on as they rise.
+
+    A sensor's noise is white. A coder's is level where it cuts the picture's power down, and above falls with it.
+    """
+    first = int(np.flatnonzero(determined)[0])
+    near = determined & (frequency <= _SLOPE_SPAN * frequency[first])
+    slope = 0.0
+    if np.count_nonzero(near) > 2:
+        slope = -float(np.polyfit(np.log(frequency[near]), np.log(noise[near]), 1)[0])
+    rise = np.maximum(frequency[first] / np.maximum(frequency, _LEVEL_BELOW), 1.0)
+    return np.asarray(rise ** np.clip(slope, 0.0, _STEEPEST_NOISE))
+
+
+def _as_detail_falls(frequency: Array, signal: Array, passed: Array, noise: Array) -> Array:
+    """S where the noise comes near it: at least what the last clear ring says by the law of natural pictures.
+
+    There the coder has taken the blurred picture's faint detail away, and the fit finds less than the sharp one has.
+    """
+    doubtful = np.flatnonzero(passed * signal < _CLEAR_SIGNAL * noise)
+    doubtful = doubtful[doubtful > 1]
+    if not len(doubtful):
+        return signal
+    last = int(doubtful[0]) - 1
+    return np.append(signal[: last + 1], np.maximum(signal, falling_power(frequency, signal, last))[last + 1 :])
+
+
+def falling_power(frequency: Array, signal: Array, ring: int) -> Array:
+    """S by a ring's own, falling as f⁻³: between edges (f⁻³) and the lens's softening of the texture."""
+    return np.asarray(signal[ring] * (frequency[ring] / frequency) ** _DETAIL_SLOPE)
 
 
 def _unknown_picture() -> PictureStatistics:
