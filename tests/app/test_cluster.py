@@ -1,6 +1,5 @@
 """The same segments on a Dask cluster: the same bytes, whoever dies meanwhile."""
 
-import json
 import os
 import signal
 import subprocess
@@ -13,6 +12,7 @@ from typing import Any
 
 import pytest
 from cluster_processes import Cluster, running_cluster
+from run_content import content
 
 from virest.app import jobs
 from virest.app.cluster import is_lost
@@ -21,17 +21,7 @@ from virest.errors import RestorationError
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 SLOW = ("--preset", "best", "--deblur", "wiener")
-SIMULATED = "--width 180 --height 240 --frames 60 --exposure-ms 12 --rate 2 --seed 11"
-
-
-def content(run: Path) -> dict[str, Any]:
-    """Everything in a run's folder, without what a clock or the command line decides."""
-    found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
-    lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
-    found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
-    account = json.loads(found["run.json"])
-    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
-    return found
+SIMULATED = "--width 180 --height 240 --frames 40 --exposure-ms 12 --rate 2 --seed 11"
 
 
 def wait_until(condition: Callable[[], bool], process: "subprocess.Popen[str]") -> None:
@@ -91,14 +81,14 @@ def test_a_killed_worker_costs_its_segments_only(
         _, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     assert content(tmp_path / "out/turning") == undisturbed
-    assert undisturbed["run.json"]["counts"]["restored"] > 50
+    assert undisturbed["run.json"]["counts"]["restored"] > 30
 
 
 @pytest.mark.scenario
 def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
-    turning: Path, undisturbed: dict[str, Any], cluster: Cluster, tmp_path: Path
+    virest: Virest, turning: Path, undisturbed: dict[str, Any], cluster: Cluster, tmp_path: Path
 ) -> None:
-    """Exit 7; what was done stays; on another cluster, --resume ends as if nothing had happened."""
+    """Exit 7; what was done stays; --resume, here on this machine, ends as if nothing had happened."""
     run = tmp_path / "out/turning"
     with start(turning, tmp_path / "out", cluster.address) as process:
         wait_until(lambda: finished_segments(run) > 0, process)
@@ -113,12 +103,8 @@ def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
     assert output == ""
     kept = finished_segments(run)
     assert kept
-    with (
-        running_cluster(tmp_path / "another", 1) as other,
-        start(turning, tmp_path / "out", other.address, "--resume") as process,
-    ):
-        output, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
+    again = virest("process", turning, "--out", tmp_path / "out", *SLOW, "--jobs", 2, "--resume")
+    assert again.returncode == 0, again.stderr
     assert content(run) == undisturbed
 
 

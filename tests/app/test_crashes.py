@@ -3,7 +3,6 @@
 VIREST_KILLS sets how many moments are tried (a handful in the suite).
 """
 
-import json
 import os
 import random
 import signal
@@ -12,9 +11,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from run_content import content
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 KILLS = int(os.environ.get("VIREST_KILLS", "2"))
@@ -41,16 +40,6 @@ sys.exit(code)
 """.replace("{changes!r}", repr(set(CHANGES)))
 
 
-def content(run: Path) -> dict[str, Any]:
-    """Everything in a run's folder, without what a clock or the command line decides."""
-    found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
-    lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
-    found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
-    account = json.loads(found["run.json"])
-    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
-    return found
-
-
 def run_dying(step: int, tiny: Path, out: Path, *options: str) -> "subprocess.CompletedProcess[str]":
     """Run with one process that kills itself at its ``step``-th change of the output folder; 0 never."""
     arguments = [str(out), str(step), "process", str(tiny), "--out", str(out), "--preset", "fast", "--jobs", "1"]
@@ -65,9 +54,8 @@ def test_killed_before_any_change_of_the_folder_resume_ends_the_same(tiny: Path,
     assert done.returncode == 0, done.stderr
     steps, expected = int(done.stdout.splitlines()[-1]), content(tmp_path / "undisturbed/tiny")
     assert steps > 24 * 2
-    rng = random.Random(42)
-    chosen = [*range(steps, 1, -1)][: max(KILLS // 4, 1)] + [rng.randint(1, steps) for _ in range(KILLS)]
-    for step in chosen:
+    last = steps - 2  # the run is finished, its scaffolding still stands
+    for step in {last, *random.Random(42).sample(range(1, steps + 1), min(KILLS, steps))}:
         out = tmp_path / f"killed-{step}"
         assert run_dying(step, tiny, out).returncode == -signal.SIGKILL
         again = run_dying(0, tiny, out, "--resume")

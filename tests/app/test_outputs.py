@@ -140,6 +140,32 @@ def test_a_finished_run_is_refused_without_overwrite(tmp_path: Path) -> None:
     assert check_run(run, REQUEST, "resume") == "finished"
 
 
+@pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
+def test_a_run_killed_in_its_first_moment_is_no_obstacle(tmp_path: Path, mode: str) -> None:
+    """Half of its request is no foreign file, and goes."""
+    run = RunFolder(tmp_path / "trip")
+    run.path.mkdir()
+    (run.path / ".run.0123abcd.part").write_bytes(b"half")
+    with opened_run(run, REQUEST, mode):  # type: ignore[arg-type]
+        assert names(run.path) - {".lock"} == {".run", ".segments", "frames"}
+    (run.path / "mine.0123abcd.part").write_bytes(b"mine")
+    run.state.unlink()
+    with pytest.raises(OutputError, match="no run of virest"):
+        check_run(run, REQUEST, "overwrite")
+
+
+def test_a_run_killed_in_its_last_moment_is_cleared_away_by_resume(tmp_path: Path) -> None:
+    """It is finished, but its scaffolding still stands."""
+    run = RunFolder(tmp_path / "trip")
+    finish(run)
+    run.segments.mkdir()
+    write_whole(run.segment_log(0, 0), b'{"frame": 0}\n')
+    (run.path / "run.json.0123abcd.part").write_bytes(b"half")
+    with opened_run(run, REQUEST, "resume") as found:
+        assert found == "finished"
+    assert names(run.path) == {"frames", "frames/000000.png", "parameters.jsonl", "run.json"}
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -1,6 +1,5 @@
 """Captures and outputs behind an address: a real S3 server on localhost, the same bytes as on a disk."""
 
-import json
 import os
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from typing import Any
 import fsspec
 import pytest
 from moto.server import ThreadedMotoServer
+from run_content import folder_files, without_clocks
 
 from virest.app import outputs
 from virest.app.outputs import RunFolder, capture_name, finished_segments, opened_run, write_whole
@@ -22,6 +22,8 @@ from virest.errors import OutputError, SettingsError, VideoError
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 FAST = ("--preset", "fast", "--jobs", 1)
+ELSEWHERE = ("folder", "movie", "profile_source")
+"""Keys of run.json that name a place."""
 REQUEST = {"version": "1", "settings": {}, "frames": "0:1:1", "profile_sha256": "ab", "inputs": []}
 
 
@@ -67,27 +69,11 @@ def everything(address: str) -> dict[str, bytes]:
     return {name.removeprefix(key + "/"): store.cat_file(name) for name in store.find(key)}
 
 
-def without_clocks(files: dict[str, bytes]) -> dict[str, Any]:
-    """Files of a run without what a clock, the command line or the place decides."""
-    found: dict[str, Any] = dict(files)
-    lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
-    found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
-    account = json.loads(found["run.json"])
-    elsewhere = ("totals", "command", "folder", "movie", "profile_source")
-    found["run.json"] = {k: v for k, v in account.items() if k not in elsewhere}
-    return found
-
-
 def fail_after_a_segment(run: RunFolder) -> None:
     """Write one frame and its segment's log, then fail."""
     write_whole(run.picture(0), b"png")
     write_whole(run.segment_log(0, 0), b'{"frame": 0, "output": "frames/000000.png"}\n')
     raise RuntimeError
-
-
-def local_files(run: Path) -> dict[str, bytes]:
-    """All files of a run's folder."""
-    return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
 
 
 # ── addresses ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -255,7 +241,7 @@ def test_a_run_from_bucket_to_bucket_is_the_local_run(virest: Virest, bucket: st
     """Byte for byte, also after a kill and --resume; --json gives the same lines."""
     upload(tiny, f"{bucket}/tiny")
     assert virest("process", tiny, "--out", tmp_path / "out", *FAST).returncode == 0
-    local = without_clocks(local_files(tmp_path / "out/tiny"))
+    local = without_clocks(folder_files(tmp_path / "out/tiny"), *ELSEWHERE)
     run = locate(f"{bucket}/out/tiny")
     command = [
         sys.executable,
@@ -278,7 +264,7 @@ def test_a_run_from_bucket_to_bucket_is_the_local_run(virest: Virest, bucket: st
     assert result.returncode == 0, result.stderr
     files = everything(f"{bucket}/out/tiny")
     assert result.stdout.encode() == files["parameters.jsonl"]
-    assert without_clocks(files) == local
+    assert without_clocks(files, *ELSEWHERE) == local
     again = virest("process", f"{bucket}/tiny", "--out", f"{bucket}/out", *FAST)
     assert again.returncode == 8
     missing = virest("process", f"{bucket}/missing", "--out", f"{bucket}/out", *FAST)

@@ -30,6 +30,8 @@ LOOK_S = 2.0
 """How old the count of workers may be."""
 LAST_SEGMENT_S = 120.0
 """How long to wait for segments that are being worked on when the program leaves."""
+TALKERS = ("distributed", "tornado", "asyncio")
+"""Loggers that tell at length of a connection that was lost."""
 LIBRARIES = ("numpy", "opencv-python-headless", "av", "isal")
 """Those that decide the bytes of a picture."""
 
@@ -182,8 +184,9 @@ def _connect(address: str, verbose: bool) -> Any:
     from dask.distributed import Client
 
     if not verbose:  # what it has to say about lost connections is said here in one line
-        for name in ("distributed", "tornado", "asyncio"):
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        for name in [*logging.root.manager.loggerDict, *TALKERS]:  # Dask gives some of their children levels
+            if name.partition(".")[0] in TALKERS:
+                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECT_S}s"})
     try:
         asyncio.run(_knock(address))  # a client that cannot connect would complain at length when it is taken away

@@ -235,7 +235,7 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
             return found, old  # type: ignore[return-value]
     try:
         inside = run.path.iterdir() if run.path.is_dir() else ()
-        foreign = [p.name for p in inside if p != run.lock and p.name not in BESIDE]
+        foreign = [p.name for p in inside if p != run.lock and p.name not in BESIDE and not _is_own_part(p.name)]
     except OSError as error:
         raise output_error(run.path, error) from error
     if foreign:
@@ -244,6 +244,11 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
             hint="choose another folder with --out",
         )
     return "nothing", {}
+
+
+def _is_own_part(name: str) -> bool:
+    """Whether a file is what a run that was killed in its first moment leaves."""
+    return bool(PART.fullmatch(name) and OWN_FILES.fullmatch(name))
 
 
 def _read_request(path: Path) -> dict[str, Any] | None:
@@ -301,6 +306,8 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
             try:
                 if found != "finished" or mode == "overwrite":
                     _make_ready(run, request, mode)
+                else:
+                    _clear_scaffolding(run)  # a run killed in its last moment leaves some
                 yield found if mode == "resume" else "nothing"
             except BaseException:
                 _leave(run)
@@ -359,6 +366,15 @@ def _remove_own(run: RunFolder) -> None:
     for folder in (run.path, run.frames):
         own = [file for file in folder.iterdir() if OWN_FILES.fullmatch(file.name) and file != run.state]
         remove_files([file for file in own if is_remote(file) or not file.is_dir()])
+
+
+def _clear_scaffolding(run: RunFolder) -> None:
+    """Take away what only an unfinished run needs."""
+    try:
+        _remove_segments(run)
+        remove_parts(run)
+    except OSError as error:
+        raise output_error(run.path, error) from error
 
 
 def _remove_segments(run: RunFolder) -> None:
@@ -436,9 +452,9 @@ def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any]) ->
         _join(run.parameters, logs)
         write_whole(run.run_json, (json.dumps(plain(account), allow_nan=False, indent=2) + "\n").encode())
         run.state.unlink(missing_ok=True)
-        _remove_segments(run)
     except OSError as error:
         raise output_error(run.path, error) from error
+    _clear_scaffolding(run)
 
 
 def _join(path: Path, logs: Iterable[Path]) -> None:

@@ -26,6 +26,7 @@ from virest.capture.join import (
     outside_reason,
     pts_tolerance_ns,
 )
+from virest.capture.location import locate
 from virest.capture.profile_source import default_profile, resolve_profile
 from virest.capture.records import NO_STAMP, STARTUP, Capture, CaptureMetadata, Frame, Note
 from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source
@@ -123,7 +124,7 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
 def require_folder(path: Path) -> Path:
     """The folder, resolved, so that `.` has a name. Raises CaptureError if it is missing or no folder."""
     try:
-        folder = Path(path).resolve(strict=True)
+        folder = locate(path).resolve(strict=True)
         if folder.is_dir():
             return folder
     except FileNotFoundError:

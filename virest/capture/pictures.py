@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.files import label, require_regular_file, scan_text
+from virest.capture.location import is_remote
 from virest.capture.marslogger_android import STAMPS, read_frame_timestamps
 from virest.capture.tables import INTEGER, Int64, exact_times_ns, keep_rising, text_chunks
 from virest.errors import CaptureError, ClockError, VideoError
@@ -155,6 +156,8 @@ def _from_names(folder: Path) -> PictureList:
 def _pictures(folder: Path) -> list[str]:
     """Names of the plain files of a folder that are called like pictures, sorted."""
     try:
+        if is_remote(folder):
+            return [place.name for place in folder.iterdir() if place.name.lower().endswith(SUFFIXES)]
         with os.scandir(folder) as entries:
             return sorted(e.name for e in entries if e.name.lower().endswith(SUFFIXES) and e.is_file())
     except (OSError, ValueError):
@@ -169,9 +172,16 @@ def _place(base: Path, names: list[str]) -> str:
     """Where the listed pictures lie: beside the list, or in one of the usual folders."""
     for name in names[:20]:
         for place in ("data", *PLACES):
-            if _is_inside(name) and (base / place / name).is_file():
+            if _is_inside(name) and _is_file(base / place / name):
                 return place
     return ""
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long
+        return False
 
 
 def _is_inside(name: str) -> bool:

@@ -10,6 +10,7 @@ from virest.camera.kalibr import is_kalibr, parse_camchain
 from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, load_yaml_mapping, parse_profile
 from virest.camera.shutter import Shutter
 from virest.capture.files import is_present
+from virest.capture.location import locate
 from virest.capture.records import Capture
 from virest.errors import SettingsError
 
@@ -80,10 +81,10 @@ def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[Camer
         path = capture.folder / PROFILE_NAME
     if path is None:
         return default_profile(capture), "the capture's metadata and documented defaults"
-    profile = read_any_profile(Path(path))
+    profile = read_any_profile(locate(path))
     if (profile.width, profile.height) != (capture.width, capture.height):
         raise SettingsError(
-            f"{Path(path).name}: image {profile.width}x{profile.height}, but {capture.name}/{capture.movie.name} is "
+            f"{locate(path).name}: image {profile.width}x{profile.height}, but {capture.name}/{capture.movie.name} is "
             f"{capture.width}x{capture.height}",
             hint="a profile holds for one stored size; scale its intrinsics, or pass the one of this mode",
         )

@@ -182,11 +182,12 @@ def _bound_memory() -> bool:
     """Have FFmpeg refuse blocks above MAX_BLOCK_BYTES; False where its library cannot be told apart (not Linux)."""
     try:
         mapped = Path("/proc/self/maps").read_text().splitlines()
-        library = next(line.split(maxsplit=5)[-1] for line in mapped if "/libavutil" in line)
-        ctypes.CDLL(library).av_max_alloc(ctypes.c_size_t(MAX_BLOCK_BYTES))
-    except (OSError, StopIteration, AttributeError):
+        libraries = {line.split(maxsplit=5)[-1] for line in mapped if "/libavutil" in line}  # OpenCV brings one too
+        for library in libraries:
+            ctypes.CDLL(library).av_max_alloc(ctypes.c_size_t(MAX_BLOCK_BYTES))
+    except (OSError, AttributeError):
         return False
-    return True
+    return bool(libraries)
 
 
 def _video_stream(container: Any, path: Path) -> Any:
@@ -304,10 +305,10 @@ def _decoded(container: Any, stream: Any, index: MovieIndex, first: int) -> Iter
     broken_since: int | None = None
     for packet in _packets(container, stream):
         try:
-            frames = packet.decode()
+            frames = stream.decode(packet)
         except av.FFmpegError:
             frames = []
-            if packet.pts is not None:
+            if packet is not None and packet.pts is not None:
                 broken_since = packet.pts if broken_since is None else min(broken_since, packet.pts)
         for frame in frames:
             if frame.pts is None or int(frame.pts) not in lookup:
@@ -322,12 +323,12 @@ def _decoded(container: Any, stream: Any, index: MovieIndex, first: int) -> Iter
 
 
 def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    """Packets up to the end of what can be read, then the flushing one."""
+    """Packets up to the end of what can be read, then the flushing one: empty, or None where the reading failed."""
     try:
         yield from container.demux(stream)
     except av.FFmpegError as fault:
         log.warning("the movie's data end early: %s", _reason(fault))
-        yield av.Packet(0)
+        yield None
 
 
 # ── pixels ───────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -17,12 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from virest import __version__
+from virest.app.bench.cost import cost_section
 from virest.app.bench.curves import curves_section
 from virest.app.bench.diagnosis import diagnosis_section
 from virest.app.bench.memory import memory_section
 from virest.app.bench.quality import quality_section
 from virest.app.bench.real import real_section
 from virest.app.bench.shutter import shutter_section
+from virest.app.bench.soak import soak_section
 from virest.app.bench.speed import speed_section
 from virest.app.bench.workload import Scale
 from virest.app.console import emit
@@ -32,9 +34,11 @@ SECTIONS: dict[str, Section] = {
     "quality": quality_section,
     "shutter": shutter_section,
     "speed": speed_section,
+    "cost": cost_section,
     "memory": memory_section,
     "curves": curves_section,
     "diagnosis": diagnosis_section,
+    "soak": soak_section,
     "real": real_section,
 }
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image")

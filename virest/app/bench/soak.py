@@ -1,0 +1,197 @@
+"""Two hundred captures in one run, a tenth of them broken in ten ways: all good ones done, nothing grows.
+
+Memory and open files of the program and its workers are sampled all along; the last quarter of the run is held against
+the second, since the first one fills caches.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from virest.app.bench.memory import process_tree, resident_bytes
+from virest.app.bench.tables import table
+from virest.app.bench.workload import Scale, simulated
+
+CAPTURES, QUICK_CAPTURES = 200, 20
+BROKEN_EVERY = 10
+FRAMES = 8
+SAMPLE_S = 0.25
+PARTLY_FAILED = 9
+HEAD_LINES = 1
+SHIFT_NS = 10**15
+
+
+def soak_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
+    """Write the captures, process them in one run, and look at what became of each."""
+    count = QUICK_CAPTURES if scale.quick else CAPTURES
+    source = simulated(work, "soak-source", width=240, height=180, frames=FRAMES, seed=3)
+    broken = dict(_write_captures(work / "soak", source, count))
+    folders = sorted((work / "soak").iterdir())
+    out = work / "soak-out"
+    command = [sys.executable, "-m", "virest", "process", *map(str, folders), "--out", str(out)]
+    code, errors, samples = _watched([*command, "--preset", "fast", "--jobs", "2"], work / "soak.log")
+    facts = {"captures": count, "exit_code": code, **_judge(folders, broken, out, errors), **_growth(samples)}
+    for folder in (work / "soak", out):
+        shutil.rmtree(folder)
+    return facts, _text(facts)
+
+
+# ── captures ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _write_captures(folder: Path, source: Path, count: int) -> Iterator[tuple[str, str]]:
+    """Copies of one capture, every tenth broken; gives (name, way) of those."""
+    folder.mkdir()
+    for number in range(count):
+        copy = folder / f"capture-{number:04d}"
+        shutil.copytree(source, copy, ignore=shutil.ignore_patterns("truth*"))
+        if number % BROKEN_EVERY == BROKEN_EVERY - 1:
+            way = list(WAYS)[number // BROKEN_EVERY % len(WAYS)]
+            WAYS[way](copy)
+            yield copy.name, way
+
+
+def _cut_movie(folder: Path) -> None:
+    movie = folder / "movie.mp4"
+    movie.write_bytes(movie.read_bytes()[: movie.stat().st_size // 2])
+
+
+def _spoil_movie(folder: Path) -> None:
+    """Overwrite the last third of the pictures' data; the tables stay."""
+    movie = folder / "movie.mp4"
+    data = bytearray(movie.read_bytes())
+    start = data.find(b"mdat")
+    size = int.from_bytes(data[start - 4 : start], "big")
+    data[start + 2 * size // 3 : start + size - 4] = np.random.default_rng(1).bytes(size - 4 - 2 * size // 3)
+    movie.write_bytes(data)
+
+
+def _empty_movie(folder: Path) -> None:
+    (folder / "movie.mp4").write_bytes(b"")
+
+
+def _empty_gyro(folder: Path) -> None:
+    (folder / "gyro_accel.csv").write_bytes(b"")
+
+
+def _other_session(folder: Path) -> None:
+    """Move the gyroscope's times by eleven days."""
+    path = folder / "gyro_accel.csv"
+    lines = path.read_text().splitlines()
+    rows = (line.partition(",") for line in lines[HEAD_LINES:])
+    moved = [f"{int(time_ns) + SHIFT_NS},{rest}" for time_ns, _, rest in rows]
+    path.write_text("\n".join([*lines[:HEAD_LINES], *moved]) + "\n")
+
+
+def _no_gyro(folder: Path) -> None:
+    path = folder / "gyro_accel.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:HEAD_LINES], *(re.sub(r",.*", ",null" * 6, row) for row in lines[1:])]) + "\n")
+
+
+def _swap(folder: Path) -> None:
+    one, other = folder / "gyro_accel.csv", folder / "frame_timestamps.txt"
+    content = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+
+
+def _pipe(folder: Path) -> None:
+    (folder / "gyro_accel.csv").unlink()
+    os.mkfifo(folder / "gyro_accel.csv")
+
+
+def _wrong_profile(folder: Path) -> None:
+    (folder / "camera.yaml").write_text("virest_profile: 1\nimage: {width: 240, hight: 180}\n")
+
+
+def _remove_all(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.mkdir()
+
+
+WAYS: dict[str, Callable[[Path], None]] = {
+    "movie cut": _cut_movie,
+    "movie spoilt": _spoil_movie,
+    "movie empty": _empty_movie,
+    "gyroscope empty": _empty_gyro,
+    "gyroscope null": _no_gyro,
+    "gyroscope of another session": _other_session,
+    "files swapped": _swap,
+    "pipe for a file": _pipe,
+    "wrong profile": _wrong_profile,
+    "nothing there": _remove_all,
+}
+
+
+# ── watching ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _watched(command: list[str], log: Path) -> tuple[int, str, list[tuple[float, int]]]:
+    """Exit code, standard error, and (bytes, open files) of the whole tree of processes, four times a second."""
+    samples = []
+    with log.open("w") as file, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file) as process:
+        while process.poll() is None:
+            tree = process_tree(process.pid)
+            samples.append((float(sum(map(resident_bytes, tree))), sum(map(_open_files, tree))))
+            time.sleep(SAMPLE_S)
+    return process.returncode, log.read_text(errors="replace"), samples
+
+
+def _open_files(pid: int) -> int:
+    with suppress(OSError):
+        return len(os.listdir(f"/proc/{pid}/fd"))
+    return 0
+
+
+def _growth(samples: list[tuple[float, int]]) -> dict[str, Any]:
+    """Medians of the second and the last quarter of the run."""
+    values = np.array(samples)
+    quarter = len(values) // 4
+    early, late = np.median(values[quarter : 2 * quarter], axis=0), np.median(values[3 * quarter :], axis=0)
+    return {
+        "memory_mb": [early[0] / 1e6, late[0] / 1e6],
+        "open_files": [int(early[1]), int(late[1])],
+        "seconds": len(values) * SAMPLE_S,
+    }
+
+
+def _judge(folders: list[Path], broken: dict[str, str], out: Path, errors: str) -> dict[str, Any]:
+    """Which good captures are done, and which broken ones are explained: by a line of the log, or by their run."""
+    done = {folder.name for folder in folders if (out / folder.name / "run.json").is_file()}
+    said = {name: [line for line in errors.splitlines() if name in line and "camera profile from" not in line]
+            for name in broken}  # fmt: skip
+    return {
+        "good": len(folders) - len(broken),
+        "good_done": sum(folder.name in done for folder in folders if folder.name not in broken),
+        "broken": len(broken),
+        "broken_explained": sum(bool(lines) for lines in said.values()),
+        "explanations": {broken[name]: lines[0] if lines else "" for name, lines in said.items()},
+        "tracebacks": errors.count("Traceback"),
+        "left_over": sorted(p.name for p in out.rglob("*") if p.name.endswith((".part", ".lock")) or p.name == ".run"),
+    }
+
+
+def _text(facts: dict[str, Any]) -> str:
+    rows = [
+        ["exit code", str(facts["exit_code"]), str(PARTLY_FAILED)],
+        ["good captures done", str(facts["good_done"]), str(facts["good"])],
+        ["broken ones explained", str(facts["broken_explained"]), str(facts["broken"])],
+        ["tracebacks, files left over", f"{facts['tracebacks']}, {len(facts['left_over'])}", "0, 0"],
+        ["memory, MB", "{:.0f} -> {:.0f}".format(*facts["memory_mb"]), "level"],
+        ["open files", "{} -> {}".format(*facts["open_files"]), "level"],
+    ]
+    title = f"SOAK: {facts['captures']} captures in one run, {facts['seconds']:.0f} s; second quarter -> last quarter\n"
+    said = "\n".join(f"  {way}: {line[:150]}" for way, line in facts["explanations"].items())
+    return title + table(["what", "found", "wanted"], rows) + "\n" + said
