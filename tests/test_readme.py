@@ -14,8 +14,8 @@ from virest.camera import profile
 README = Path(__file__).resolve().parent.parent / "README.md"
 TEXT = README.read_text(encoding="utf-8")
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive"}
-"""Options of pip and git that a README may name."""
+OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive", "--nthreads"}
+"""Options of pip, git and dask that a README may name."""
 
 
 def options_of(command: Any) -> set[str]:
