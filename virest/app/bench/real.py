@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,8 @@ from virest.diagnosis.geometric_ladder import shown
 from virest.diagnosis.ladder import diagnose_capture
 from virest.errors import VirestError
 from virest.motion.tracking import track_pairs
+
+log = logging.getLogger(__name__)
 
 CALIBRATED = {"lhaippp_car": (), "nexus5_162941": ("clock-skew",), "gopro_karma": (), "gopro_hero7": ()}
 DIAGNOSED = ("lhaippp_car", "nexus5_162941", "honor_v10", "gopro_hero7")
@@ -48,7 +51,8 @@ def _calibrated(folder: Path, extra: tuple[str, ...]) -> list[Row]:
         pairs = track_pairs(read_gray(movie, probe_movie(movie), plan.frames))
         found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
     except VirestError as error:
-        return [[folder.name, "refused", str(error), "", ""]]
+        log.info("%s", error)
+        return [[folder.name, "refused", "", "", ""]]
     wanted = [value for value in found.values if value.name in ("time_offset_s", "readout_time_s", "clock_skew")]
     return [
         [folder.name, v.name, shown(v.value), "" if v.std is None else shown(v.std), "yes" if v.determined else "no"]
