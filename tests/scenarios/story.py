@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from virest.app.bench.measures import psnr_db
+from virest.evaluation.fidelity import psnr_db
 
 Virest = Callable[..., CompletedProcess[str]]
 Picture = np.ndarray[Any, np.dtype[np.uint8]]

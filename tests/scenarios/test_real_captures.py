@@ -10,8 +10,8 @@ import pytest
 import yaml
 from story import Result, process
 
-from virest.app.bench.measures import point_distances_px
 from virest.capture.video import probe_movie, read_frames
+from virest.evaluation.fidelity import point_distances_px
 from virest.motion.tracking import TrackingSettings, TrackPair, track_pairs
 
 pytestmark = pytest.mark.scenario

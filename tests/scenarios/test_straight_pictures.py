@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from story import Result, process, simulate, truth_picture
 
-from virest.app.bench.measures import point_distances_px, shift_px
+from virest.evaluation.fidelity import point_distances_px, shift_px
 
 pytestmark = pytest.mark.scenario
 

@@ -17,13 +17,13 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 from story import Picture, Result, process, truth_picture
 
-from virest.app.bench.measures import psnr_db
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_frames, read_gray
 from virest.degradation.row_motion import FrameTranslation, frame_times_s
+from virest.evaluation.fidelity import psnr_db
 from virest.restoration.capture import RestorationPlan, plan_restoration, restore_frames
 from virest.restoration.settings import PRESETS
 

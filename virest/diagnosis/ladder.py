@@ -150,6 +150,9 @@ class _Story:
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         left = remaining_structure(self.geometric, self.light)
         first, observed = self.first, self.points.observed
+        extended = self.curve.profile
+        # a lens's lean belongs to the start of this log; a process that begins later must not have it
+        unleaning = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
         stamps = sum(NO_STAMP not in frame.skip_codes for frame in self.capture.frames)
         nominal = Nominal(
             first.nominal_rms_px, first.noise_px, self.light.photometric_rms, self.blur.blur_rms_px,
@@ -161,7 +164,7 @@ class _Story:
             tuple(findings),
             left,
             first.nominal.profile,
-            self.curve.profile,
+            replace(extended, extensions=unleaning),
             (*self.geometric.rungs, *(rung for look in looks for rung in look.rungs)),
             {"before": residuals(first, True), "after": residuals(self.geometric, False)},
             (*self.notes, *self.geometric.notes, *(note for look in looks for note in look.notes)),

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.bench.measures import MARGIN_PX
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Picture, Scale, recorded_frames, simulated, truth_frame
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
+from virest.evaluation.fidelity import MARGIN_PX
 from virest.restoration.capture import RestorationPlan, restore_frames
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS, RestorationSettings

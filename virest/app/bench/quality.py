@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.measures import psnr_db
 from virest.app.bench.peers import PEERS, frame_motions, peer_pictures
 from virest.app.bench.tables import table
 from virest.app.bench.workload import (
@@ -21,6 +20,7 @@ from virest.app.bench.workload import (
     truth_frame,
 )
 from virest.app.console import emit
+from virest.evaluation.fidelity import psnr_db
 
 METHODS = (*PRESETS, *PEERS)
 KIND_TITLES = {

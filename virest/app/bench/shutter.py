@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.measures import point_distances_px
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, recorded_frames, run_process, simulated, truth_frame
+from virest.evaluation.fidelity import point_distances_px
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
 SIZES = {"640x480": (640, 480), "720x1280": (720, 1280)}
