@@ -13,6 +13,7 @@ from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
 from virest.capture.imu import ImuSamples
 from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.motion.integration import integrate_gyro
+from virest.motion.relief_surface import Relief
 
 CAMERA = TurningCamera(phone(), velocity_m_s=(0.4, -0.25, 0.6))
 
@@ -67,6 +68,29 @@ def test_the_plane_stays_where_it_is_while_the_camera_moves() -> None:
         np.testing.assert_allclose(motion.inverse_depth(seen / seen[:, 2:], time_s), 1 / seen[:, 2], atol=1e-9)
     beyond = np.array([[0.0, 9.0, 1.0]])
     assert motion.inverse_depth(beyond, motion.reference_s).tolist() == [0.0]
+
+
+BUMP = Relief(
+    np.array([-0.6, -0.5]),
+    np.array([1.2, 1.0]),
+    np.array([[0.0, 0.05, 0.0, -0.1], [0.1, 0.4, 0.2, 0.0], [0.0, 0.1, 0.0, 0.05]], np.float32),
+    np.full((2, 2), 0.01, np.float32),
+)
+
+
+def test_a_surface_stays_where_it_is_while_the_camera_moves() -> None:
+    """A point on the surface has, at any time, the inverse depth that the surface gives on the ray to it."""
+    motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=replace(SWAY, relief=BUMP))
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 6))
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=-1)
+    above = BUMP.at(rays)
+    points = rays / (rays @ SWAY.inverse_depth_plane + above)[:, None]
+    assert np.ptp(above) > 0.3
+    for since in (0.0, 0.011, 0.03):
+        time_s = np.full(len(points), motion.reference_s + since)
+        rotation, shift = motion.pose(time_s)
+        seen = np.einsum("nij,nj->ni", rotation, points) + shift
+        np.testing.assert_allclose(motion.inverse_depth(seen / seen[:, 2:], time_s), 1 / seen[:, 2], atol=2e-4)
 
 
 def test_relative_poses_compose() -> None:

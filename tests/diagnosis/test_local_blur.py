@@ -9,15 +9,21 @@ import pytest
 from scipy.special import erf
 
 from virest.app.simulate import simulate_command
-from virest.camera.profile import CameraProfile, read_profile
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile, Extensions, read_profile
 from virest.camera.response import ResponseCurve
+from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
+from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.capture.video import probe_movie, read_gray
-from virest.diagnosis.local_blur import BlurObservations, frames_to_read, observe_blur, residuals
+from virest.capture.video import GrayReader, probe_movie, read_gray
+from virest.degradation.kernels import kernel_field
+from virest.degradation.row_motion import row_motion
+from virest.diagnosis import local_blur
+from virest.diagnosis.local_blur import BlurObservations, frames_to_read, look_for_blur, observe_blur, residuals
 from virest.diagnosis.local_blur_edges import EdgeSettings, fit_steps, measure_widths, observe_picture
 from virest.diagnosis.local_blur_fit import Defocus, ExposureTime, fit, held_out
-from virest.diagnosis.local_blur_model import fitted_width
+from virest.diagnosis.local_blur_model import fitted_width, node_tensors
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
@@ -39,15 +45,56 @@ def observed(folder: Path, seed: int, *effects: str) -> Observed:
 
 
 @pytest.fixture(scope="module")
-def nominal(tmp_path_factory: pytest.TempPathFactory) -> Observed:
+def nominal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the capture with nothing hidden lies."""
+    return tmp_path_factory.mktemp("null") / "trip"
+
+
+@pytest.fixture(scope="module")
+def nominal(nominal_folder: Path) -> Observed:
     """A capture with nothing hidden."""
-    return observed(tmp_path_factory.mktemp("null") / "trip", 51)
+    return observed(nominal_folder, 51)
 
 
 @pytest.fixture(scope="module")
 def altered(tmp_path_factory: pytest.TempPathFactory) -> Observed:
     """A capture exposed 1.5 times as long as logged, and out of focus by 1.3 px."""
     return observed(tmp_path_factory.mktemp("both") / "trip", 52, "exposure_time=1.5", "defocus=1.3")
+
+
+@pytest.mark.parametrize("direction", ["bottom_to_top", "left_to_right"])
+def test_paths_are_those_of_the_kernels(direction: str) -> None:
+    """Of all frames at once, the paths' covariances are those of the kernels that restoration takes, lens in motion."""
+    lens = Intrinsics(320, 240, 261.0, 255.0, 151.0, 128.0, "radtan", (-0.06, 0.01, 0.001, -0.002, 0.0))
+    extensions = Extensions(focal_drift_per_s=0.02, stabilisation_fraction=0.4, stabilisation_cutoff_hz=0.7)
+    shutter = Shutter(0.023, direction, exposure_scale=1.2)
+    profile = CameraProfile(320, 240, intrinsics=lens, shutter=shutter, time_offset_s=0.013, extensions=extensions)
+    time_s = np.arange(0.0, 1.5, 0.005)
+    rate = np.stack([1.1 * np.sin(6 * time_s), 1.4 * np.cos(5 * time_s), 2.0 * np.sin(8 * time_s + 1)], axis=-1)
+    trajectory = integrate_gyro(ImuSamples(time_s, rate, np.full_like(rate, np.nan)), profile)
+    points = np.array([[30.0, 200.0], [290.0, 25.0], [160.0, 130.0], [75.0, 60.0]])
+    stamp_s, exposure_s = np.array([0.3, 1.1, 0.7]), np.array([0.012, 0.02, 0.005])
+    found = node_tensors(points, stamp_s, exposure_s, profile, trajectory)
+    for k, stamp in enumerate(stamp_s):
+        paths = kernel_field(row_motion(trajectory, profile, stamp, exposure_s[k]), points).paths_px
+        for place, path in enumerate(paths):
+            xx, xy, _, yy = np.cov(path.T, ddof=0).ravel() / (1 - 1 / len(path) ** 2)
+            np.testing.assert_allclose(found[k, place], [xx, xy, yy], atol=3e-3 * (xx + yy))
+
+
+def test_parts_of_a_capture_show_what_all_of_it_shows(
+    nominal: Observed, nominal_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Measured part by part, edges and spectra are those of one stream."""
+    monkeypatch.setattr(local_blur, "frames_to_read", lambda capture: [3, 5, 7, 8, 9, 12])
+    capture, (_, profile, trajectory) = read_capture(nominal_folder, look_at_pictures=False), nominal
+    gray = GrayReader(capture.movie, probe_movie(capture.movie))
+    whole = observe_blur(gray([3, 5, 7, 8, 9, 12]), capture, profile, trajectory)
+    parts = look_for_blur(gray, capture, profile, trajectory)
+    np.testing.assert_array_equal(parts.edges.width_px, whole.edges.width_px)
+    np.testing.assert_array_equal(parts.ratios.log_ratio, whole.ratios.log_ratio)
+    assert parts.candidates == whole.candidates
+    assert len(whole.ratios) > 0
 
 
 def test_the_width_of_a_blurred_step_is_found(rng: np.random.Generator) -> None:

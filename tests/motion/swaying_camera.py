@@ -39,6 +39,8 @@ class Sway:
     """Of the wall, before it is made a unit vector."""
     relief_m: float = 0.0
     """Standard deviation of points before and behind the wall."""
+    panel: float | None = None
+    """A panel hangs before part of the wall, at this part of its distance."""
     accel_bias_m_s2: tuple[float, float, float] = (0.05, -0.08, 0.03)
     accel_delay_s: float = 0.0
     accelerometer: bool = True
@@ -144,7 +146,7 @@ class SwayingCamera:
         first_s = self._seen_s(first_px, self.stamp_s[k])
         rays = np.concatenate([(first_px - CENTRE_PX) / setup.focal_px, np.ones((setup.points, 1))], axis=1)
         way, start = self.orientation(first_s).apply(rays), self.position(first_s)
-        along = (self.distance - start @ self.normal) / (way @ self.normal)
+        along = self._along(start, way)
         world = start + way * (along + rng.normal(0, setup.relief_m, len(along)))[:, None]
         second_px = first_px.copy()
         for _ in range(8):
@@ -154,6 +156,22 @@ class SwayingCamera:
         inside = (second_px > 0).all(axis=1) & (second_px < size - 1).all(axis=1)
         noise = rng.normal(0, setup.noise_px, second_px.shape)
         return TrackPair(k, k + 1, first_px[inside], (second_px + noise)[inside])
+
+    def _along(self, start: Array, way: Array) -> Array:
+        """How many times each way (n, 3) leads to what is seen: the panel where it hangs, or the wall."""
+        wall = (self.distance - start @ self.normal) / (way @ self.normal)
+        if self.setup.panel is None:
+            return wall
+        panel = (self.setup.panel * self.distance - start @ self.normal) / (way @ self.normal)
+        edge = self.orientation(self.stamp_s[-1] / 2).apply([0.8, 0.6, 0.0])
+        hangs = (start + way * panel[:, None]) @ edge > 0.12 * self.distance
+        return np.where(hangs, panel, wall)
+
+    def inverse_depth(self, camera_s: float, points_px: Array) -> Array:
+        """Of what is seen at pixels (n, 2) at an instant on the camera's clock, along the optical axis."""
+        time_s = np.full(len(points_px), camera_s + self.setup.time_offset_s)
+        rays = np.concatenate([(points_px - CENTRE_PX) / self.setup.focal_px, np.ones((len(points_px), 1))], axis=1)
+        return 1 / self._along(self.position(time_s), self.orientation(time_s).apply(rays))
 
     def _seen_s(self, points_px: Array, stamp_s: float) -> Array:
         """Middle of the exposure of the columns through the points, IMU clock."""

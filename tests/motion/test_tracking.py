@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from virest.motion.tracking import TrackingSettings, find_corners, track_pairs
+from virest.motion import tracking
+from virest.motion.tracking import TrackingSettings, find_corners, track_frames, track_pairs
 
 Picture = NDArray[np.uint8]
 
@@ -47,6 +50,26 @@ def test_blurred_pictures_are_followed() -> None:
     pair = track_pairs([(0, view(scene, (0, 0))), (1, view(scene, (12.5, -3.0)))])[0]
     assert len(pair) > 60
     assert np.median(np.abs(pair.points_second_px - pair.points_first_px - (12.5, -3.0))) < 0.1
+
+
+def test_parts_of_a_movie_give_what_one_stream_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut anywhere, across a jump and beside a repeated picture, no pair is lost, doubled or new."""
+    scene = texture(700, 800)
+    movie = {k: view(scene, (2.5 * k, -1.5 * k), (120, 160)) for k in (*range(9), *range(20, 25))}
+    movie[4] = movie[3]
+
+    def gray(frames: Sequence[int]) -> list[tuple[int, Picture | None]]:
+        return [(k, movie[k]) for k in frames]
+
+    whole = track_pairs(gray(list(movie)))
+    for length in (3, 4, 5):
+        monkeypatch.setattr(tracking, "PART_FRAMES", length)
+        done: list[int] = []
+        parts = track_frames(gray, list(movie), progress=done.append)
+        assert [(p.first, p.second) for p in parts] == [(p.first, p.second) for p in whole]
+        assert all(np.array_equal(a.points_second_px, b.points_second_px) for a, b in zip(parts, whole, strict=True))
+        assert sum(done) == len(movie)
+        assert max(done) <= length
 
 
 def test_halving_keeps_stored_pixels() -> None:

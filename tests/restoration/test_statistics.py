@@ -145,3 +145,13 @@ def test_detail_that_a_coder_took_away_is_taken_to_fall_as_a_pictures_does() -> 
     np.testing.assert_allclose(found, signal, rtol=1e-9)
     clear = statistics_room._as_detail_falls(frequency, signal, passed, np.full(24, 1e-3))
     np.testing.assert_array_equal(clear, signal)
+
+
+@pytest.mark.parametrize("height", [41, 45])
+def test_white_noise_is_the_median_second_difference(height: int, rng: np.random.Generator) -> None:
+    """What the histogram gives is the median of every fourth pixel's second difference both ways."""
+    plane = rng.integers(0, 256, (height, 58)).astype(np.uint8)
+    mask = np.outer([1, -2, 1], [1, -2, 1]).astype(float)
+    differences = cv2.filter2D(plane.astype(float), -1, mask)[2 : height - 2 : 4, 2:-2:4]
+    expected = np.median(np.abs(differences)) / 0.6745 / 6.0
+    assert statistics_room.white_noise(plane) == pytest.approx(expected, rel=1e-9)

@@ -14,9 +14,10 @@ from virest.degradation.blur import tile_grid
 from virest.restoration.statistics import packed_frequency
 from virest.restoration.tiles import (
     TileDeconvolution,
-    doubled,
     gradient_power,
     inverse_filter,
+    packed_power,
+    packed_product,
     quick_grid,
     wiener_filter,
 )
@@ -46,14 +47,22 @@ def _lopsided_kernel(size: int = 15) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_doubled_powers_are_real_factors(size: int, rng: np.random.Generator) -> None:
-    """A packed |K|², doubled, multiplies as the full |K|² does in NumPy's transform, in every place of the packing."""
+def test_packed_powers_are_real_factors(size: int, rng: np.random.Generator) -> None:
+    """A packed |K|² multiplies as the full |K|² does in NumPy's transform, in every place of the packing."""
     kernel = random_picture((size, size), rng) / size
-    spectrum = cv2.dft(kernel)
-    power = doubled(cv2.mulSpectrums(spectrum, spectrum, 0, conjB=True))
     picture = random_picture((size, size), rng)
     expected = _filtered_by_numpy(picture, lambda fy, fx: np.abs(np.fft.fft2(kernel)) ** 2)
-    np.testing.assert_allclose(_filtered(picture, power), expected, atol=1e-4 * np.abs(expected).max())
+    filtered = _filtered(picture, packed_power(cv2.dft(kernel)))
+    np.testing.assert_allclose(filtered, expected, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_packed_products_are_periodic_convolutions(size: int, rng: np.random.Generator) -> None:
+    """The product of two packed spectra is that of NumPy's full ones."""
+    picture, kernel = (random_picture((size, size), rng) / size for _ in range(2))
+    expected = np.fft.ifft2(np.fft.fft2(picture) * np.fft.fft2(kernel)).real
+    product = cv2.idft(packed_product(cv2.dft(picture), cv2.dft(kernel)), flags=cv2.DFT_SCALE)
+    np.testing.assert_allclose(product, expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -122,6 +131,23 @@ def test_each_tile_is_restored_by_its_own_kernel() -> None:
 def test_the_inverse_is_held_where_nothing_passes() -> None:
     """The naive inverse stays finite where the kernel cancels, and is exact where it passes."""
     np.testing.assert_allclose(inverse_filter(np.array([0.0, 1e-6, 0.25], np.float32)), [1000, 1000, 4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("border", [3e-2, 7e-2])
+def test_what_pulls_is_0_beyond_the_picture(border: float) -> None:
+    """A pull goes into each tile at its place, times the factor of tiles inside or at the picture's border."""
+    pull = texture(150, 210).astype(np.float32)
+    grid = tile_grid(150, 210, 64, 16)
+    deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16)
+    nothing = [np.zeros((deconvolution.size,) * 2, np.float32)] * len(deconvolution.kernels)
+    beyond = np.pad(pull, 100)
+    pulled = deconvolution.pulled(nothing, pull, 0.5, border)
+    for spectrum, (top, left), at_border in zip(pulled, grid.corners(), deconvolution.at_border, strict=True):
+        expected = np.zeros((deconvolution.size,) * 2)
+        rows, columns = (slice(84 + k, 84 + k + deconvolution.patch) for k in (top, left))
+        expected[: deconvolution.patch, : deconvolution.patch] = beyond[rows, columns]
+        tile = cv2.idft(spectrum, flags=cv2.DFT_SCALE)
+        np.testing.assert_allclose(tile, expected * (border if at_border else 0.5), atol=1e-5)
 
 
 @pytest.mark.parametrize(("height", "width", "margin"), [(480, 640, 16), (1280, 720, 23), (360, 640, 8), (90, 70, 41)])

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from story import Picture, Result, process, truth_picture
 
 from virest.app.simulate import simulate_command
+from virest.app.slam_captures import SlamCapture, make_capture
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
@@ -73,11 +74,11 @@ class Story:
 
         return plan_restoration(self.capture, replace(self.profile, **changes), SETTINGS, read)
 
-    def psnr_db(self, plan: RestorationPlan) -> np.ndarray[Any, Any]:
-        """Of the chosen frames, against truth, away from the edges."""
+    def psnr_db(self, plan: RestorationPlan, chosen: range = CHOSEN) -> np.ndarray[Any, Any]:
+        """Of chosen frames, against truth, away from the edges."""
         folder, movie = self.capture.folder, self.capture.movie
-        pictures = dict(read_frames(movie, probe_movie(movie), 0, max(CHOSEN)))
-        frames = [(self.capture.frames[k], pictures[k]) for k in CHOSEN]
+        pictures = dict(read_frames(movie, probe_movie(movie), 0, max(chosen)))
+        frames = [(self.capture.frames[k], pictures[k]) for k in chosen]
         found = []
         for restored in restore_frames(frames, self.capture.imu, plan):
             truth = truth_picture(folder, restored.frame.index)
@@ -155,6 +156,23 @@ def test_accelerations_a_sample_late_do_not_matter(story: Callable[[str], Story]
     imu = told.capture.imu
     late = replace(imu, accel_m_s2=np.roll(imu.accel_m_s2, 1, axis=0))
     require_close(Story(replace(told.capture, imu=late), told.profile).plan(), told)
+
+
+def test_things_before_a_wall_are_restored_at_their_own_depth(work: Path):
+    """A walk past them: their surface brings 1 dB over the wall's plane, and no frame is worse."""
+    walk = SlamCapture(
+        "things", "before a wall", width=480, height=360, focal_px=400.0, readout_ms=27.0, exposure_ms=6.0, frames=24,
+        walk_m=(0.35, -0.06, 0.08), depth_m=3.0, near_m=1.1, tilt_deg=(9.0, -13.0), seed=63,
+    )  # fmt: skip
+    folder = make_capture(walk, work / "things")
+    capture = read_capture(folder)
+    told = Story(capture, replace(resolve_profile(capture, folder / "truth" / "camera.yaml")[0], depth_m=None))
+    plan = told.plan()
+    assert plan.translations is not None, plan.warnings
+    flat = replace(plan, translations={k: replace(t, relief=None) for k, t in plan.translations.items()})
+    plane, surface = (told.psnr_db(p, range(3, 24, 6)) for p in (flat, plan))
+    assert (surface - plane).min() > 0, surface - plane
+    assert (surface - plane).mean() > 1, surface - plane
 
 
 # ── as the program runs ──────────────────────────────────────────────────────────────────────────────────────────

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,19 +17,17 @@ from virest.calibration.geometry import FRAME_LAG, OPTIONAL, CalibratedValue, Ge
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
 from virest.camera.profile import CameraProfile, format_profile, load_yaml_mapping, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
-from virest.capture.join import median_period_s
-from virest.capture.records import Capture, Frame
-from virest.capture.video import probe_movie, read_gray
+from virest.capture.records import Capture
+from virest.capture.video import GrayReader, probe_movie
 from virest.errors import CalibrationError, OutputError
-from virest.motion.alignment import choose_pairs
-from virest.motion.tracking import track_pairs
+from virest.motion.lively_frames import lively_frames
+from virest.motion.shared_out import Each, one_by_one
+from virest.motion.tracking import track_frames
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
 """What ``--with`` takes."""
 MAX_FRAMES = 400
 """Every frame of captures up to this length, 13 s at 30 frames a second; runs of that many in all of longer ones."""
-RUN_S, MIN_RUN_FRAMES, MAX_RUN_FRAMES = 1.5, 20, 80
-"""A run lets the accelerometer tell the camera's path, and eight of them and more spread over the capture."""
 FIT_STEPS = 3
 UNEXPLAINED = 1.5
 """A residual of this many times the noise of tracking is worth a note."""
@@ -116,17 +114,10 @@ def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str
 
 def choose_frames(capture: Capture, profile: CameraProfile, with_startup: bool = False) -> list[int]:
     """Movie indices to track, rising: every usable frame, or lively runs of them; the start-up's where asked for."""
-    chosen = choose_pairs(
-        capture.frames, capture.imu, MAX_FRAMES, _run_frames(capture.usable), profile.time_offset_s or 0.0
-    )
+    chosen = lively_frames(capture.frames, capture.imu, MAX_FRAMES, profile.time_offset_s or 0.0)
     if with_startup:
         chosen += [frame.index for frame in capture.frames if frame.only_startup]
     return sorted(set(chosen))
-
-
-def _run_frames(frames: Sequence[Frame]) -> int:
-    period_s = median_period_s(np.array([frame.time_s for frame in frames])) if len(frames) > 1 else None
-    return int(np.clip(round(RUN_S / period_s), MIN_RUN_FRAMES, MAX_RUN_FRAMES)) if period_s else MIN_RUN_FRAMES
 
 
 def _imu_file(source: str) -> ImuNoise | None:
@@ -142,18 +133,20 @@ def _imu_file(source: str) -> ImuNoise | None:
 
 
 def run_calibration(
-    plan: CalibrationPlan, output: CalibrationOutput, progress: Callable[[int], Any] | None = None
+    plan: CalibrationPlan,
+    output: CalibrationOutput,
+    progress: Callable[[int], Any] | None = None,
+    each: Each = one_by_one,
 ) -> tuple[Json, str]:
     """Track, fit and write; returns the mapping for ``--json`` and the table for people.
 
-    progress is called with 1 for each of the plan's steps.  Raises CalibrationError, OutputError; nothing is written
-    then.
+    progress is called with the number of the plan's steps just done.  each: shares work out.  Raises CalibrationError,
+    OutputError; nothing is written then.
     """
     output.require()
     step = progress or (lambda _: None)
     movie = plan.capture.movie
-    pictures: Iterator[Any] = read_gray(movie, probe_movie(movie), plan.frames)
-    pairs = track_pairs(pictures, progress=lambda _index: step(1))
+    pairs = track_frames(GrayReader(movie, probe_movie(movie)), plan.frames, each, step)
     found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1))
     _require_offset(found)
     noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)
@@ -217,6 +210,7 @@ def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise |
         "profile_source": plan.source,
         "with": list(plan.extra),
         "frames": len(plan.frames),
+        "frames_recorded": len(plan.capture.frames),
         "pairs": found.pairs,
         "tracks": found.tracks,
         "values": values,
@@ -308,6 +302,8 @@ def describe(facts: Json) -> str:
         f"the gyroscope explains {facts['explained']:.1%} of the turns",
         f"camera's translation: {_TRANSLATIONS.get(facts['translation'], facts['translation'])}",
     ]
+    if facts["frames"] < facts["frames_recorded"]:
+        lines.append(f"looked at {facts['frames']} of {facts['frames_recorded']} frames, runs spread over the capture")
     lines += [
         f"errors of {pair['first']} and {pair['second']} go together: correlation {pair['correlation']:+.2f}"
         for pair in facts["correlations"]

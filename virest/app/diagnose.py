@@ -22,10 +22,11 @@ from virest.app.recreate import restored_scene
 from virest.camera.profile import CameraProfile, format_profile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
-from virest.capture.video import probe_movie, read_frames, read_gray
+from virest.capture.video import GrayReader, probe_movie, read_frames
 from virest.diagnosis.findings import CONSISTENT, Diagnosis, Finding, Remaining, Rung
 from virest.diagnosis.restoration_gain import RestorationGain, chosen_pairs, measure_restoration_gain
 from virest.errors import OutputError, VirestError
+from virest.motion.shared_out import Each, one_by_one
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.settings import PRESETS
@@ -85,23 +86,25 @@ class Source:
     gray: Reader
 
 
-def run_diagnosis(path: str, options: DiagnosisOptions, progress: Progress | None = None) -> DiagnosisOutcome:
+def run_diagnosis(
+    path: str, options: DiagnosisOptions, progress: Progress | None = None, each: Each = one_by_one
+) -> DiagnosisOutcome:
     """Diagnose one capture and write DIR/<capture>/diagnosis.json, extended.yaml and figures.
 
-    progress: told of each stage and of the part that is done.  Raises CaptureError, SettingsError, CalibrationError,
-    OutputError; nothing is written then.
+    progress: told of each stage and of the part that is done.  each: shares work out.  Raises CaptureError,
+    SettingsError, CalibrationError, OutputError; nothing is written then.
     """
     say = progress or (lambda _stage, _part: None)
     folder = Path(options.out) / capture_name(path)
     require_free(folder, options.overwrite)
     source = open_source(Path(path), options.config)
-    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part))
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each)
     say("restoring", LADDER_PART)
     gain = measure_restoration_gain(
-        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray
+        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray, each=each
     )
     say("figures", GAIN_PART)
-    files, drawn = draw_figures(source.capture, found)
+    files, drawn = draw_figures(source.capture, found, each)
     facts = as_json(found, gain, drawn)
     files[EXTENDED] = extended_text(source.capture.name, found).encode()
     files[DIAGNOSIS] = (json.dumps(facts, allow_nan=False, indent=2) + "\n").encode()
@@ -111,11 +114,11 @@ def run_diagnosis(path: str, options: DiagnosisOptions, progress: Progress | Non
     return DiagnosisOutcome(facts, text, found.verdict)
 
 
-def climb(source: Source, progress: Progress) -> Diagnosis:
+def climb(source: Source, progress: Progress, each: Each = one_by_one) -> Diagnosis:
     """The ladder itself."""
     from virest.diagnosis.ladder import diagnose_capture
 
-    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress)
+    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each)
 
 
 def require_free(folder: Path, overwrite: bool) -> None:
@@ -147,10 +150,7 @@ def open_source(path: Path, config: Path | None = None) -> Source:
         for first, last in _runs(numbers):
             yield from read_frames(capture.movie, index, first, last)
 
-    def gray(numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
-        return read_gray(capture.movie, index, numbers)
-
-    return Source(capture, profile, pictures, gray)
+    return Source(capture, profile, pictures, GrayReader(capture.movie, index))
 
 
 def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
@@ -238,7 +238,9 @@ def _plain_std(std: Any) -> Any:
 # ── figures ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def draw_figures(capture: Capture, found: Diagnosis) -> tuple[dict[str, bytes], list[list[str]]]:
+def draw_figures(
+    capture: Capture, found: Diagnosis, each: Each = one_by_one
+) -> tuple[dict[str, bytes], list[list[str]]]:
     """PNG files by their path below the capture's folder, and the paths that belong to each cause."""
     files: dict[str, bytes] = {}
     before, after = found.residuals.get("before"), found.residuals.get("after")
@@ -249,7 +251,7 @@ def draw_figures(capture: Capture, found: Diagnosis) -> tuple[dict[str, bytes], 
     if found.ladder:
         rungs = [_bars(rung) for rung in found.ladder[:MAX_RUNGS]]
         files[f"{FIGURES}/ladder.png"] = ladder_figure(rungs, f"{capture.name}: what was tried")
-    pictures = _pictures_figure(capture, found)
+    pictures = _pictures_figure(capture, found, each)
     if pictures is not None:
         files[f"{FIGURES}/pictures.png"] = pictures
     common = list(files)
@@ -267,7 +269,7 @@ def _bars(rung: Rung) -> tuple[str, float, dict[str, float], str | None]:
     return rung.quantity, rung.before, rung.tried, rung.entered
 
 
-def _pictures_figure(capture: Capture, found: Diagnosis) -> bytes | None:
+def _pictures_figure(capture: Capture, found: Diagnosis, each: Each) -> bytes | None:
     """A lively frame against its simulation from its neighbour's restored picture, with either profile."""
     firsts = chosen_pairs(capture, found.extended_profile)
     if not firsts:
@@ -278,8 +280,8 @@ def _pictures_figure(capture: Capture, found: Diagnosis) -> bytes | None:
     if found.causes:
         profiles["causes built in"] = found.extended_profile
     rows = []
-    for label, profile in profiles.items():
-        simulated = simulated_frame(capture, profile, number)
+    shown = each(simulated_frame, [(capture, profile, number) for profile in profiles.values()])
+    for label, simulated in zip(profiles, shown, strict=True):
         if measured is not None and simulated is not None:
             rows.append((label, measured, simulated))
     return comparison_figure(rows, f"{capture.name}: frame {number}") if rows else None

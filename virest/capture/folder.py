@@ -23,6 +23,7 @@ from virest.capture.join import (
     find_gaps,
     floor_us,
     join_metadata,
+    median_period_s,
     outside_reason,
     pts_tolerance_ns,
 )
@@ -321,6 +322,7 @@ def _frames(
     began: start.Startup,
 ) -> tuple[Frame, ...]:
     readout_s = metadata.readout_time_s or 0.0
+    imu_period_s = median_period_s(imu.time_s)
     frames = []
     for i, row in enumerate(joined.metadata_rows.tolist()):
         exposure_s = _value(files.metadata.exposure_s, row) if files.metadata else None
@@ -332,7 +334,7 @@ def _frames(
             reasons.append((NO_STAMP, f"no row in {files.names.stamps if files.stamps else files.names.metadata}"))
         start_s = float(time_s[i])
         end_s = start_s + (exposure_s or metadata.exposure_s or 0.0) + readout_s
-        if outside := outside_reason(start_s, end_s, imu.time_s, gaps):
+        if outside := outside_reason(start_s, end_s, imu.time_s, gaps, imu_period_s):
             reasons.append(outside)
         frames.append(
             Frame(

@@ -172,13 +172,18 @@ def find_gaps(time_s: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
 
 
 def outside_reason(
-    start_s: float, end_s: float, time_s: NDArray[np.float64], gaps_s: tuple[tuple[float, float], ...]
+    start_s: float,
+    end_s: float,
+    time_s: NDArray[np.float64],
+    gaps_s: tuple[tuple[float, float], ...],
+    period_s: float | None = None,
 ) -> tuple[str, str] | None:
     """(code, text) of why the IMU does not cover [start_s, end_s], None if it does.
 
-    One period beyond either end of the IMU still counts as covered: the last rate is held that long.
+    One period beyond either end of the IMU still counts as covered: the last rate is held that long.  period_s: of the
+    samples, where it is known already.
     """
-    period = median_period_s(time_s)
+    period = median_period_s(time_s) if period_s is None else period_s
     if start_s < time_s[0] - period:
         return "no-imu", f"begins {(time_s[0] - start_s) * 1e3:.1f} ms before the first IMU row"
     if end_s > time_s[-1] + period:

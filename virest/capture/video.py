@@ -145,6 +145,18 @@ def read_gray(path: Path, index: MovieIndex, frames: Iterable[int]) -> Iterator[
     yield from _read(path, index, frames, to_gray)
 
 
+@dataclass(frozen=True, slots=True)
+class GrayReader:
+    """Luma of the frames asked for: what a process needs to read a movie by itself."""
+
+    movie: Path
+    index: MovieIndex
+
+    def __call__(self, frames: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        """As `read_gray`."""
+        return read_gray(self.movie, self.index, frames)
+
+
 # ── the container ────────────────────────────────────────────────────────────────────────────────────────────────
 
 

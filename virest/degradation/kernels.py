@@ -8,6 +8,7 @@ A kernel is that path splatted onto the pixel grid; g is the *correlation* of f 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -17,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from virest.degradation.light import flicker
 from virest.degradation.row_motion import RowMotion
-from virest.degradation.warp import moved_between, seen_by_rows
+from virest.degradation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
 
 Array = NDArray[np.float64]
 SAMPLES_PER_PX = 2.0
@@ -83,10 +84,10 @@ def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inve
     points = np.broadcast_to(centres_px[:, None], (len(centres_px), count, 2))
     if inverse_depth is not None:
         inverse_depth = np.broadcast_to(np.asarray(inverse_depth, float)[..., None], gathered_s.shape)
-    nodes_px = seen_by_rows(motion, points, gathered_s, anchor, inverse_depth) - points
+    nodes_px = seen_by_rows(motion, points, gathered_s, anchor, inverse_depth, PIXELS_WITHIN_PX) - points
     length = np.linalg.norm(np.diff(nodes_px, axis=1), axis=-1).sum(axis=1).max(initial=0.0)
     samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_PX * 1.3 * length)))
-    paths_px = _between(part, samples) @ nodes_px
+    paths_px = _between(count, samples) @ nodes_px
     light, sigma_px = _light(motion, centres_px, samples), motion.profile.extensions.defocus_sigma_px
     return KernelField(centres_px, paths_px, anchor, light, sigma_px)
 
@@ -100,10 +101,11 @@ def _light(motion: RowMotion, centres_px: Array, samples: int) -> Array | None:
     return flicker(motion.profile, middles_s, piece_s)
 
 
-def _between(part: Array, samples: int) -> Array:
-    """Weights (samples, nodes) of a cubic spline's nodes at ``part``, in the middles of ``samples`` equal pieces."""
+@lru_cache(maxsize=64)
+def _between(count: int, samples: int) -> Array:
+    """Weights (samples, count) of a cubic spline's evenly spaced nodes in the middles of ``samples`` equal pieces."""
     middles = (np.arange(samples) + 0.5) / samples
-    return np.asarray(CubicSpline(part, np.eye(len(part)))(middles))
+    return np.asarray(CubicSpline(np.linspace(0.0, 1.0, count), np.eye(count))(middles))
 
 
 def blur_chords(motion: RowMotion, points_px: Array, inverse_depth: Any = None) -> Array:

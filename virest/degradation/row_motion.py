@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.relief_surface import Relief
 from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
 
 Array = NDArray[np.float64]
@@ -19,7 +20,9 @@ OUTSIDE_FRACTION = 0.25
 """The table reaches this part of the readout beyond the first and last row, for points outside the picture."""
 
 _LEAST_DISTANCE = 0.05
-"""The camera never comes nearer to the plane than this part of its distance at the reference time."""
+"""The camera never comes nearer to the scene than this part of its distance at the reference time."""
+_RELIEF_STEPS = 3
+"""Where a point lies on the surface depends on its depth: each step shrinks the error by surface's slope × parallax."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +42,18 @@ class FrameTranslation:
     """At the picture's centre, for the log; None: unknown."""
     source: str = "none"
     """Where the depth is from: ``triangulated``, ``profile`` or ``none``."""
+    relief: Relief | None = None
+    """What stands out of the plane, at the reference time; None: nothing is known to."""
 
     def position_m(self, since_reference_s: Array) -> Array:
         """Centre (..., 3) at times (...) from the reference."""
         since = np.asarray(since_reference_s, float)[..., None]
         return since * (np.asarray(self.velocity_m_s) + 0.5 * since * np.asarray(self.acceleration_m_s2))
+
+    def inverse_depth(self, rays: Array) -> Array:
+        """1 / depth (...) along the optical axis at the reference time, of what rays (..., 3), z = 1, meet."""
+        plane = rays @ np.asarray(self.inverse_depth_plane, float)
+        return np.maximum(plane if self.relief is None else plane + self.relief.at(rays), 0.0)
 
     def velocity_at(self, since_reference_s: Any) -> Array:
         """Velocity (..., 3) of the centre at times (...) from the reference, still in the axes at the reference."""
@@ -110,16 +120,24 @@ class RowMotion:
         return rotation, t_to - np.squeeze(rotation @ t_from[..., None], -1)
 
     def inverse_depth(self, rays: Array, time_s: Any) -> Array:
-        """1 / depth (...) along the optical axis at times (...) of where rays (..., 3), z = 1, meet the frame's plane.
+        """1 / depth (...) along the optical axis at times (...) of where rays (..., 3), z = 1, meet the scene.
 
-        0 without a plane.  n · X = 1 at the reference becomes (R n) · X = 1 + (R n) · t at another time.
+        0 without a plane.  n · X = 1 at the reference becomes (R n) · X = 1 + (R n) · t at another time.  With relief
+        the place on the plane is the first guess of where the point is seen at the reference time.
         """
         rotation, shift = self.pose(time_s)
         if self.translation is None or shift is None:
             return np.zeros(rays.shape[:-1])
         turned = rotation @ np.asarray(self.translation.inverse_depth_plane, float)
         nearer = np.maximum(1 + (turned * shift).sum(-1), _LEAST_DISTANCE)
-        return np.maximum((turned * rays).sum(-1) / nearer, 0.0)
+        nearness = np.maximum((turned * rays).sum(-1) / nearer, 0.0)
+        for _ in range(_RELIEF_STEPS if self.translation.relief is not None else 0):
+            back = np.squeeze(np.swapaxes(rotation, -1, -2) @ (rays - shift * nearness[..., None])[..., None], -1)
+            seen = back / np.maximum(back[..., 2:], _LEAST_DISTANCE)
+            at_reference = self.translation.inverse_depth(seen)
+            ahead = (rotation[..., 2, :] * seen).sum(-1) + shift[..., 2] * at_reference
+            nearness = at_reference / np.maximum(ahead, _LEAST_DISTANCE)
+        return nearness
 
     @property
     def _step_s(self) -> float:

@@ -2,25 +2,31 @@
 
 Rolling shutter, blur paths and the log's corner points are this map between different times.  Points are undistorted
 before it and distorted after it, by the lens as it is at either time.  Depth is along the optical axis where a point is
-seen first, in metres; its inverse 0 means rotation only, and None that of the frame's plane.
+seen first, in metres; its inverse 0 means rotation only, and None that of the frame's plane or surface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from virest.degradation.row_motion import RowMotion
 
 Array = NDArray[np.float64]
 FIXED_POINT_PX = 1e-5
 """Rows are known well enough once points move less than this."""
+PIXELS_WITHIN_PX = 1e-3
+"""The same where points name pixels of a picture; what is then left is a thirtieth of it."""
 FIXED_POINT_STEPS = 8
 """Row times depend on where a point lands; each step shrinks the error about thirtyfold."""
+CELLS_PER_KNOT, MIN_KNOTS = 3, 12
+"""A map's splines have a knot for so many cells of its grid, but at least so many: one in some 2 ms of a readout."""
 
 
 def moved_between(motion: RowMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = None) -> Array:
@@ -42,10 +48,17 @@ def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, in
     return seen_by_rows(motion, points_px, motion.reference_s, anchor, inverse_depth)
 
 
-def seen_by_rows(motion: RowMotion, points_px: Array, at_s: Any, anchor: float, inverse_depth: Any = None) -> Array:
+def seen_by_rows(
+    motion: RowMotion,
+    points_px: Array,
+    at_s: Any,
+    anchor: float,
+    inverse_depth: Any = None,
+    within_px: float = FIXED_POINT_PX,
+) -> Array:
     """Where points seen at pixels (..., 2) at time ``at_s`` lie in the picture whose rows are seen at their anchors.
 
-    A fixed point, since the row that sees a point depends on where it sees it.
+    A fixed point, since the row that sees a point depends on where it sees it; found once steps are below within_px.
     """
     seen = points_px
     fixed = _fixed_points(motion, points_px, at_s, inverse_depth)
@@ -53,7 +66,7 @@ def seen_by_rows(motion: RowMotion, points_px: Array, at_s: Any, anchor: float, 
         before = seen
         row_s = motion.row_start_s(seen) + anchor * motion.exposure_s
         seen = _shown(motion, *fixed, row_s)
-        if np.abs(seen - before).max(initial=0.0) < FIXED_POINT_PX:
+        if np.abs(seen - before).max(initial=0.0) < within_px:
             break
     return seen
 
@@ -66,16 +79,26 @@ def corner_points(width: int, height: int) -> Array:
 def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = None) -> NDArray[np.float32]:
     """:func:`recorded_points` of every pixel, (height, width, 2) as cv2.remap takes it.
 
-    Computed on a grid and filled in by straight lines; the map is smooth, so this is off by less than 0.01 px.
+    Computed on a grid and filled in; the map is smooth, so this is off by less than 0.01 px.
     """
-    return grid_filled(motion, lambda points: recorded_points(motion, points, anchor, inverse_depth), spacing_px)
+
+    def recorded(points: Array) -> Array:
+        return seen_by_rows(motion, points, motion.reference_s, anchor, inverse_depth, PIXELS_WITHIN_PX)
+
+    return grid_filled(motion, recorded, spacing_px)
 
 
 def grid_filled(motion: RowMotion, mapping: Callable[[Array], Array], spacing_px: int = 16) -> NDArray[np.float32]:
-    """A smooth map of pixels, worked out on a grid and filled in by straight lines, (height, width, 2)."""
+    """A smooth map of pixels, (height, width, 2): worked out at the knots of cubic splines, which give it on a grid.
+
+    Straight lines between the grid's nodes are the quickest way to all pixels, splines the one from fewest knots.
+    Before relief a map bends at depth edges, where splines would swing: every node is worked out.
+    """
     width, height = motion.profile.width, motion.profile.height
-    nodes = np.stack(np.meshgrid(_nodes(width, spacing_px), _nodes(height, spacing_px)), -1)
-    values = mapping(nodes).astype(np.float32)
+    bent = motion.translation is not None and motion.translation.relief is not None
+    (x, across), (y, down) = ((_all_nodes if bent else _knots)(length, spacing_px) for length in (width, height))
+    at_knots = mapping(np.stack(np.meshgrid(x, y), -1))
+    values = (across @ np.tensordot(down, at_knots, 1)).astype(np.float32)
     size = (values.shape[1] * spacing_px, values.shape[0] * spacing_px)
     filled = cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
     return filled[spacing_px : spacing_px + height, spacing_px : spacing_px + width]
@@ -85,6 +108,22 @@ def _nodes(length: int, spacing: int) -> Array:
     """Middles of cells of ``spacing`` pixels over 0 ... length − 1, and of one more cell on both sides."""
     cells = np.arange(-1, int(np.ceil(length / spacing)) + 1, dtype=np.float64)
     return (cells + 0.5) * spacing - 0.5
+
+
+@lru_cache(maxsize=8)
+def _all_nodes(length: int, spacing: int) -> tuple[Array, Array]:
+    """As :func:`_knots` with a knot at each node."""
+    nodes = _nodes(length, spacing)
+    return nodes, np.eye(len(nodes))
+
+
+@lru_cache(maxsize=8)
+def _knots(length: int, spacing: int) -> tuple[Array, Array]:
+    """Knots (m,) of a spline over :func:`_nodes`, and the weights (nodes, m) that give its values there."""
+    nodes = _nodes(length, spacing)
+    count = min(max(MIN_KNOTS, -(-len(nodes) // CELLS_PER_KNOT)), len(nodes))
+    knots = np.linspace(nodes[0], nodes[-1], count)
+    return knots, np.asarray(CubicSpline(knots, np.eye(count))(nodes))
 
 
 def _fixed_points(motion: RowMotion, points_px: Array, at_s: Any, inverse_depth: Any) -> tuple[Array, Array | None]:

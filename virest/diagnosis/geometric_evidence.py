@@ -86,16 +86,25 @@ class Evidence:
 
     def fit(self, model: Model, terms: Sequence[Term], table: TrackTable, use: Mask | None = None) -> TrackFit:
         """Fit terms and the scene from a model, on the pairs in ``use`` (pairs,)."""
-        rows = table if use is None else table.chosen(use[table.pair])
-        return fit_tracks(self.imu, rows, model.profile, terms, model.scene, max_iterations=10)
+        return fit_model(self.imu, model, terms, table if use is None else table.chosen(use[table.pair]))
 
     def distances(self, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
         """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
-        scene = fitted.scene
-        if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
-            scene = many_directions(table)
-        everywhere = fit_tracks(self.imu, table, fitted.profile, (), scene, max_iterations=0)
-        return everywhere.distance_at(depth_spread_per_m)
+        return distances(self.imu, fitted, table, depth_spread_per_m)
+
+
+def fit_model(imu: ImuSamples, model: Model, terms: Sequence[Term], table: TrackTable) -> TrackFit:
+    """Fit terms and the scene from a model."""
+    return fit_tracks(imu, table, model.profile, terms, model.scene, max_iterations=10)
+
+
+def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
+    """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
+    scene = fitted.scene
+    if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
+        scene = many_directions(table)
+    everywhere = fit_tracks(imu, table, fitted.profile, (), scene, max_iterations=0, known=fitted.ground)
+    return everywhere.distance_at(depth_spread_per_m)
 
 
 def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:

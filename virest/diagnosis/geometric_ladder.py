@@ -19,6 +19,7 @@ from scipy import stats
 
 from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
 from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import (
@@ -28,17 +29,22 @@ from virest.diagnosis.geometric_evidence import (
     base_scene,
     capped_rms,
     depth_of,
+    distances,
+    fit_model,
     free_scene,
     loss,
     relief_loss,
 )
+from virest.motion.scene_motion import InertialMotion
+from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term, TrackFit
-from virest.motion.track_model import TrackTable
+from virest.motion.track_model import TrackTable, ground, predict
 from virest.motion.tracking_bias import bias_std
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 SCREEN_POINTS, JUDGE_POINTS, FINAL_POINTS = 1500, 3500, 7000
 PROMISING = 4
 MIN_T = 3.0
@@ -53,6 +59,7 @@ LARGE_GAIN, LARGE_MIN_T = 0.05, 1.7
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 MAX_RUNGS = 5
+CLOCKS = ("time_offset", "clock_skew")
 PLAUSIBLE = {
     "time_offset": 2.0,
     "clock_skew": 0.03,
@@ -149,6 +156,7 @@ def climb(
     far: FarClock | None = None,
     progress: Callable[[float], None] | None = None,
     max_rungs: int = MAX_RUNGS,
+    each: Each = one_by_one,
 ) -> GeometricVerdict:
     """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
 
@@ -163,7 +171,7 @@ def climb(
     rungs: list[Rung] = []
     say(0.1)
     for number in range(max_rungs):
-        best, rung = _rung(evidence, nominal, model, accepted, lags, far or FarClock())
+        best, rung = _rung(evidence, nominal, model, accepted, lags, far or FarClock(), each)
         rungs.append(rung)
         say(0.1 + 0.8 * (number + 1) / MAX_RUNGS)
         if best is None:
@@ -202,17 +210,18 @@ def _rung(
     accepted: list[Accepted],
     lags: Sequence[Schedule],
     far: FarClock,
+    each: Each,
 ) -> tuple[tuple[Model, Accepted] | None, Rung]:
     tried = {entry.name for entry in accepted}
     candidates = _candidates(evidence, nominal, model, tried, lags, far)
-    base = _screened(evidence, Candidate("", model, (), None))
-    screened = _best_of_each([_screened(evidence, candidate) for candidate in candidates])
+    candidates = _worth_beginning(evidence, model, candidates)
+    base, *others = _screened(evidence, [Candidate("", model, (), None), *candidates], each)
+    screened = _best_of_each(others)
     promising = sorted(screened, key=lambda s: s.loss)[:PROMISING]
     promising = [entry for entry in promising if entry.loss < base.loss]
     scale = min([base.scale, *(entry.scale for entry in promising)])
     spread = (promising[0] if promising else base).depth_spread_per_m
-    before = _judge(evidence, base.candidate, scale, spread)
-    judged = [_judge(evidence, entry.candidate, scale, spread) for entry in promising]
+    before, *judged = _judge(evidence, [base.candidate, *(p.candidate for p in promising)], scale, spread, each)
     table = {j.candidate.name: j.rms * evidence.typical_px for j in judged}
     nothing = Rung(None, table, before.rms * evidence.typical_px, GEOMETRY)
     for best in sorted(judged, key=lambda j: float(j.block_loss.mean())):
@@ -237,6 +246,26 @@ def _rung(
         )  # fmt: skip
         return (entered, done), replace(nothing, entered=best.candidate.name)
     return None, nothing
+
+
+def _worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate]) -> list[Candidate]:
+    """Without far starts of the clocks that are further off than where the model stands: a fit would only come back."""
+    table = evidence.table(model, SCREEN_POINTS)
+    here = _off_px(evidence, model, table)
+    return [
+        candidate
+        for candidate in candidates
+        if candidate.name not in CLOCKS
+        or candidate.model.profile == model.profile
+        or _off_px(evidence, candidate.model, table) < here
+    ]
+
+
+def _off_px(evidence: Evidence, model: Model, table: TrackTable) -> float:
+    """Median distance of the points from where a model puts them."""
+    known = ground(evidence.imu, model.profile, translation=isinstance(model.scene, InertialMotion))
+    off = table.second_px - predict(known, table, model.scene).second_px
+    return float(np.median(np.linalg.norm(off, axis=-1)))
 
 
 def _candidates(
@@ -315,12 +344,22 @@ class _Screened:
     depth_spread_per_m: float
 
 
-def _screened(evidence: Evidence, candidate: Candidate) -> _Screened:
-    table = evidence.table(candidate.model, SCREEN_POINTS)
-    terms = (*candidate.model.terms, *candidate.added)
-    fitted = evidence.fit(candidate.model, terms, table)
-    model = replace(candidate.model, profile=fitted.profile, scene=fitted.scene)
-    return _Screened(relief_loss(fitted), replace(candidate, model=model), fitted.scale, fitted.depth_spread_per_m)
+def _screened(evidence: Evidence, candidates: Sequence[Candidate], each: Each) -> list[_Screened]:
+    tables = {
+        lag: evidence.table(model, SCREEN_POINTS) for lag, model in {c.model.lag: c.model for c in candidates}.items()
+    }
+    calls = [(evidence.imu, tables[c.model.lag], c.model, (*c.model.terms, *c.added)) for c in candidates]
+    found = each(_screen, calls)
+    return [_Screened(s[0], replace(c, model=s[1]), s[2], s[3]) for c, s in zip(candidates, found, strict=True)]
+
+
+def _screen(
+    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term]
+) -> tuple[float, Model, float, float]:
+    """Loss, fitted model, scale and spread of depths of one candidate."""
+    fitted = fit_model(imu, model, terms, table)
+    found = replace(model, profile=fitted.profile, scene=fitted.scene)
+    return relief_loss(fitted), found, fitted.scale, fitted.depth_spread_per_m
 
 
 def _best_of_each(screened: list[_Screened]) -> list[_Screened]:
@@ -332,21 +371,34 @@ def _best_of_each(screened: list[_Screened]) -> list[_Screened]:
     return list(best.values())
 
 
-def _judge(evidence: Evidence, candidate: Candidate, scale: float, depth_spread_per_m: float) -> _Judged:
+def _judge(
+    evidence: Evidence, candidates: Sequence[Candidate], scale: float, depth_spread_per_m: float, each: Each
+) -> list[_Judged]:
     """Fit on every other block, judge on those between, and the other way round."""
-    table = evidence.table(candidate.model, JUDGE_POINTS)
-    terms = (*candidate.model.terms, *candidate.added)
-    distance = np.zeros(len(table))
-    for fold in (0, 1):
-        use = evidence.block % 2 == fold
-        fitted = evidence.fit(candidate.model, terms, table, use)
-        held = ~use[table.pair]
-        distance[held] = evidence.distances(fitted, table, depth_spread_per_m)[held]
-    block = evidence.block[table.pair]
-    counts = np.maximum(np.bincount(block), 1)
-    each = loss(distance, scale)
-    by_pair = np.bincount(table.pair, each) / np.maximum(np.bincount(table.pair), 1)
-    return _Judged(candidate, np.bincount(block, each) / counts, by_pair, capped_rms(distance))
+    tables = [evidence.table(candidate.model, JUDGE_POINTS) for candidate in candidates]
+    calls = [
+        (evidence.imu, table, c.model, (*c.model.terms, *c.added), evidence.block % 2 == fold, depth_spread_per_m)
+        for c, table in zip(candidates, tables, strict=True)
+        for fold in (0, 1)
+    ]
+    halves = each(_held_out, calls)
+    judged = []
+    for candidate, table, first, second in zip(candidates, tables, halves[::2], halves[1::2], strict=True):
+        distance = np.where(evidence.block[table.pair] % 2 == 0, second, first)
+        block = evidence.block[table.pair]
+        mean = loss(distance, scale)
+        by_pair = np.bincount(table.pair, mean) / np.maximum(np.bincount(table.pair), 1)
+        by_block = np.bincount(block, mean) / np.maximum(np.bincount(block), 1)
+        judged.append(_Judged(candidate, by_block, by_pair, capped_rms(distance)))
+    return judged
+
+
+def _held_out(
+    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, depth_spread_per_m: float
+) -> Array:
+    """Distances (n,) of all points from a fit on the pairs in ``use`` (pairs,)."""
+    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]))
+    return distances(imu, fitted, table, depth_spread_per_m)
 
 
 def _lagging_gain(evidence: Evidence, before: _Judged, after: _Judged) -> Array:
@@ -454,9 +506,8 @@ def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted,
     if entry.effect is None or entry.effect.term is None:
         return entry
     less, _ = _refitted(evidence, _without(model, nominal, entry), SCREEN_POINTS)
-    before, after = (
-        _judge(evidence, Candidate("", m, (), None), fitted.scale, fitted.depth_spread_per_m) for m in (less, model)
-    )
+    without_and_with = [Candidate("", m, (), None) for m in (less, model)]
+    before, after = _judge(evidence, without_and_with, fitted.scale, fitted.depth_spread_per_m, one_by_one)
     return replace(entry, before=before.rms * evidence.typical_px, after=after.rms * evidence.typical_px, rivals=())
 
 

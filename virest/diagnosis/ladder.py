@@ -17,13 +17,23 @@ from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
-from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_photometry, judge_curve
-from virest.diagnosis.points import MIN_PAIRS, TrackedPoints, at_model_times, evened, pulses, pulsing, with_null_values
+from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve
+from virest.diagnosis.points import (
+    MIN_PAIRS,
+    TrackedPoints,
+    at_model_times,
+    evened,
+    frames_to_follow,
+    pulses,
+    pulsing,
+    with_null_values,
+)
 from virest.diagnosis.remaining import points_left, remaining_structure, residuals
 from virest.errors import CaptureError
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import observe_tracks
-from virest.motion.tracking import track_pairs
+from virest.motion.shared_out import Each, one_by_one
+from virest.motion.tracking import track_frames, track_pairs
 
 Progress = Callable[[str, float], None]
 
@@ -34,17 +44,19 @@ def diagnose_capture(
     pictures: Reader,
     gray: Reader,
     progress: Progress | None = None,
+    each: Each = one_by_one,
 ) -> Diagnosis:
     """Climb the ladder on one capture; pictures gives (index, RGB), gray (index, luma) of the frames asked for.
 
-    Raises CaptureError where there is nothing to judge by: too few points.
+    each: shares work out; gray then goes to other processes.  Raises CaptureError where there is nothing to judge by:
+    too few points.
     """
     say = progress or (lambda _text, _part: None)
     say("tracking", 0.02)
-    points, notes = _tracked(capture, profile, gray)
+    points, notes = _tracked(capture, profile, gray, each)
     say("points", 0.15)
     first = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
-    story = _Story(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes)
+    story = _Story(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each)
     say("brightness", 0.5)
     story.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
     say("blur", 0.75)
@@ -55,10 +67,10 @@ def diagnose_capture(
     return story.told()
 
 
-def _tracked(capture: Capture, profile: CameraProfile, gray: Reader) -> tuple[TrackedPoints, list[str]]:
-    """Points of all frames that have a stamp, those of the start-up too."""
-    indices = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
-    observed = observe_tracks(capture, track_pairs(gray(indices)), profile)
+def _tracked(capture: Capture, profile: CameraProfile, gray: Reader, each: Each) -> tuple[TrackedPoints, list[str]]:
+    """Points of the frames that are followed, those of the start-up too."""
+    indices = frames_to_follow(capture, profile)
+    observed = observe_tracks(capture, track_frames(gray, indices, each), profile)
     start, null_terms, notes, far, follows = with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
@@ -68,9 +80,12 @@ def _tracked(capture: Capture, profile: CameraProfile, gray: Reader) -> tuple[Tr
         )
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
     rungs_allowed = MAX_RUNGS if follows or schedules else 0
+    stamped_frames = sum(NO_STAMP not in frame.skip_codes for frame in capture.frames)
+    if len(indices) < stamped_frames:
+        notes.append(f"points were followed in {len(indices)} of {stamped_frames} frames, runs spread over the capture")
     if not rungs_allowed:
         notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
-    return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed), notes
+    return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
 
 
 @dataclass(slots=True)
@@ -88,6 +103,7 @@ class _Story:
     findings: list[Finding] = field(default_factory=list)
     """Of the points, and what blur made of them."""
     notes: list[str] = field(default_factory=list)
+    each: Each = one_by_one
 
     @property
     def frames(self) -> list[Frame]:
@@ -99,10 +115,12 @@ class _Story:
     ) -> None:
         """Brightness; where it pulses, and points still go astray, they are followed again in pictures without that."""
         frames, moved = self.frames, self.geometric.model.profile
-        self.light = climb_photometry(self.capture, frames, moved, integrate_gyro(self.capture.imu, moved), pictures)
+        trajectory = integrate_gyro(self.capture.imu, moved)
+        self.light = climb_light(self.capture, frames, moved, trajectory, pictures, self.each)
         if points_left(self.geometric).significant and pulses(self.light.profile):
             even = evened(gray, frames, self.light.profile)
-            again = observe_tracks(self.capture, track_pairs(even([frame.index for frame in frames])), given)
+            followed = set(frames_to_follow(self.capture, given)) & {frame.index for frame in frames}
+            again = observe_tracks(self.capture, track_pairs(even(sorted(followed))), given)
             start = self.points.start
             self.points = replace(
                 self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
@@ -122,7 +140,9 @@ class _Story:
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
             shown = replace(self.capture, frames=tuple(self.frames))
-            self.blur, is_exposure = climb_blur(shown, lit, integrate_gyro(self.capture.imu, lit), gray, scale)
+            self.blur, is_exposure = climb_blur(
+                shown, lit, integrate_gyro(self.capture.imu, lit), gray, scale, self.each
+            )
         if is_exposure and scale is not None:
             exposure = as_exposure(self.findings, scale, float(np.median(exposure_s)))
             self.geometric = replace(self.points, start=exposed(self.points.start, scale)).climbed(progress)
@@ -139,7 +159,7 @@ class _Story:
         if points_left(self.geometric).significant or _paths_uncertain(extended, self.geometric):
             return
         trajectory = integrate_gyro(self.capture.imu, extended)
-        self.curve = judge_curve(extended, self.light.observations, self.frames, trajectory, pictures)
+        self.curve = judge_curve(extended, self.light.observations, self.frames, trajectory, pictures, self.each)
 
     def told(self) -> Diagnosis:
         """The verdict, with everything that led to it."""

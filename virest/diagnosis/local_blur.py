@@ -12,7 +12,7 @@ fills in damps the ratios (DAMPING, known to DAMPING_STD).  Both were measured o
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.capture.records import Capture
+from virest.capture.records import Capture, Frame
 from virest.diagnosis.local_blur_edges import EdgeSettings, EdgeWidths, join_edges, observe_picture
 from virest.diagnosis.local_blur_model import (
     across,
@@ -39,10 +39,12 @@ from virest.diagnosis.local_blur_spectra import (
     observe_pair,
     ring_of_bin,
 )
+from virest.motion.shared_out import Each, one_by_one
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
 
 LENS_SIGMA_PX = 0.70
 """Width of a sharp edge in a decoded picture: lens, pixel and coding; defocus is what lies beyond."""
@@ -56,6 +58,8 @@ STILL_PX = 0.4
 """Edges across which the path's standard deviation is below this are measured."""
 MIN_TRANSFER = 0.25
 """Bins whose |K|² is predicted below this are noise."""
+PARTS = 4
+"""In which the frames may be measured side by side."""
 PAIR_FRAMES = 4
 """Frames between the two of a pair: the hand has turned, the patch is still in view."""
 MIN_EDGES = 40
@@ -124,8 +128,34 @@ def frames_to_read(capture: Capture, pairs: int = 22) -> list[int]:
     return sorted({starts[i] + step for i in picked for step in (0, PAIR_FRAMES)})
 
 
+def look_for_blur(
+    gray: Callable[[Sequence[int]], Stream],
+    capture: Capture,
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    each: Each = one_by_one,
+) -> BlurObservations:
+    """Measure the frames of :func:`frames_to_read` of a capture, part by part; the same as in one stream of them."""
+    wanted, curve = frames_to_read(capture), profile.response or ResponseCurve("srgb")
+    parts = np.array_split(np.array(wanted, np.intp), PARTS)
+    early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if len(part) else [] for part in parts]
+    calls = [
+        (gray, [*lead, *part.tolist()], len(lead), capture.frames, curve)
+        for lead, part in zip(early, parts, strict=True)
+    ]
+    seen = each(_measured_part, calls)
+    edges, pairs = ([one for part in seen for one in part[kind]] for kind in (0, 1))
+    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory)
+
+
+def _measured_part(
+    gray: Callable[[Sequence[int]], Stream], wanted: list[int], lead: int, frames: Sequence[Frame], curve: ResponseCurve
+) -> tuple[list[EdgeWidths], list[SpectrumRatios]]:
+    return _measured(gray(wanted), frames, curve, EdgeSettings(), frozenset(wanted[:lead]))
+
+
 def observe_blur(
-    pictures: Iterable[tuple[int, NDArray[np.uint8] | None]],
+    pictures: Stream,
     capture: Capture,
     profile: CameraProfile,
     trajectory: Trajectory,
@@ -136,18 +166,28 @@ def observe_blur(
     PAIR_FRAMES + 1 pictures are in memory at a time.  Profile and trajectory only pick the edges that hardly moved and
     the frequencies that motion leaves above the noise.
     """
-    settings = settings or EdgeSettings()
     curve = profile.response or ResponseCurve("srgb")
-    edges, pairs, kept = [], [], {}
+    edges, pairs = _measured(pictures, capture.frames, curve, settings or EdgeSettings(), frozenset())
+    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory)
+
+
+def _measured(
+    pictures: Stream, frames: Sequence[Frame], curve: ResponseCurve, settings: EdgeSettings, only_paired: frozenset[int]
+) -> tuple[list[EdgeWidths], list[SpectrumRatios]]:
+    """Edges of all pictures but some, and spectra of all pairs of them."""
+    edges: list[EdgeWidths] = []
+    pairs: list[SpectrumRatios] = []
+    kept: dict[int, SeenFrame] = {}
     for index, picture in pictures:
-        if picture is None or not capture.frames[index].exposure_s:
+        if picture is None or not frames[index].exposure_s:
             continue
-        edges.append(observe_picture(picture, capture.frames[index], curve, settings))
-        kept[index] = SeenFrame(picture, tuple(capture.frames[max(index - k, 0)] for k in range(MEMORY)))
-        if index - PAIR_FRAMES in kept:
+        if index not in only_paired:
+            edges.append(observe_picture(picture, frames[index], curve, settings))
+        kept[index] = SeenFrame(picture, tuple(frames[max(index - k, 0)] for k in range(MEMORY)))
+        if index - PAIR_FRAMES in kept and index not in only_paired:
             pairs.append(observe_pair(kept[index - PAIR_FRAMES], kept[index], curve))
         kept = {k: seen for k, seen in kept.items() if k > index - PAIR_FRAMES}
-    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory)
+    return edges, pairs
 
 
 def _chosen(
@@ -159,32 +199,49 @@ def _chosen(
     return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, len(edges))
 
 
+@dataclass(frozen=True, slots=True)
+class PredictedBlur:
+    """What the paths of a profile make of the observations; defocus, lens and damping are no part of it."""
+
+    motion_px: Array
+    """(edges,) standard deviation of the path across each edge."""
+    log_ratios: Array
+    """(valid bins, MEMORY) of the spectra, of the frames themselves and of those before them."""
+
+
+def predicted_blur(observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> PredictedBlur:
+    """Follow the paths of a profile."""
+    return PredictedBlur(
+        _motion_px(observations.edges, profile, trajectory),
+        predicted_ratios(observations.ratios, profile, trajectory)[observations.valid],
+    )
+
+
 def residuals(
     observations: BlurObservations,
     profile: CameraProfile,
     trajectory: Trajectory,
     lens_sigma_px: float = LENS_SIGMA_PX,
     damping: float = 1.0,
+    predicted: PredictedBlur | None = None,
 ) -> Array:
     """Measured less predicted blur, px (n,): widths of edges, then spectra as widths of the motion.
 
     A log ratio changes by 2 (2π f)² τ δτ with the path's standard deviation τ; it is given as δτ at τ = 1 px.
-    The profile alone carries every effect; lens_sigma_px and damping are nuisances of the measurement.
+    The profile alone carries every effect; lens_sigma_px and damping are nuisances of the measurement.  predicted: what
+    its paths make, where that is known already.
     """
-    motion_px = _motion_px(observations.edges, profile, trajectory)
-    widths = fitted_width(motion_px, profile.extensions.defocus_sigma_px, lens_sigma_px)
-    return np.concatenate(
-        [observations.edges.width_px - widths, _ratio_residuals(observations, profile, trajectory, damping)]
-    )
+    predicted = predicted or predicted_blur(observations, profile, trajectory)
+    widths = fitted_width(predicted.motion_px, profile.extensions.defocus_sigma_px, lens_sigma_px)
+    off = _ratio_residuals(observations, predicted.log_ratios, damping)
+    return np.concatenate([observations.edges.width_px - widths, off])
 
 
-def _ratio_residuals(
-    observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, damping: float
-) -> Array:
+def _ratio_residuals(observations: BlurObservations, log_ratios: Array, damping: float) -> Array:
     valid = observations.valid
     ring = np.broadcast_to(ring_of_bin(), valid.shape)[valid]
     share = damping * np.array(DAMPING)[ring]
-    own, *earlier = (predicted_ratios(observations.ratios, profile, trajectory)[valid] * share[:, None]).T
+    own, *earlier = (log_ratios * share[:, None]).T
     off = observations.ratios.log_ratio[valid] - own
     scale = 1.0 / (2.0 * (2 * np.pi * (np.array(BANDS_PER_PX[:-1]) + np.array(BANDS_PER_PX[1:])) / 2) ** 2)
     return (off - _remembered(off, np.stack(earlier, -1) - own[:, None])) * scale[ring]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +17,8 @@ from virest.diagnosis.local_blur import (
     MIN_CONTRAST,
     MIN_RATIOS,
     BlurObservations,
+    PredictedBlur,
+    predicted_blur,
     residuals,
     robust_weights,
     time_blocks,
@@ -178,6 +180,8 @@ class _Problem:
     trajectory: Trajectory
     effects: Sequence[BlurEffect]
     use: Mask
+    known: dict[tuple[float, float], PredictedBlur] = field(default_factory=dict)
+    """What paths were seen to make, by exposure scale and shift: nothing else in a fit changes them."""
 
     @property
     def count(self) -> int:
@@ -206,7 +210,10 @@ class _Problem:
         """The used residuals."""
         lens, shift = theta[self.count :]
         profile = _shifted(self.applied(theta), float(shift))
-        return residuals(self.observations, profile, self.trajectory, float(lens), damping)[self.use]
+        key = profile.shutter.exposure_scale, float(shift)
+        if key not in self.known:
+            self.known[key] = predicted_blur(self.observations, profile, self.trajectory)
+        return residuals(self.observations, profile, self.trajectory, float(lens), damping, self.known[key])[self.use]
 
     def linearised(self, theta: Array) -> tuple[Array, Array, Array]:
         """Residuals, their derivatives (n, p), and robust weights over variance, each kind by its own scale."""

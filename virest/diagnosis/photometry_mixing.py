@@ -35,6 +35,7 @@ from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, Indices, Mask
 from virest.diagnosis.photometry_fit import HeldOut
 from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
+from virest.motion.shared_out import Each, one_by_one
 from virest.motion.trajectory import Trajectory
 
 Gray = NDArray[np.uint8]
@@ -147,6 +148,7 @@ def observe_mixing(
     trajectory: Trajectory,
     profile: CameraProfile,
     settings: MixingSettings | None = None,
+    each: Each = one_by_one,
 ) -> MixingEvidence:
     """Compare blurred frames with sharp ones near them. Empty where the hand gives no such pairs."""
     settings = settings or MixingSettings()
@@ -156,11 +158,12 @@ def observe_mixing(
     by_index = {frame.index: frame for frame in frames}
     darkest = _darkest(list(pictures.values()))
     steps = _steps(darkest)
-    rows: list[tuple[int, Array]] = []
-    for number, (sharp, blurred) in enumerate(pairs):
-        if sharp in pictures and blurred in pictures:
-            pair = (by_index[sharp], pictures[sharp]), (by_index[blurred], pictures[blurred])
-            rows += [(number, row) for row in _compare(*pair, trajectory, profile, settings, steps)]
+    known = [number for number, pair in enumerate(pairs) if pair[0] in pictures and pair[1] in pictures]
+    calls = [
+        (*((by_index[k], pictures[k]) for k in pairs[number]), trajectory, profile, settings, steps) for number in known
+    ]
+    compared = each(_compare, calls)
+    rows = [(number, row) for number, found in zip(known, compared, strict=True) for row in found]
     table = np.array([row for _, row in rows]).reshape(-1, 12)
     names = tuple(steps)
     return MixingEvidence(

@@ -9,13 +9,14 @@ pixels; what they leave is small against the flat surround of a patch.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, PhotometricObservations
@@ -34,6 +35,8 @@ _LK_LEVELS = 3
 class PatchSettings:
     """How patches are chosen and looked up. Lengths in pixels hold for a picture 640 px long and grow with it."""
 
+    halve_above_px: int = 1000
+    """Pictures with a longer side are halved first: patches are means over many pixels anyway."""
     patch_px: float = 11.0
     surround_px: float = 23.0
     """Side of the square around a patch that has to be flat."""
@@ -79,6 +82,8 @@ def observe_photometry(
     over.
     """
     settings = settings or PatchSettings()
+    if max(profile.width, profile.height) > settings.halve_above_px:
+        pictures, profile = ((frame, _halved(picture)) for frame, picture in pictures), halved_profile(profile)
     keys: list[_Key] = []
     places = since = 0
     rows: list[Array] = []
@@ -102,6 +107,23 @@ def observe_photometry(
         since += 1
     table = np.concatenate(rows) if rows else np.zeros((0, 8))
     return _observations(table, seen, profile, settings, intra_frames)
+
+
+def halved_profile(profile: CameraProfile) -> CameraProfile:
+    """The same camera with pictures of half the size: pixel x is then (x − ½) / 2."""
+    width, height, lens = profile.width // 2, profile.height // 2, profile.intrinsics
+    if lens is not None:
+        focal, centre = (lens.fx_px / 2, lens.fy_px / 2), ((lens.cx_px - 0.5) / 2, (lens.cy_px - 0.5) / 2)
+        lens = Intrinsics(width, height, *focal, *centre, lens.model, lens.coefficients)
+    return replace(profile, width=width, height=height, intrinsics=lens)
+
+
+def _halved(picture: Picture | None) -> Picture | None:
+    if picture is None:
+        return None
+    even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+    size = even.shape[1] // 2, even.shape[0] // 2
+    return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 # ── one frame ──────────────────────────────────────────────────────────────────────────────────────────────────────

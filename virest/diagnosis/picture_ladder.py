@@ -30,6 +30,7 @@ from virest.diagnosis.photometry_mixing import (
     observe_mixing,
 )
 from virest.diagnosis.photometry_patches import observe_photometry
+from virest.motion.shared_out import Each, one_by_one
 from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -43,6 +44,13 @@ MIN_GAIN = 0.15
 LEAST_FALL = 0.02
 """Least part of the held-out mean square that it takes away, where the noise measured leaves no excess."""
 MAX_RUNGS = 3
+WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130
+"""Brightness is judged in every frame of a short capture, and in one stretch of a longer one: patches hang together
+from frame to frame."""
+MAX_GAIN_FRAMES = 3000
+"""A gain for each frame is looked for in all of up to so many."""
+SAME_SPREAD = 0.05
+"""Stretches whose log exposure × ISO spreads alike to this tell the curve alike."""
 MIN_OBSERVATIONS = 300
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
@@ -82,12 +90,50 @@ class PictureVerdict:
 # ── brightness ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
+def light_stretch(frames: Sequence[Frame]) -> list[Frame]:
+    """Frames to judge brightness by: all of few, else the stretch of neighbours over which exposure × ISO varies most.
+
+    Among stretches that are alike in this the one nearest to the middle.
+    """
+    if len(frames) <= WHOLE_LIGHT_FRAMES:
+        return list(frames)
+    light = np.log([(frame.exposure_s or 1.0) * (frame.iso or 1.0) for frame in frames])
+    starts = np.unique(np.linspace(0, len(frames) - MAX_LIGHT_FRAMES, 33).round().astype(int))
+    spread = np.array([np.ptp(np.quantile(light[k : k + MAX_LIGHT_FRAMES], [0.05, 0.95])) for k in starts])
+    alike = starts[spread >= spread.max() - SAME_SPREAD]
+    begin = int(alike[np.argmin(np.abs(alike - (len(frames) - MAX_LIGHT_FRAMES) / 2))])
+    return list(frames[begin : begin + MAX_LIGHT_FRAMES])
+
+
+def climb_light(
+    capture: Capture,
+    frames: Sequence[Frame],
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    rgb: Reader,
+    each: Each = one_by_one,
+) -> PictureVerdict:
+    """Find what changes brightness, on a stretch of a long capture; a gain for each frame then in all of it."""
+    looked = light_stretch(frames)
+    found = climb_photometry(capture, looked, profile, trajectory, rgb, each)
+    if len(looked) == len(frames):
+        return found
+    gains = any(finding.name == "gain_drift" for finding in found.findings)
+    if gains and len(frames) <= MAX_GAIN_FRAMES:
+        return climb_photometry(capture, frames, profile, trajectory, rgb, each)
+    span = f"frames {looked[0].index} to {looked[-1].index}"
+    note = f"brightness was judged in {len(looked)} of {len(frames)} frames, {span}"
+    found.notes.append(f"{note}; the others' gain is taken to be that of the nearest" if gains else note)
+    return found
+
+
 def climb_photometry(
     capture: Capture,
     frames: Sequence[Frame],
     profile: CameraProfile,
     trajectory: Trajectory,
     rgb: Reader,
+    each: Each = one_by_one,
 ) -> PictureVerdict:
     """Find what changes the brightness of patches; frames at their true times."""
     verdict = PictureVerdict(profile)
@@ -103,11 +149,13 @@ def climb_photometry(
     if len(observations) < MIN_OBSERVATIONS:
         verdict.notes.append("too few flat patches are seen again: brightness not judged")
     else:
-        climb_observations(verdict, observations, len(capture.frames))
+        climb_observations(verdict, observations, len(capture.frames), each)
     return verdict
 
 
-def climb_observations(verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int) -> None:
+def climb_observations(
+    verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int, each: Each = one_by_one
+) -> None:
     """Enter into the verdict what the brightness of patches says."""
     nominal = verdict.profile
     verdict.photometric_rms = normalised_rms(observations, nominal)[0]
@@ -117,7 +165,7 @@ def climb_observations(verdict: PictureVerdict, observations: PhotometricObserva
     accepted: list[PhotometricEffect] = []
     plain = fit_photometry(observations, nominal, ())
     for _ in range(MAX_RUNGS):
-        rung = _rung(observations, nominal, plain, effects, accepted)
+        rung = _rung(observations, nominal, plain, effects, accepted, each)
         verdict.rungs.append(rung[0])
         if rung[1] is None:
             break
@@ -141,10 +189,13 @@ def _rung(
     plain: PhotometricFit,
     effects: Sequence[PhotometricEffect],
     accepted: list[PhotometricEffect],
+    each: Each,
 ) -> tuple[Rung, PhotometricEffect | None, PhotometricFit]:
     """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part."""
     before = normalised_rms(observations.with_memory(plain.memory), plain.profile)[0]
-    fits = {e.name: fit_photometry(observations, nominal, [*accepted, e]) for e in effects if e not in accepted}
+    others = [e for e in effects if e not in accepted]
+    found = each(fit_photometry, [(observations, nominal, [*accepted, e]) for e in others])
+    fits = {e.name: fitted for e, fitted in zip(others, found, strict=True)}
     tried = {name: fitted.rms for name, fitted in fits.items()}
     size = np.log(max(len(observations), 2))
     order = sorted(fits, key=lambda name: fits[name].cost + 0.5 * size * len(fits[name].of(name)[0]))
@@ -239,10 +290,11 @@ def judge_curve(
     frames: Sequence[Frame],
     trajectory: Trajectory,
     pictures: Reader,
+    each: Each = one_by_one,
 ) -> PictureVerdict:
     """Gamma or black level from how blur mixes light, where nothing else tells them; paths must be right by now."""
     verdict = PictureVerdict(profile)
-    _mixing(verdict, observations, frames, trajectory, pictures)
+    _mixing(verdict, observations, frames, trajectory, pictures, each)
     return verdict
 
 
@@ -252,11 +304,12 @@ def _mixing(
     frames: Sequence[Frame],
     trajectory: Trajectory,
     pictures: Reader,
+    each: Each,
 ) -> None:
     if observations is not None and _light_spread(observations) >= VARIED_LIGHT:
         return
     usable = [frame for frame in frames if frame.exposure_s]
-    evidence = observe_mixing(pictures, usable, trajectory, verdict.profile)
+    evidence = observe_mixing(pictures, usable, trajectory, verdict.profile, each=each)
     found = {name: _mixed(evidence, verdict.profile, name) for name in MIXING_LEAST}
     if not any(found.values()):
         verdict.notes.append("no blurred frames beside sharp ones: the curve was not judged at constant exposure")
@@ -310,14 +363,14 @@ def climb_blur(
     trajectory: Trajectory,
     gray: Reader,
     exposure_hypothesis: float | None,
+    each: Each = one_by_one,
 ) -> tuple[PictureVerdict, bool]:
     """Find a wrong exposure and defocus from local blur; also whether a time offset is really a wrong exposure.
 
     exposure_hypothesis: the exposure scale that would put an offset found at constant exposure down to the exposure.
     """
     verdict = PictureVerdict(profile)
-    wanted = local_blur.frames_to_read(capture)
-    observations = local_blur.observe_blur(gray(wanted), capture, profile, trajectory)
+    observations = local_blur.look_for_blur(gray, capture, profile, trajectory, each)
     if len(observations) < local_blur.MIN_EDGES:
         verdict.notes.append("too little texture to measure local blur")
         return verdict, False

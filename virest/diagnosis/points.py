@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.capture.records import Capture, Frame
+from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.degradation.light import flicker
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
@@ -20,12 +20,16 @@ from virest.diagnosis.picture_ladder import Reader
 from virest.motion import profile_terms as terms_of
 from virest.motion.coarse_alignment import align_coarsely, align_with_skew
 from virest.motion.integration import integrate_gyro
+from virest.motion.lively_frames import lively_frames
 from virest.motion.observed_tracks import CELLS, ObservedTracks
+from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term
 from virest.motion.track_noise import step_noise_px
 from virest.motion.turns import gyro_turns
 
 Array = NDArray[np.float64]
+WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
+"""Every frame of captures up to 15 s at 30 frames a second is followed; of longer ones runs, so many frames in all."""
 MIN_PAIRS = 6
 MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
 AXIS_EXPLAINED = 0.6
@@ -40,6 +44,16 @@ NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 
 """Number of the block of two by two cells that each cell lies in."""
 
 
+def frames_to_follow(capture: Capture, profile: CameraProfile) -> list[int]:
+    """Movie indices, rising: every stamped frame of a short capture; of a longer one lively runs and the start-up."""
+    stamped = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
+    if len(stamped) <= WHOLE_FRAMES:
+        return stamped
+    chosen = lively_frames(capture.frames, capture.imu, FRAMES_IN_RUNS, profile.time_offset_s or 0.0)
+    begun = [frame.index for frame in capture.frames if frame.only_startup][:FRAMES_IN_RUNS]
+    return sorted({*chosen, *begun})
+
+
 @dataclass(frozen=True, slots=True)
 class TrackedPoints:
     """Tracked points and where their ladder begins."""
@@ -51,6 +65,7 @@ class TrackedPoints:
     schedules: Sequence[Schedule]
     far: FarClock
     rungs_allowed: int
+    each: Each = one_by_one
 
     def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
         """The ladder's end, climbed again without the parts of the picture that move together on their own."""
@@ -72,7 +87,9 @@ class TrackedPoints:
 
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
         evidence = make_evidence(self.capture.imu, observed)
-        return climb(evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed)
+        return climb(
+            evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each
+        )
 
 
 def _together(difference_px: Array, group: NDArray[np.intp]) -> float:

@@ -25,11 +25,13 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
+from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
 from virest.degradation.row_motion import frame_times_s
 from virest.motion.alignment import choose_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.shared_out import Each, one_by_one
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration, restore_frames
@@ -107,7 +109,7 @@ class _Restoration:
         moved = rays @ turn.T
         translation = (self.plan.translations or {}).get(first)
         if translation is not None:
-            nearness = np.maximum(rays @ np.asarray(translation.inverse_depth_plane, float), 0.0)
+            nearness = translation.inverse_depth(rays)
             shift = turn @ translation.position_m(np.array(to_s - from_s))
             moved = moved - np.outer(nearness, shift)
         return self.lens.project(moved, to_s)
@@ -125,13 +127,15 @@ def measure_restoration_gain(
     pictures: Reader,
     gray: Reader,
     settings: RestorationSettings = PRESETS["balanced"],
+    each: Each = one_by_one,
 ) -> RestorationGain:
     """Restore a few pairs of neighbours with both profiles and compare; pictures: RGB by index, gray: luma."""
     firsts = chosen_pairs(capture, extended)
     numbers = sorted({first + step for first in firsts for step in (0, 1)})
     recorded = {index: picture for index, picture in pictures(numbers) if picture is not None}
-    before = _restored(capture, nominal, recorded, gray, settings)
-    after = before if extended == nominal else _restored(capture, extended, recorded, gray, settings)
+    profiles = [nominal] if extended == nominal else [nominal, extended]
+    restored = _restored(capture, profiles, recorded, gray, settings, each)
+    before, after = restored[0], restored[-1]
     whole = (0, 0, capture.width, capture.height)
     sharp: dict[str, list[float]] = {"recorded": [], "before": [], "after": []}
     apart: dict[str, list[Array]] = {"before": [], "after": []}
@@ -204,16 +208,40 @@ def shared_gradient(
 
 
 def _restored(
-    capture: Capture, profile: CameraProfile, recorded: dict[int, Picture], gray: Reader, settings: RestorationSettings
-) -> _Restoration:
+    capture: Capture,
+    profiles: Sequence[CameraProfile],
+    recorded: dict[int, Picture],
+    gray: Reader,
+    settings: RestorationSettings,
+    each: Each,
+) -> list[_Restoration]:
+    """What each profile makes of the recorded frames."""
+    planned = [_planned(capture, profile, gray, settings) for profile in profiles]
+    asked = [
+        (dataclasses.replace(one.frames[n], skip_reason=None, skip_codes=()), recorded[n], one.plan)
+        for one in planned
+        for n in sorted(recorded)
+    ]
+    done = each(_restored_one, [(frame, picture, capture.imu, plan) for frame, picture, plan in asked])
+    size = len(recorded)
+    return [
+        dataclasses.replace(one, restored={f.frame.index: f for f in done[k * size : (k + 1) * size] if f is not None})
+        for k, one in enumerate(planned)
+    ]
+
+
+def _restored_one(frame: Frame, picture: Picture, imu: ImuSamples, plan: RestorationPlan) -> RestoredFrame | None:
+    return next(iter(restore_frames([(frame, picture)], imu, plan)), None)
+
+
+def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> _Restoration:
+    """What a profile says of the frames, nothing restored yet."""
     plan = _plan(capture, profile, gray, settings)
     frames = {frame.index: frame for frame in at_true_times(capture.frames, plan.profile, capture.repeats)}
     known = plan.profile.intrinsics is not None
     trajectory = integrate_gyro(capture.imu, plan.profile) if known else None
     lens = moving_lens(trajectory, plan.profile) if trajectory is not None else None
-    asked = [(dataclasses.replace(frames[n], skip_reason=None, skip_codes=()), recorded[n]) for n in sorted(recorded)]
-    restored = {frame.frame.index: frame for frame in restore_frames(asked, capture.imu, plan)}
-    return _Restoration(plan, frames, restored, trajectory, lens)
+    return _Restoration(plan, frames, {}, trajectory, lens)
 
 
 def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> RestorationPlan:

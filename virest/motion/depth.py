@@ -7,17 +7,23 @@ points about it, ρ(r) = m · r, drawn to the plane of its whole window where th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from virest.motion.optics import MovingLens
+from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_model import SMALLEST_DEPTH, Ground, TrackTable, centre, mean_orientation, seen_s, turned
 
 Array = NDArray[np.float64]
 PASSES = 3
+RELIEF_PASSES, RELIEF_REACH = 6, 3.0
+FARTHEST = 0.02
+"""Points are held no farther than this part of the plane's inverse depth."""
+MAX_ACROSS = 4.0
+"""Standard deviations of the tracking noise."""
 QUOTIENT = 1e-3
 """Step of the difference quotient, part of the inverse depth."""
 MAX_RELATIVE_STD = 0.5
@@ -52,6 +58,39 @@ class TriangulatedPoints:
     def __len__(self) -> int:
         return len(self.window)
 
+    def chosen(self, use: NDArray[np.bool_]) -> TriangulatedPoints:
+        """Some of the points."""
+        return TriangulatedPoints(
+            self.window[use], self.place_m[use], self.time_s[use], self.inverse_depth_per_m[use], self.std_per_m[use]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Sights:
+    """Triangulated points with how they were seen first."""
+
+    points: TriangulatedPoints
+    pair: NDArray[np.intp]
+    """(n,) number of the pair of frames."""
+    from_m: Array
+    """(n, 3) the camera's centre, world axes, from its place at the window's middle."""
+    rays: Array
+    """(n, 3) with z = 1, camera axes at the sight."""
+    above_per_m: Array
+    """(n,) inverse depth above the window's plane."""
+    across: Array
+    """(n,) how far the second sight lies off the parallax, in standard deviations of the tracking noise."""
+
+    def __len__(self) -> int:
+        return len(self.pair)
+
+    def chosen(self, use: NDArray[np.bool_]) -> Sights:
+        """Some of the points."""
+        return Sights(
+            self.points.chosen(use), self.pair[use], self.from_m[use], self.rays[use], self.above_per_m[use],
+            self.across[use],
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True)
 class FrameDepth:
@@ -67,13 +106,46 @@ class FrameDepth:
     """Triangulated points that the plane goes through; 0: the window's plane."""
     reason: str = ""
     """Why the frame's own points were not used."""
+    relief: Relief | None = None
+    """What stands out of the plane; None: nothing that the points tell."""
+
+    def with_relief(self, relief: Relief, middle: Array, relative_std: float) -> FrameDepth:
+        """The same scene with a surface on its plane; middle (3,): the ray through the picture's centre."""
+        inverse = max(float(self.plane_per_m @ middle + relief.at(middle)), 1e-6)
+        relative = float(np.hypot(relief.std_at(middle) / inverse, relative_std))
+        return replace(self, depth_m=1 / inverse, std_m=relative / inverse, relief=relief)
 
 
 def triangulate(known: Ground, scene: InertialMotion, table: TrackTable) -> TriangulatedPoints:
-    """Find the inverse depth of every matched point whose parallax tells it.
+    """Find the inverse depth of every matched point whose parallax tells it and that lies about the plane.
 
-    Gauss-Newton on one unknown a point, from the plane of its window; its standard deviation is the pair's tracking
-    noise over the parallax.  Points before which the camera hardly moved, or with an absurd depth, are left out.
+    Points before which the camera hardly moved, or with an absurd depth, are left out.
+    """
+    sights = _sights(known, scene, table, PASSES, 1.0)
+    depth, expected = sights.points.inverse_depth_per_m, sights.points.inverse_depth_per_m - sights.above_per_m
+    near = (np.abs(sights.above_per_m) < expected) & (depth > 0.1 * expected)
+    return sights.points.chosen(near & (sights.points.std_per_m < MAX_RELATIVE_STD * expected))
+
+
+def triangulate_relief(known: Ground, scene: InertialMotion, table: TrackTable) -> Sights:
+    """Find the inverse depth of every matched point whose parallax tells it, however far from the plane.
+
+    A point that leaves the line of its parallax is a mismatch or moves on its own.
+    """
+    sights = _sights(known, scene, table, RELIEF_PASSES, RELIEF_REACH)
+    expected = sights.points.inverse_depth_per_m - sights.above_per_m
+    std = sights.points.std_per_m
+    far = np.maximum(sights.points.inverse_depth_per_m, FARTHEST * expected)
+    good = (std < MAX_RELATIVE_STD * expected) & (sights.points.inverse_depth_per_m > -2 * std)
+    place = sights.from_m + (sights.points.place_m - sights.from_m) * (sights.points.inverse_depth_per_m / far)[:, None]
+    sights = replace(sights, points=replace(sights.points, place_m=place, inverse_depth_per_m=far))
+    return sights.chosen(good & (sights.across < MAX_ACROSS))
+
+
+def _sights(known: Ground, scene: InertialMotion, table: TrackTable, passes: int, reach: float) -> Sights:
+    """Gauss-Newton on one unknown a point, from the plane of its window, at most ``reach`` of it in a pass.
+
+    The standard deviation is the pair's tracking noise over the parallax.
     """
     assert known.displacement is not None
     profile = known.profile
@@ -86,36 +158,48 @@ def triangulate(known: Ground, scene: InertialMotion, table: TrackTable) -> Tria
     scale = profile.shutter.exposure_scale
     before = mean_orientation(known.trajectory, first_s, scale * table.first_exposure_s)
     back = np.swapaxes(mean_orientation(known.trajectory, second_s, scale * table.second_exposure_s), -1, -2)
-    way = turned(before, known.lens.rays(table.first_px, first_s))
+    rays = known.lens.rays(table.first_px, first_s)
+    way = turned(before, rays)
     clearance = np.maximum(1 - (plane * centre_1).sum(axis=-1), SMALLEST_DEPTH)
     expected = np.maximum((plane * way).sum(axis=-1) / clearance, 0.0)
-    depth, std = _inverse_depths(
-        known.lens, turned(back, way), turned(back, centre_1 - centre_2), table, second_s, expected
-    )
-    good = (std < MAX_RELATIVE_STD * expected) & (np.abs(depth - expected) < expected) & (depth > 0.1 * expected)
-    place = centre_1[good] + way[good] / depth[good, None]
-    return TriangulatedPoints(table.window[good], place, first_s[good], depth[good], std[good])
+    view = _Parallax(known.lens, turned(back, way), turned(back, centre_1 - centre_2), table, second_s)
+    depth, std, across = view.inverse_depths(expected, passes, reach)
+    safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
+    points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], first_s, depth, std)
+    return Sights(points, table.pair, centre_1, rays, depth - expected, across)
 
 
-def _inverse_depths(
-    lens: MovingLens, far: Array, step: Array, table: TrackTable, second_s: Array, start: Array
-) -> tuple[Array, Array]:
-    """(n,) inverse depths and their standard deviations; far, step (n, 3): point at infinity and its shift a unit."""
+@dataclass(frozen=True, slots=True)
+class _Parallax:
+    """Where points are seen the second time, by their inverse depths."""
 
-    def seen(inverse_depth: Array) -> Array:
-        rays = far + step * inverse_depth[:, None]
+    lens: MovingLens
+    far: Array
+    """(n, 3) the point at infinity."""
+    step: Array
+    """(n, 3) its shift a unit of inverse depth."""
+    table: TrackTable
+    second_s: Array
+
+    def seen(self, inverse_depth: Array) -> Array:
+        """Pixels (n, 2)."""
+        rays = self.far + self.step * inverse_depth[:, None]
         rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)
-        return lens.project(rays, second_s)
+        return self.lens.project(rays, self.second_s)
 
-    depth = start.copy()
-    for _ in range(PASSES):
-        quotient = QUOTIENT * np.maximum(start, 1e-3)
-        at = seen(depth)
-        slope = (seen(depth + quotient) - at) / quotient[:, None]
-        power = np.maximum((slope**2).sum(axis=-1), 1e-12)
-        change = (slope * (table.second_px - at)).sum(axis=-1) / power
-        depth = depth + np.clip(change, -start, start)
-    return depth, table.noise_px[table.pair] / np.sqrt(power)
+    def inverse_depths(self, start: Array, passes: int, reach: float) -> tuple[Array, Array, Array]:
+        """(n,) inverse depths, their standard deviations, and what is left across in those of the tracking noise."""
+        depth, noise = start.copy(), self.table.noise_px[self.table.pair]
+        for _ in range(passes):
+            quotient = QUOTIENT * np.maximum(start, 1e-3)
+            at = self.seen(depth)
+            slope = (self.seen(depth + quotient) - at) / quotient[:, None]
+            power = np.maximum((slope**2).sum(axis=-1), 1e-12)
+            left = self.table.second_px - at
+            change = (slope * left).sum(axis=-1) / power
+            depth = depth + np.clip(change, -reach * start, reach * start)
+        across = np.abs(left[:, 0] * slope[:, 1] - left[:, 1] * slope[:, 0]) / np.sqrt(power)
+        return depth, noise / np.sqrt(power), across / noise
 
 
 def frame_depth(

@@ -80,9 +80,10 @@ class MovingLens:
         return centre + (np.asarray(points_px, float) - centre) * scale
 
 
-def moving_lens(trajectory: Trajectory, profile: CameraProfile) -> MovingLens:
+def moving_lens(trajectory: Trajectory, profile: CameraProfile, step_s: float = SHIFT_STEP_S) -> MovingLens:
     """The profile's lens along a motion; the stabiliser is at rest at the trajectory's first knot.
 
+    step_s: grid of the stabiliser's path; a fit of tracked points bears a wider one than a restored picture.
     Let the trajectory begin :func:`settling_time_s` before the first time of interest, or where the log begins.
     Raises ValueError without a focal length.
     """
@@ -91,7 +92,7 @@ def moving_lens(trajectory: Trajectory, profile: CameraProfile) -> MovingLens:
     extensions = profile.extensions
     if not extensions.stabilisation_fraction:
         return MovingLens(profile.intrinsics, extensions.focal_drift_per_s)
-    time_s = _shift_grid(*trajectory.span_s)
+    time_s = _shift_grid(*trajectory.span_s, step_s)
     fraction, cutoff_hz = extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
     shift = stabiliser_shift(time_s, trajectory.rate_rad_s(time_s), fraction, cutoff_hz)
     if any(extensions.stabilisation_lean_rad):
@@ -101,10 +102,10 @@ def moving_lens(trajectory: Trajectory, profile: CameraProfile) -> MovingLens:
     return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift)
 
 
-def _shift_grid(start_s: float, end_s: float) -> Array:
+def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:
     """Whole multiples of the step, and both ends: parts of a log share their grid, and so every digit."""
-    first, last = int(np.floor(start_s / SHIFT_STEP_S)) + 1, int(np.ceil(end_s / SHIFT_STEP_S))
-    return np.concatenate([[start_s], SHIFT_STEP_S * np.arange(first, last), [end_s]])
+    first, last = int(np.floor(start_s / step_s)) + 1, int(np.ceil(end_s / step_s))
+    return np.concatenate([[start_s], step_s * np.arange(first, last), [end_s]])
 
 
 def settling_time_s(profile: CameraProfile) -> float:

@@ -103,6 +103,11 @@ def stabilise(profile: CameraProfile, v: Array) -> CameraProfile:
     )
 
 
+def skew_clock(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] to the clock skew."""
+    return replace(profile, clock_skew=profile.clock_skew + float(v[0]))
+
+
 TIME_OFFSET = Term("time_offset", shift_offset, (1e-4,), (0.02,), (INF,))
 READOUT = Term("readout_time", add_readout, (2e-4,), (0.01,), (INF,))
 IMU_ROTATION = Term("imu_rotation", rotate_imu, (1e-3,) * 3, (0.1,) * 3, (INF,) * 3)
@@ -111,9 +116,7 @@ GYRO_SCALE = Term("gyro_scale", scale_gyro, (1e-3,), (0.1,), (0.3,))
 FOCAL = Term("focal_length", scale_focal, (1e-3,), (0.1,), (0.5,))
 K1 = Term("radial_distortion", add_k1, (1e-3,), (0.1,), (0.5,))
 PRINCIPAL_POINT = Term("principal_point", shift_principal_point, (1.0, 1.0), (20.0, 20.0), (200.0, 200.0))
-CLOCK_SKEW = Term(
-    "clock_skew", lambda p, v: replace(p, clock_skew=p.clock_skew + float(v[0])), (1e-4,), (0.005,), (0.05,)
-)
+CLOCK_SKEW = Term("clock_skew", skew_clock, (1e-4,), (0.005,), (0.05,))
 EXPOSURE_SCALE = Term("exposure_time", scale_exposure, (0.05,), (0.3,), (0.7,))
 FOCAL_DRIFT = Term("focal_drift", drift_focal, (1e-3,), (0.03,), (0.2,))
 STABILISATION = Term("stabilisation", stabilise, (0.02, 0.1, 0.01, 0.01), (0.3, 0.5, 0.1, 0.1), (1.0, 1.5, 0.05, 0.05))

@@ -4,6 +4,9 @@ Each term changes a profile by a small step.  The camera's velocity, gravity, th
 scene's plane are fitted along where the accelerometer tells a displacement.  Differences are whitened by the noise of
 their pair and, along the parallax, by the spread of depths about the plane; Cauchy weights bear moving objects.
 Covariances come from the scatter between blocks of time, since points of one frame are not independent.
+
+How the points depend on the values changes little on the way: slopes are taken anew only where the points have moved
+far since, and once more where the fit ends.
 """
 
 from __future__ import annotations
@@ -32,6 +35,9 @@ GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4
 MAX_DAMPING = 1e3
 SMALLEST_SCALE = 0.03
+ON_THE_WAY, AT_THE_END = (1.5, 0.5), (0.1, 0.05)
+"""Slopes serve until the points have moved so many pixels (median), or the scene's own values by this part, since."""
+NOT_AT_ALL = (0.0, 0.0)
 ANY_DEPTH = 1e6
 """Spread of inverse depths that leaves a point free to lie anywhere along its parallax."""
 SPREAD_PASSES, SPREAD_TOLERANCE = 3, 0.2
@@ -157,11 +163,13 @@ def fit_tracks(
         raise ImuError("no accelerometer to tell the camera's path", hint="fit a free motion")
     directed = isinstance(scene, DirectedMotion)
     state = _State(known, scene, np.zeros(sum(map(len, terms))), ANY_DEPTH if directed else 0.0)
+    look: _Look | None = None
     for _ in range(SPREAD_PASSES if inertial else 1):
-        state, system = _descend(imu, table, terms, scene, state, max_iterations)
+        state, system = _descend(imu, table, terms, scene, state, max_iterations, look)
         if inertial and abs(system.depth_spread - state.depth_spread) <= SPREAD_TOLERANCE * system.depth_spread:
             break
         state = replace(state, depth_spread=system.depth_spread if inertial else state.depth_spread)
+        look = system.look
     return _conclude(table, terms, state, system, blocks)
 
 
@@ -172,25 +180,37 @@ def _descend(
     start: Motion | None,
     state: _State,
     max_iterations: int,
+    look: _Look | None,
 ) -> tuple[_State, _System]:
-    """Levenberg-Marquardt at one spread of depths; the robust scale follows each accepted step."""
-    system, damping = _linearise(imu, table, terms, start, state), 0.0
+    """Levenberg-Marquardt at one spread of depths; the robust scale follows each accepted step.
+
+    look: at this state, from an earlier descent.
+    """
+    problem = _Problem(imu, table, terms, start)
+    system, damping = problem.weighed(state, look or problem.look(state, None)), 0.0
     if not system.hessian.size:
         return state, system
     for _ in range(max_iterations):
         step = system.solve(damping)
         step *= min(1.0, 1.0 / max(float(np.max(np.abs(step) / system.limit, initial=0.0)), 1e-12))
         moved = _moved(imu, terms, state, step)
-        after = _linearise(imu, table, terms, start, moved)
+        after = problem.weighed(moved, problem.look(moved, system.look, ON_THE_WAY))
         if _cost(after, system.scale) > _cost(system, system.scale) * (1 + 1e-9):
+            if system.look.is_stale(NOT_AT_ALL):
+                system = problem.weighed(state, problem.look(state, system.look, NOT_AT_ALL))
+                continue
             damping = max(10 * damping, 1e-3)
             if damping > MAX_DAMPING:
                 break
             continue
         small = bool(np.all(np.abs(step) < CONVERGED * np.sqrt(np.diag(system.inverse()))))
         state, system, damping = replace(moved, scene=after.scene), after, damping / 10 if damping > 1e-4 else 0.0
-        if small:
+        if small and not system.look.is_stale(AT_THE_END):
             break
+        if small:
+            system = problem.weighed(state, problem.look(state, system.look, AT_THE_END))
+    if system.look.is_stale(AT_THE_END):
+        system = problem.weighed(state, problem.look(state, system.look, AT_THE_END))
     return state, system
 
 
@@ -206,11 +226,45 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
-class _System:
-    """Weighted rows at one point, and their normal equations with the priors."""
+class _Look:
+    """The points as a state predicts them, with slopes that were taken there or not far away."""
 
     scene: Motion | None
     prediction: Prediction
+    slope: Array
+    """(n, 2, k) change of the predicted points per unit of each term's values and of the motion's entries, px."""
+    taken_px: Array
+    """(n, 2) where the points were predicted when the slopes were taken."""
+    taken_scene: Motion | None
+    flow: Array | None
+    """(n, 2, 3) of a unit step along each world axis, of a directed motion."""
+
+    def is_stale(self, limit: tuple[float, float]) -> bool:
+        """Whether points or scene have moved further than (px, part) since the slopes were taken."""
+        if self.prediction.second_px is self.taken_px:
+            return False
+        if isinstance(self.scene, DirectedMotion):
+            return True  # its directions are found anew at every look, and what lies across them with them
+        moved_px = float(np.median(np.abs(self.prediction.second_px - self.taken_px)))
+        return moved_px > limit[0] or _part_moved(self.taken_scene, self.scene) > limit[1]
+
+
+def _part_moved(before: Motion | None, after: Motion | None) -> float:
+    """By what part the planes and velocities of an inertial motion have changed."""
+    if not isinstance(before, InertialMotion) or not isinstance(after, InertialMotion):
+        return 0.0
+    parts = (
+        np.linalg.norm(new - old) / max(float(np.linalg.norm(old)), 1e-9)
+        for new, old in ((after.plane_per_m, before.plane_per_m), (after.velocity_m_s, before.velocity_m_s))
+    )
+    return float(max(parts))
+
+
+@dataclass(frozen=True, slots=True)
+class _System:
+    """Weighted rows at one point, and their normal equations with the priors."""
+
+    look: _Look
     difference: Array
     squared: Array
     """(n,) squared whitened differences."""
@@ -237,56 +291,88 @@ class _System:
     def inverse(self) -> Array:
         return _inverse(self.hessian + np.diag(self.prior))
 
+    @property
+    def scene(self) -> Motion | None:
+        """As it was found anew, for a directed motion."""
+        return self.look.scene
 
-def _linearise(
-    imu: ImuSamples, table: TrackTable, terms: tuple[Term, ...], start: Motion | None, state: _State
-) -> _System:
-    flow = None
-    if isinstance(state.scene, DirectedMotion):
-        scene, flow = _directed(table, state, state.scene)
-        state = replace(state, scene=scene)
-    prediction = predict(state.known, table, state.scene, slopes=state.scene is not None)
-    difference = table.second_px - prediction.second_px
-    slope = [_term_slopes(imu, table, terms, state, prediction)]
-    limit = [value for term in terms for value in term.limit]
-    prior = [std**-2.0 for term in terms for std in term.prior_std]
-    pulled = list(np.array(prior) * state.change)
-    if state.scene is not None and start is not None:
-        assert prediction.slopes is not None
-        slope.append(prediction.slopes)
-        information = state.scene.prior_std() ** -2.0
-        limit += list(state.scene.limits())
-        prior += list(information)
-        pulled += list(information * (state.scene.vector() - start.vector()))
-    rows, left, spread = _whitened(np.concatenate(slope, axis=-1), difference, prediction, table, state.depth_spread)
-    squared = (left**2).sum(axis=-1)
-    one_way = state.depth_spread == ANY_DEPTH
-    scale = max(float(np.median(np.sqrt(squared))) / (NORMAL_MEDIAN if one_way else RAYLEIGH_MEDIAN), SMALLEST_SCALE)
-    weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
-    if isinstance(state.scene, DirectedMotion) and flow is not None:
-        noise = table.noise_px[table.pair]
-        group = state.scene.group(table.pair)
-        rows, left = without_directions(
-            rows, left, weight, difference / noise[:, None], flow / noise[:, None, None], state.scene.direction, group
-        )
-    flat = rows.reshape(2 * len(table), rows.shape[-1])
-    weighted = flat * np.repeat(weight / scale**2, 2)[:, None]
-    return _System(
-        state.scene, prediction, difference, squared, weight, scale, spread, rows, left,
-        weighted.T @ flat, weighted.T @ left.ravel(), np.array(prior), np.array(pulled), np.array(limit),
-    )  # fmt: skip
+    @property
+    def prediction(self) -> Prediction:
+        """Where the points should be."""
+        return self.look.prediction
 
 
-def _term_slopes(imu: ImuSamples, table: TrackTable, terms: tuple[Term, ...], state: _State, at: Prediction) -> Array:
-    """(n, 2, k) change of the predicted points per unit of each term's values, by difference quotients."""
-    columns = []
-    for term in terms:
-        for k, quotient in enumerate(term.quotient):
-            step = np.zeros(len(term))
-            step[k] = quotient
-            moved = with_profile(state.known, imu, term.change(state.known.profile, step))
-            columns.append((predict(moved, table, state.scene).second_px - at.second_px) / quotient)
-    return np.stack(columns, axis=-1) if columns else np.zeros((len(table), 2, 0))
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """What stays the same through a descent."""
+
+    imu: ImuSamples
+    table: TrackTable
+    terms: tuple[Term, ...]
+    start: Motion | None
+
+    def look(self, state: _State, before: _Look | None, limit: tuple[float, float] = NOT_AT_ALL) -> _Look:
+        """Predict the points of a state; slopes of an earlier look serve while they are not stale."""
+        table, flow = self.table, None
+        if isinstance(state.scene, DirectedMotion):
+            scene, flow = _directed(table, state, state.scene)
+            state = replace(state, scene=scene)
+        like = None if before is None else before.prediction
+        if before is not None:
+            prediction = predict(state.known, table, state.scene, like=like)
+            kept = _Look(state.scene, prediction, before.slope, before.taken_px, before.taken_scene, flow)
+            if not kept.is_stale(limit):
+                return kept
+            like = prediction
+        prediction = predict(state.known, table, state.scene, slopes=state.scene is not None, like=like)
+        slope = [self._term_slopes(state, prediction)]
+        slope += [] if prediction.slopes is None or self.start is None else [prediction.slopes]
+        prediction = replace(prediction, slopes=None)
+        return _Look(
+            state.scene, prediction, np.concatenate(slope, axis=-1), prediction.second_px, state.scene, flow
+        )  # fmt: skip
+
+    def _term_slopes(self, state: _State, at: Prediction) -> Array:
+        """(n, 2, k) change of the predicted points per unit of each term's values, by difference quotients."""
+        columns = []
+        for term in self.terms:
+            for k, quotient in enumerate(term.quotient):
+                step = np.zeros(len(term))
+                step[k] = quotient
+                moved = with_profile(state.known, self.imu, term.change(state.known.profile, step))
+                ahead = predict(moved, self.table, state.scene, like=at)
+                columns.append((ahead.second_px - at.second_px) / quotient)
+        return np.stack(columns, axis=-1) if columns else np.zeros((len(self.table), 2, 0))
+
+    def weighed(self, state: _State, look: _Look) -> _System:
+        """Whiten a look's rows by noise and spread of depths, weigh them, and sum the normal equations up."""
+        table, scene = self.table, look.scene
+        difference = table.second_px - look.prediction.second_px
+        limit = [value for term in self.terms for value in term.limit]
+        prior = [std**-2.0 for term in self.terms for std in term.prior_std]
+        pulled = list(np.array(prior) * state.change)
+        if scene is not None and self.start is not None:
+            information = scene.prior_std() ** -2.0
+            limit += list(scene.limits())
+            prior += list(information)
+            pulled += list(information * (scene.vector() - self.start.vector()))
+        rows, left, spread = _whitened(look.slope, difference, look.prediction, table, state.depth_spread)
+        squared = (left**2).sum(axis=-1)
+        typical = NORMAL_MEDIAN if state.depth_spread == ANY_DEPTH else RAYLEIGH_MEDIAN
+        scale = max(float(np.median(np.sqrt(squared))) / typical, SMALLEST_SCALE)
+        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+        if isinstance(scene, DirectedMotion) and look.flow is not None:
+            noise = table.noise_px[table.pair]
+            rows, left = without_directions(
+                rows, left, weight, difference / noise[:, None], look.flow / noise[:, None, None], scene.direction,
+                scene.group(table.pair),
+            )  # fmt: skip
+        flat = rows.reshape(2 * len(table), rows.shape[-1])
+        weighted = flat * np.repeat(weight / scale**2, 2)[:, None]
+        return _System(
+            look, difference, squared, weight, scale, spread, rows, left,
+            weighted.T @ flat, weighted.T @ left.ravel(), np.array(prior), np.array(pulled), np.array(limit),
+        )  # fmt: skip
 
 
 def _whitened(
@@ -424,9 +510,10 @@ def many_directions(table: TrackTable) -> DirectedMotion:
 def _directed(table: TrackTable, state: _State, motion: DirectedMotion) -> tuple[DirectedMotion, Array]:
     """Directions found anew from the differences, and the flow (n, 2, 3) of a unit step along each world axis."""
     known, groups = state.known, len(motion.direction)
+    turned_only = predict(known, table, None)
     axes = (DirectedMotion(np.tile(axis, (groups, 1))) for axis in np.eye(3))
-    flow = np.stack([np.asarray(predict(known, table, axis).along_px) for axis in axes], axis=-1)
-    difference = table.second_px - predict(known, table, None).second_px
+    flow = np.stack([np.asarray(predict(known, table, axis, like=turned_only).along_px) for axis in axes], axis=-1)
+    difference = table.second_px - turned_only.second_px
     noise = table.noise_px[table.pair]
     start = motion.direction if motion.direction.any() else None
     found = find_directions(

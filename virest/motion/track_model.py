@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -32,6 +33,8 @@ Index = NDArray[np.intp]
 SMALLEST_DEPTH = 0.05
 """Points are held at least this part of the typical depth before the camera."""
 RAY_STEP = 1e-5
+SHIFT_STEP_S = 2e-3
+"""Grid of a stabiliser's path: at 10 rad/s² a straight line over it is off by 5e-6 rad, far below tracking's noise."""
 
 
 _PER_POINT = (
@@ -103,34 +106,88 @@ class Ground:
 
 
 @dataclass(frozen=True, slots=True)
+class Poses:
+    """When the points were seen and how the camera was turned then: the same for every lens and scene."""
+
+    trajectory: Trajectory
+    exposure_scale: float
+    first_s: Array
+    """(n,) IMU clock."""
+    second_s: Array
+    before: Array
+    """(n, 3, 3) R_world_cam at the first sight."""
+    back: Array
+    """(n, 3, 3) R_cam_world at the second."""
+
+
+@dataclass(frozen=True, slots=True)
 class Prediction:
     """Points as the model sees them, and how they depend on the scene and on the camera's translation."""
 
     second_px: Array
     """(n, 2)."""
-    first_s: Array
-    """(n,) IMU clock."""
-    second_s: Array
+    poses: Poses
     along_px: Array | None = None
     """(n, 2) change of second_px per unit of inverse depth; None without translation."""
     slopes: Array | None = None
     """(n, 2, k) change per entry of the motion's vector."""
+    moved: Moved | None = None
+    """How the camera moved between the two sights; None without translation."""
+
+    @property
+    def first_s(self) -> Array:
+        """(n,) when the first points were seen, IMU clock."""
+        return self.poses.first_s
+
+    @property
+    def second_s(self) -> Array:
+        """(n,) when the second points were seen, IMU clock."""
+        return self.poses.second_s
 
 
 def ground(imu: ImuSamples, profile: CameraProfile, *, translation: bool) -> Ground:
     """Integrate the inertial samples with a profile's bias, scale and rotation."""
     trajectory = integrate_gyro(imu, profile)
     displacement = integrate_accelerometer(imu, profile, trajectory) if translation else None
-    return Ground(profile, trajectory, displacement, moving_lens(trajectory, profile))
+    return Ground(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S))
 
 
 def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Ground:
     """Return the ground for another profile; what does not depend on the change is kept."""
-    before = known.profile
-    same = ("gyro_bias_rad_s", "gyro_scale", "r_cam_imu", "p_cam_imu_m")
+    before, kept = known.profile, known
+    same = ("gyro_bias_rad_s", "gyro_scale", "p_cam_imu_m")
     if any(getattr(before, name) != getattr(profile, name) for name in same):
         return ground(imu, profile, translation=known.displacement is not None)
-    return replace(known, profile=profile, lens=moving_lens(known.trajectory, profile))
+    if before.r_cam_imu != profile.r_cam_imu:
+        known = _turned_about(known, profile.rotation_cam_imu @ before.rotation_cam_imu.T)
+    if known.trajectory is not kept.trajectory or before.intrinsics != profile.intrinsics or _moves(before, profile):
+        known = replace(known, lens=moving_lens(known.trajectory, profile, SHIFT_STEP_S))
+    return replace(known, profile=profile)
+
+
+def _moves(before: CameraProfile, after: CameraProfile) -> bool:
+    """Whether two profiles' lenses move differently."""
+    names = ("focal_drift_per_s", "stabilisation_fraction", "stabilisation_cutoff_hz", "stabilisation_lean_rad")
+    return any(getattr(before.extensions, name) != getattr(after.extensions, name) for name in names)
+
+
+def _turned_about(known: Ground, turn: Array) -> Ground:
+    """The ground with the camera's axes turned on the IMU, (3, 3): everything in camera and world axes turns along."""
+    way = known.trajectory
+    trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, way.rate_polynomials @ turn.T)
+    if known.displacement is None:
+        return replace(known, trajectory=trajectory)
+    old = known.displacement
+    path, per_bias, per_delay = (_turned_spline(spline, turn) for spline in (old.path, old.per_bias, old.per_delay))
+    moved = Displacement(trajectory, path, per_bias, per_delay, old.arm_cam_m)
+    return replace(known, trajectory=trajectory, displacement=moved)
+
+
+def _turned_spline(spline: CubicHermiteSpline, turn: Array) -> CubicHermiteSpline:
+    """A spline of vectors (m, 3), or of matrices' rows (m, 9), in turned axes."""
+    pieces = spline.c.reshape(*spline.c.shape[:2], 3, -1)
+    turned_pieces = np.einsum("ij,pmjk->pmik", turn, pieces).reshape(spline.c.shape)
+    return CubicHermiteSpline.construct_fast(turned_pieces, spline.x, spline.extrapolate, spline.axis)
 
 
 def track_table(
@@ -194,81 +251,116 @@ def pulse_delay_s(profile: CameraProfile, middle_s: Array, exposure_s: Array) ->
     return np.asarray(moment / np.maximum(light, 1e-6))
 
 
-def predict(known: Ground, table: TrackTable, scene: Motion | None, *, slopes: bool = False) -> Prediction:
-    """Predict the second points (n, 2); scene None: rotation only."""
+def predict(
+    known: Ground, table: TrackTable, scene: Motion | None, *, slopes: bool = False, like: Prediction | None = None
+) -> Prediction:
+    """Predict the second points (n, 2); scene None: rotation only.
+
+    like: an earlier prediction of the same table; what it shares with this one is not worked out again.
+    """
+    poses = _poses(known, table, like)
+    world = turned(poses.before, known.lens.rays(table.first_px, poses.first_s))
+    if scene is None:
+        return Prediction(known.lens.project(turned(poses.back, world), poses.second_s), poses)
+    if isinstance(scene, DirectedMotion):
+        step = scene.direction[scene.group(table.pair)]
+        return _seen_again(known, world, poses, Moved(step, None, np.zeros(len(table)), np.zeros((len(table), 3, 0))))
+    paths = like.moved.paths if like is not None and like.moved is not None and like.poses is poses else None
+    paths = paths or _paths(known, table, scene, poses)
+    return _seen_again(known, world, poses, _moved_inertially(table, scene, world, paths, slopes))
+
+
+def _poses(known: Ground, table: TrackTable, like: Prediction | None) -> Poses:
+    """Sights and turns of the points; those of an earlier prediction where they are the same."""
     profile, scale = known.profile, known.profile.shutter.exposure_scale
     first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
     second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    if like is not None:
+        old = like.poses
+        same = old.trajectory is known.trajectory and old.exposure_scale == scale
+        if same and np.array_equal(first_s, old.first_s) and np.array_equal(second_s, old.second_s):
+            return old
     before = mean_orientation(known.trajectory, first_s, scale * table.first_exposure_s)
     after = mean_orientation(known.trajectory, second_s, scale * table.second_exposure_s)
-    rays = known.lens.rays(table.first_px, first_s)
-    back = np.swapaxes(after, -1, -2)
-    if scene is None:
-        return Prediction(known.lens.project(turned(back, turned(before, rays)), second_s), first_s, second_s)
-    world = turned(before, rays)
-    if isinstance(scene, DirectedMotion):
-        step = scene.direction[scene.group(table.pair)]
-        moved = _Moved(step, np.zeros(len(table)), np.zeros((len(table), 3, 0)))
-    else:
-        moved = _moved_inertially(known, table, scene, world, first_s, second_s, slopes)
-    return _seen_again(known, world, back, moved, first_s, second_s)
+    return Poses(known.trajectory, scale, first_s, second_s, before, np.swapaxes(after, -1, -2))
 
 
 @dataclass(frozen=True, slots=True)
-class _Moved:
+class Paths:
+    """What the accelerometer knows of the camera's centre at one sight of each point, from its window's middle."""
+
+    since_s: Array
+    """(n,) from the window's middle."""
+    path: Array
+    """(n, 3) without velocity, gravity, bias and delay, world axes."""
+    per_bias: Array
+    """(n, 3, 3)."""
+    per_delay: Array
+    """(n, 3)."""
+
+    def centre(self, scene: InertialMotion, velocity: Array) -> Array:
+        """Camera's centre (n, 3), world axes."""
+        moved = self.path + velocity * self.since_s[:, None] + 0.5 * scene.gravity_m_s2 * self.since_s[:, None] ** 2
+        return moved - self.per_bias @ scene.accel_bias_m_s2 + self.per_delay * scene.accel_delay_s
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
     """Displacement c(t₁) − c(t₂) of the camera and the inverse depth of each point, world axes."""
 
     step: Array
     """(n, 3)."""
+    paths: tuple[Paths, Paths] | None
+    """At both sights, of a path by the accelerometer."""
     inverse_depth: Array
     """(n,)."""
     per_entry: Array | None
     """(n, 3, k) change of step · inverse depth per entry of the motion's vector."""
 
 
-def _seen_again(known: Ground, world: Array, back: Array, moved: _Moved, first_s: Array, second_s: Array) -> Prediction:
+def _paths(known: Ground, table: TrackTable, scene: InertialMotion, poses: Poses) -> tuple[Paths, Paths]:
+    assert known.displacement is not None
+    origin_s = np.asarray(known.profile.imu_time_s(table.origin_s))[table.window]
+    first, second = (
+        Paths(time_s - origin_s, *known.displacement.at(time_s, origin_s)) for time_s in (poses.first_s, poses.second_s)
+    )
+    return first, second
+
+
+def _seen_again(known: Ground, world: Array, poses: Poses, moved: Moved) -> Prediction:
+    back, second_s = poses.back, poses.second_s
     rays = turned(back, world + moved.step * moved.inverse_depth[:, None])
     rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)
     expected = known.lens.project(rays, second_s)
     if moved.per_entry is None:
-        return Prediction(expected, first_s, second_s)
+        ahead = rays + RAY_STEP * turned(back, moved.step)
+        return Prediction(
+            expected, poses, (known.lens.project(ahead, second_s) - expected) / RAY_STEP, None, moved
+        )  # fmt: skip
     lens_slope = np.stack(
         [(known.lens.project(rays + RAY_STEP * axis, second_s) - expected) / RAY_STEP for axis in np.eye(3)], axis=-1
     )
     per_world = lens_slope @ back
     along = np.squeeze(per_world @ moved.step[..., None], -1)
-    return Prediction(expected, first_s, second_s, along, per_world @ moved.per_entry)
+    return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
 
 
 def _moved_inertially(
-    known: Ground,
-    table: TrackTable,
-    scene: InertialMotion,
-    world: Array,
-    first_s: Array,
-    second_s: Array,
-    slopes: bool,
-) -> _Moved:
-    assert known.displacement is not None
+    table: TrackTable, scene: InertialMotion, world: Array, paths: tuple[Paths, Paths], slopes: bool
+) -> Moved:
     window, plane = table.window, scene.plane_per_m[table.window]
-    origin_s = np.asarray(known.profile.imu_time_s(table.origin_s))[window]
-    velocity = scene.velocity_m_s[window]
-    centre_1, bias_1, delay_1 = centre(known.displacement, scene, velocity, first_s, origin_s)
-    centre_2, bias_2, delay_2 = centre(known.displacement, scene, velocity, second_s, origin_s)
+    centre_1, centre_2 = (path.centre(scene, scene.velocity_m_s[window]) for path in paths)
     clearance = np.maximum(1 - (plane * centre_1).sum(axis=-1), SMALLEST_DEPTH)
     inverse_depth = np.maximum((plane * world).sum(axis=-1) / clearance, 0.0)
     step = centre_1 - centre_2
     if not slopes:
-        return _Moved(step, inverse_depth, None)
-    since_1, since_2, each = first_s - origin_s, second_s - origin_s, np.eye(3)[None]
+        return Moved(step, paths, inverse_depth, None)
+    since_1, since_2, each = paths[0].since_s, paths[1].since_s, np.eye(3)[None]
     nearer = (inverse_depth / clearance)[:, None] * plane  # change of the inverse depth per metre of the first centre
     per_plane = world / clearance[:, None] + (inverse_depth / clearance)[:, None] * centre_1
     if scene.plane_axes is not None:
         per_plane = np.einsum("ni,nij->nj", per_plane, scene.plane_axes[window])
-    first, second = (
-        _shared_slopes(each, since, bias, delay)
-        for since, bias, delay in ((since_1, bias_1, delay_1), (since_2, bias_2, delay_2))
-    )
+    first, second = (_shared_slopes(each, path.since_s, path.per_bias, path.per_delay) for path in paths)
     shared = (first - second) * inverse_depth[:, None, None]
     shared = shared + step[:, :, None] * np.einsum("ni,nik->nk", nearer, first)[:, None, :]
     own = np.zeros((len(world), 3, scene.windows, 6))
@@ -276,7 +368,8 @@ def _moved_inertially(
     own[rows, :, window, :3] = each * ((since_1 - since_2) * inverse_depth)[:, None, None]
     own[rows, :, window, :3] += step[:, :, None] * (nearer * since_1[:, None])[:, None, :]
     own[rows, :, window, 3:] = step[:, :, None] * per_plane[:, None, :]
-    return _Moved(step, inverse_depth, np.concatenate([shared, own.reshape(len(world), 3, -1)], axis=-1))
+    per_entry = np.concatenate([shared, own.reshape(len(world), 3, -1)], axis=-1)
+    return Moved(step, paths, inverse_depth, per_entry)
 
 
 def _shared_slopes(each: Array, since: Array, bias: Array, delay: Array) -> Array:
@@ -288,10 +381,8 @@ def centre(
     displacement: Displacement, scene: InertialMotion, velocity: Array, time_s: Array, origin_s: Array
 ) -> tuple[Array, Array, Array]:
     """Camera centre (n, 3) from its place at origin_s, world axes, and its changes per bias (n, 3, 3), delay (n, 3)."""
-    path, per_bias, per_delay = displacement.at(time_s, origin_s)
-    since = (time_s - origin_s)[:, None]
-    moved = path + velocity * since + 0.5 * scene.gravity_m_s2 * since**2
-    return moved - per_bias @ scene.accel_bias_m_s2 + per_delay * scene.accel_delay_s, per_bias, per_delay
+    path = Paths(time_s - origin_s, *displacement.at(time_s, origin_s))
+    return path.centre(scene, velocity), path.per_bias, path.per_delay
 
 
 def mean_orientation(trajectory: Trajectory, middle_s: Array, exposure_s: Array) -> Array:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.motion.shared_out import Each, one_by_one
+
 Array = NDArray[np.float64]
+Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
+PART_FRAMES = 60
+"""Frames that are followed in one go: a part begins a few frames early, and before it lies what must be decoded."""
+LEAD_FRAMES = 2
+"""The frame before a part's first, for the pair of the two, and one more, which that frame may repeat."""
 CORNER_BLOCK_PX = 5
 CORNER_SPACING_PX = 7
 """A corner is the strongest of a square of this side."""
@@ -83,6 +91,43 @@ def track_pairs(
                 pairs.append(pair)
         before = (index, small)
     return pairs
+
+
+def track_frames(
+    gray: Callable[[Sequence[int]], Stream],
+    frames: Sequence[int],
+    each: Each = one_by_one,
+    progress: Callable[[int], None] | None = None,
+) -> list[TrackPair]:
+    """Follow points through frames (movie indices, rising), part by part; the same as in one stream of them.
+
+    gray: gives (index, picture) of the frames asked for; picklable where ``each`` hands parts to processes.  progress
+    is called with the number of frames that a finished part had.
+    """
+    parts = _parts(frames)
+    sizes = [sum(index >= first for index in part) for part, first in parts]
+    found = each(
+        _track_part,
+        [(gray, part, first) for part, first in parts],
+        None if progress is None else lambda place: progress(sizes[place]),
+    )
+    return [pair for pairs in found for pair in pairs]
+
+
+def _parts(frames: Sequence[int]) -> list[tuple[list[int], int]]:
+    """Parts of the runs of neighbours, each with its lead, and the index from which on a part's frames are its own."""
+    rising = np.array(sorted(set(frames)), np.intp)
+    parts: list[tuple[list[int], int]] = []
+    for run in np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1):
+        cuts = np.linspace(0, len(run), -(-len(run) // PART_FRAMES) + 1).round().astype(int)
+        for start, end in pairwise(cuts):
+            parts.append((run[max(start - LEAD_FRAMES, 0) : end].tolist(), int(run[start])))
+    return parts
+
+
+def _track_part(gray: Callable[[Sequence[int]], Stream], frames: list[int], own_from: int) -> list[TrackPair]:
+    """Pairs whose second frame is the part's own."""
+    return [pair for pair in track_pairs(gray(frames)) if pair.second >= own_from]
 
 
 def find_corners(picture: NDArray[np.uint8], settings: TrackingSettings) -> NDArray[np.float32]:

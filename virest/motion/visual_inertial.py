@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.motion.depth import FrameDepth, TriangulatedPoints, frame_depth, triangulate
+from virest.motion.depth import FrameDepth, Sights, TriangulatedPoints, frame_depth, triangulate, triangulate_relief
 from virest.motion.observed_tracks import WINDOW_S, ObservedTracks
 from virest.motion.optics import settling_time_s
 from virest.motion.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT, TIME_OFFSET
+from virest.motion.relief import View, WindowRelief, find_relief, picture_grid
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.motion.track_model import TrackTable, centre, ground
@@ -78,6 +79,8 @@ class Window:
     """Robust standard deviation of what is left, in units of the tracking noise."""
     reason: str
     """Why the window's velocity is not to be used; empty: it is."""
+    spread: float = 0.0
+    """Standard deviation of inverse depths about the plane, part of the plane's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +93,8 @@ class Stretch:
     points: TriangulatedPoints
     velocity_floor_m_s: Array
     """(windows,) what tracking's own bias makes of the velocity."""
+    reliefs: tuple[WindowRelief | None, ...] = ()
+    """By window; None: the plane tells held-out points as well as a surface does."""
 
     @property
     def scene(self) -> InertialMotion:
@@ -160,6 +165,38 @@ class Stretch:
         distance = max(1 - float(plane @ self.place(window, np.array([time_s]))[0]), 0.05)
         return np.asarray(self.fit.ground.trajectory.orientation(time_s).T @ plane / distance)
 
+    def depth(self, window: int, time_s: float) -> FrameDepth:
+        """The scene before the camera at a time, IMU clock: a plane, and a surface on it where the window has one."""
+        found = self.frame_plane(window, time_s)
+        relief = self.reliefs[window] if self.reliefs else None
+        if relief is None:
+            return found
+        surface = relief.surface(self.view(window, time_s, found.plane_per_m))
+        if surface is None:
+            return found
+        lens = self.fit.ground.lens
+        middle = lens.rays(0.5 * np.array([lens.lens.width - 1.0, lens.lens.height - 1.0]), time_s)
+        return found.with_relief(surface, middle, self.windows[window].scale_std)
+
+    def frame_plane(self, window: int, time_s: float) -> FrameDepth:
+        """The plane through the points about a time."""
+        return frame_depth(
+            self.points,
+            window,
+            time_s,
+            self.fit.ground.trajectory.orientation(time_s),
+            self.place(window, np.array([time_s]))[0],
+            self.fit.ground.lens,
+            self.plane(window, time_s),
+            self.fit.depth_spread_per_m,
+            self.windows[window].scale_std,
+        )
+
+    def view(self, window: int, time_s: float, plane_per_m: Array) -> View:
+        """The camera's pose at a time before a plane."""
+        place = self.place(window, np.array([time_s]))[0]
+        return View(time_s, self.fit.ground.trajectory.orientation(time_s), place, plane_per_m)
+
 
 @dataclass(frozen=True, slots=True)
 class FrameMotion:
@@ -224,17 +261,7 @@ class VisualInertialAlignment:
         rotation = known.trajectory.orientation(time_s[0])
         std = np.sqrt(np.diag(rotation.T @ covariance[0] @ rotation))
         acceleration = (velocity[2] - velocity[1]) / (time_s[2] - time_s[1])
-        depth = frame_depth(
-            stretch.points,
-            window,
-            float(time_s[0]),
-            rotation,
-            stretch.place(window, time_s[:1])[0],
-            known.lens,
-            stretch.plane(window, float(time_s[0])),
-            stretch.fit.depth_spread_per_m,
-            stretch.windows[window].scale_std,
-        )
+        depth = stretch.depth(window, float(time_s[0]))
         return FrameMotion(velocity[0] @ rotation, std, acceleration @ rotation, depth)
 
     def clock(self) -> tuple[float, float] | None:
@@ -373,8 +400,23 @@ def _fit_stretch(
     assert isinstance(fit.scene, InertialMotion)
     points = triangulate(fit.ground, fit.scene, table)
     stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table))
-    windows = tuple(_judged(stretch, still, k, depth_m) for k in range(table.n_windows))
-    return replace(stretch, windows=windows)
+    stretch = replace(stretch, windows=tuple(_judged(stretch, still, k, depth_m) for k in range(table.n_windows)))
+    sights = triangulate_relief(fit.ground, fit.scene, observed.table(observed.tracks))
+    reliefs = tuple(_relief(stretch, sights, k) for k in range(table.n_windows))
+    windows = tuple(_with_a_surface(window, relief) for window, relief in zip(stretch.windows, reliefs, strict=True))
+    return replace(stretch, windows=windows, reliefs=reliefs)
+
+
+def _relief(stretch: Stretch, sights: Sights, window: int) -> WindowRelief | None:
+    """What stands out of a window's planes, if it tells held-out points better."""
+    if stretch.windows[window].reason:
+        return None
+    grid = picture_grid(stretch.fit.ground.lens, stretch.origin_s(window))
+
+    def view(time_s: float) -> View:
+        return stretch.view(window, time_s, stretch.frame_plane(window, time_s).plane_per_m)
+
+    return find_relief(sights.chosen(sights.points.window == window), grid, view)
 
 
 def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
@@ -419,9 +461,18 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
     inverse = max(float(stretch.scene.plane_per_m[window] @ axis), 1e-6)
     scale_std = float(np.sqrt(axis @ stretch.scene_covariance[part, part] @ axis)) / inverse
     left, before = _left(fit, mine), _left(still, mine)
-    found = Window(start_s, end_s, scale_std, float(spread) / speed, before / max(left, 1e-6), left, "")
+    found = Window(
+        start_s,
+        end_s,
+        scale_std,
+        float(spread) / speed,
+        before / max(left, 1e-6),
+        left,
+        "",
+        fit.depth_spread_per_m / inverse,
+    )
     gravity = float(np.linalg.norm(stretch.scene.gravity_m_s2))
-    return replace(found, reason=_reason(found, gravity, fit.depth_spread_per_m / inverse, before))
+    return replace(found, reason=_reason(found, gravity, before))
 
 
 def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
@@ -429,7 +480,7 @@ def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
     return float(np.median(fit.distance[mine])) / RAYLEIGH_MEDIAN
 
 
-def _reason(found: Window, gravity_m_s2: float, spread: float, before: float) -> str:
+def _reason(found: Window, gravity_m_s2: float, before: float) -> str:
     if found.parallax < MIN_PARALLAX:
         return f"no parallax to speak of: rotation alone leaves {found.parallax:.2f} times what translation does"
     unexplained = max(found.residual**2 - 1, 0.0) / max(before**2 - 1, 1e-6)
@@ -444,6 +495,11 @@ def _reason(found: Window, gravity_m_s2: float, spread: float, before: float) ->
         return (
             f"velocity undetermined: ± {min(found.velocity_std, 1):.0%}{' or more' if found.velocity_std > 1 else ''}"
         )
-    if spread > MAX_SPREAD:
-        return f"no common plane: inverse depths spread by {spread:.0%}"
     return ""
+
+
+def _with_a_surface(window: Window, relief: WindowRelief | None) -> Window:
+    """Depths that spread too far for a plane need a surface."""
+    if window.reason or relief is not None or window.spread <= MAX_SPREAD:
+        return window
+    return replace(window, reason=f"no common plane: inverse depths spread by {window.spread:.0%}")

@@ -275,6 +275,7 @@ def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTran
         depth.plane_per_m,
         depth.depth_m if stated_depth_m is None else stated_depth_m,
         "triangulated" if stated_depth_m is None else "profile",
+        depth.relief,
     )
 
 

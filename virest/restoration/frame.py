@@ -366,13 +366,18 @@ def _too_little_to_gain(luma: PictureStatistics) -> str:
     return ""
 
 
-def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32]:
-    """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on."""
+def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32] | np.float32:
+    """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on.
+
+    (height, width), or one number for all.
+    """
     width, height = motion.profile.width, motion.profile.height
     x, y = (np.linspace(0, length - 1, max(2, length // 48)) for length in (width, height))
     length_px = np.linalg.norm(blur_chords(motion, np.stack(np.meshgrid(x, y), -1)), axis=-1)
     length_px = equivalent_length_px(motion.profile, length_px)
     part = np.clip(length_px / min_blur_px - 1.0, 0.0, 1.0).astype(np.float32)
+    if part.min() == 1.0:
+        return np.float32(1.0)
     return cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)
 
 

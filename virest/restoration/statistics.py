@@ -118,8 +118,8 @@ def measure_picture(
         tiles = zip(chosen[::every], known[::every], strict=True)
         return np.stack([_windowed_power(_cut(plane, corners[i]), seen) for i, seen in tiles])
 
-    both = (np.concatenate([observed(red, 2), observed(blue, 2)]), np.concatenate([passed[::2], passed[::2]]))
-    return _fit_rings(observed(luma, 1), passed, white_noise(luma)), _fit_rings(*both, white_noise(red))
+    colour = (observed(red, 2) + observed(blue, 2)) * np.float32(0.5)
+    return _fit_rings(observed(luma, 1), passed, white_noise(luma)), _fit_rings(colour, passed[::2], white_noise(red))
 
 
 def _least_clipped(clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]]) -> NDArray[np.intp]:
@@ -150,7 +150,14 @@ def white_noise(plane: NDArray[np.uint8]) -> float:
     above, here, below = (plane[first : len(plane) - 4 + first : 4].astype(np.int16) for first in (1, 2, 3))
     down = above - 2 * here + below
     residual = down[:, 1:-3:4] - 2 * down[:, 2:-2:4] + down[:, 3:-1:4]
-    return float(np.median(np.abs(residual))) / 0.6745 / 6.0
+    return _median(np.abs(residual)) / 0.6745 / 6.0
+
+
+def _median(levels: NDArray[np.int16]) -> float:
+    """The median of whole numbers from 0 on, by their histogram: quicker than by their order."""
+    reached = np.cumsum(np.bincount(levels.ravel()))
+    middles = (reached[-1] + 1) // 2, reached[-1] // 2 + 1
+    return float(np.mean(np.searchsorted(reached, middles)))
 
 
 def _corners(field: KernelField, shape: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -158,10 +165,8 @@ def _corners(field: KernelField, shape: tuple[int, ...]) -> list[tuple[int, int]
     height, width = shape
     if min(height, width) < _SIDE:
         return []
-    return [
-        (int(np.clip(y - _SIDE / 2, 0, height - _SIDE)), int(np.clip(x - _SIDE / 2, 0, width - _SIDE)))
-        for x, y in field.centres_px
-    ]
+    corners = np.clip(field.centres_px[:, ::-1] - _SIDE / 2, 0, (height - _SIDE, width - _SIDE))
+    return [(top, left) for top, left in corners.astype(int).tolist()]
 
 
 def _cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]:
@@ -220,8 +225,8 @@ def _ring_index(side: int) -> NDArray[np.intp]:
 
 def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32], white_levels: float) -> PictureStatistics:
     """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
-    share = np.minimum((passed * _CELLS).astype(np.int32), _CELLS - 1)
-    cell = (_ring_index(_SIDE).astype(np.int32) * _CELLS + share).ravel()
+    share = np.minimum((passed * _CELLS).astype(np.intp), _CELLS - 1)
+    cell = (_ring_index(_SIDE) * _CELLS + share).ravel()
 
     def per_cell(values: NDArray[np.float32] | None) -> Array:
         weights = None if values is None else values.ravel()
@@ -234,7 +239,8 @@ def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32], white
     mean_k, mean_g = (count * k).sum(1) / in_ring, (count * g).sum(1) / in_ring
     signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
     for _ in range(_FIT_STEPS):
-        weight = count / np.maximum(noise[:, None] + signal[:, None] * k, 1e-6) ** 1.5
+        expected = np.maximum(noise[:, None] + signal[:, None] * k, 1e-6)
+        weight = count / (expected * np.sqrt(expected))
         w, wk, wkk, wg, wkg = (np.sum(weight * v, 1) for v in (np.ones_like(k), k, k * k, g, k * g))
         determinant = np.maximum(w * wkk - wk * wk, 1e-30)
         signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)

@@ -1,1 +1,1 @@
-"""Quality, shutter, speed and memory tables: ``python -m virest.app.bench``."""
+"""Quality, shutter, speed, growth, memory and command tables: ``python -m virest.app.bench``."""

@@ -1,6 +1,7 @@
-"""Print the tables and write bench-out/bench.json.
+"""Print the tables and write bench-out/bench.json, or compare two of those.
 
 $ python -m virest.app.bench --only quality --quick
+$ python -m virest.app.bench --compare OLD.json NEW.json
 """
 
 from __future__ import annotations
@@ -10,22 +11,27 @@ import json
 import os
 import platform
 import shutil
+import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from virest import __version__
+from virest.app.bench.commands import commands_section
+from virest.app.bench.compare import NOISE, compare_text, read_report
 from virest.app.bench.cost import cost_section
 from virest.app.bench.curves import curves_section
 from virest.app.bench.diagnosis import diagnosis_section
+from virest.app.bench.growth import growth_section
 from virest.app.bench.memory import memory_section
 from virest.app.bench.quality import quality_section
 from virest.app.bench.real import real_section
 from virest.app.bench.shutter import shutter_section
 from virest.app.bench.soak import soak_section
 from virest.app.bench.speed import speed_section
+from virest.app.bench.summary import summary_text
 from virest.app.bench.workload import Scale
 from virest.app.console import emit
 
@@ -34,19 +40,25 @@ SECTIONS: dict[str, Section] = {
     "quality": quality_section,
     "shutter": shutter_section,
     "speed": speed_section,
-    "cost": cost_section,
+    "growth": growth_section,
     "memory": memory_section,
+    "commands": commands_section,
+    "cost": cost_section,
     "curves": curves_section,
     "diagnosis": diagnosis_section,
     "soak": soak_section,
     "real": real_section,
 }
-LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image")
+LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image", "deepinv", "torch")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the chosen sections; figures of each are kept as soon as it is done."""
     options = _parse(arguments)
+    if options.compare:
+        old, new = map(read_report, options.compare)
+        emit(compare_text(old, new, options.noise))
+        return
     scale = Scale(quick=options.quick, full=options.full)
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
@@ -56,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             report[name], text = SECTIONS[name](work, scale)
             emit(text + "\n")
             _write(options.out / "bench.json", report)
+        emit(summary_text(report))
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -67,13 +80,43 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     size.add_argument("--quick", action="store_true", help="a few frames: a look, no measurement")
     size.add_argument("--full", action="store_true", help="memory up to 3000 frames")
     parser.add_argument("--out", type=Path, default=Path("bench-out"), help="folder of bench.json [bench-out]")
+    parser.add_argument("--compare", nargs=2, type=Path, metavar=("OLD", "NEW"), help="measure nothing, compare these")
+    parser.add_argument(
+        "--noise", type=float, default=NOISE, help=f"relative change that is none, for --compare [{NOISE}]"
+    )
     return parser.parse_args(arguments)
 
 
 def _versions() -> dict[str, Any]:
-    libraries = {name: version(name) for name in LIBRARIES}
-    machine = {"machine": platform.machine(), "cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
-    return {"virest": __version__, "python": platform.python_version(), **libraries, **machine}
+    libraries = {name: _version(name) for name in LIBRARIES}
+    machine = {"machine": platform.machine(), "processor": _processor(), "cores": len(os.sched_getaffinity(0))}
+    program = {"virest": __version__, "commit": _commit(), "python": platform.python_version()}
+    return {**program, **libraries, **machine, "load": os.getloadavg()[0]}
+
+
+def _version(library: str) -> str | None:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The commit that is checked out where the program lies, and whether files differ from it."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _processor() -> str | None:
+    """The model's name as Linux tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return None
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), None)
 
 
 def _write(path: Path, report: dict[str, Any]) -> None:

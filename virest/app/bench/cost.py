@@ -41,7 +41,8 @@ def _measured(path: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     report = json.loads(path.read_text(encoding="utf-8"))
-    return {entry["preset"]: entry["frames_per_s"] for entry in report.get("speed", {}).get("presets", [])}
+    presets = report.get("speed", {}).get("presets", [])
+    return {entry["preset"]: entry["frames_per_s"] or entry["frames_per_s_by_cpu"] for entry in presets}
 
 
 def _bytes_per_frame(work: Path) -> tuple[float, float]:

@@ -1,9 +1,11 @@
-"""scikit-image's deconvolutions at their best, over a capture: :mod:`virest.evaluation.baselines`."""
+"""Other people's deconvolutions over a capture: scikit-image's (:mod:`virest.evaluation.baselines`) and deepinv's."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from virest.evaluation.baselines import SCIKIT, Deconvolve, baseline_pictures, c
 from virest.motion.integration import integrate_gyro
 
 Picture = NDArray[np.uint8]
+Plane = NDArray[np.float32]
 PEERS: dict[str, tuple[Deconvolve, tuple[float, ...]]] = {
     name: (baseline.deconvolve, baseline.settings) for name, baseline in SCIKIT.items()
 }
@@ -42,3 +45,32 @@ def peer_deblurred(
     """One picture, each channel's linear light deconvolved with the centre's kernel."""
     psf = centre_psf(motion)
     return deblurred(picture, lambda plane: method(plane, psf, setting), psf, curve)
+
+
+# ── deepinv ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+DEEPINV = "deepinv"
+GET_DEEPINV = "not installed: pip install 'virest[peers]'"
+
+
+def deepinv_available() -> bool:
+    """Whether deepinv, and torch with it, is there."""
+    return find_spec(DEEPINV) is not None
+
+
+def deepinv_wiener(plane: Plane, psf: Plane, noise_to_signal: Any) -> Plane:
+    """Conj(K) / (|K|² + N/S) by deepinv on one thread: a circular BlurFFT and its WienerDeconvolution, flat prior.
+
+    psf: as a convolution takes it, which is deepinv's convention too.
+    """
+    import torch
+    from deepinv.models import WienerDeconvolution
+    from deepinv.physics import BlurFFT
+
+    torch.set_num_threads(1)
+    kernel, observed = (torch.from_numpy(np.ascontiguousarray(array, np.float32))[None, None] for array in (psf, plane))
+    blur = BlurFFT(img_size=(1, *plane.shape), filter=kernel)
+    with torch.no_grad():
+        restored = WienerDeconvolution(lambda_reg=float(noise_to_signal), prior=None)(observed, blur)
+    return np.asarray(restored[0, 0].numpy(), np.float32)

@@ -1,97 +1,260 @@
-"""Frames a second from the movie to PNGs, and against scikit-image on the same machine at the same time.
+"""Frames a second from the movie to PNGs: of presets and stages, beside the floor, other processes and other libraries.
 
-The program runs over N and over 2 N frames of one looped 720x1280 capture with two processes; the difference of the
-two wall-clock times, over N, is the time of a frame without starting, reading and planning.
+The program runs over N and over 2 N frames of one looped 720x1280 capture; the difference of the two wall-clock times,
+over N, is the time of a frame without starting, reading and planning.  N holds whole segments for every process.
+The floor is the same program told not to deblur: decode, warp and PNG of the same frames are left.
 """
 
 from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from virest.app.bench.peers import PEERS, frame_motions, peer_deblurred
+from virest.app.bench.peers import (
+    GET_DEEPINV,
+    PEERS,
+    deepinv_available,
+    deepinv_wiener,
+    frame_motions,
+    peer_deblurred,
+)
 from virest.app.bench.tables import table
-from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process, simulated
+from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process
+from virest.app.jobs import prepare_worker
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.video import probe_movie, read_gray
+from virest.restoration.capture import plan_restoration
+from virest.restoration.settings import PRESETS as SETTINGS
 
-FRAMES = {"fast": 120, "balanced": 80, "best": 20}
-QUICK_FRAMES = {"fast": 60, "balanced": 40, "best": 4}
+FLOOR = "floor"
+ARGUMENTS = {FLOOR: ("--preset", "fast", "--deblur", "none"), **{preset: ("--preset", preset) for preset in PRESETS}}
+FRAMES = {FLOOR: 120, "fast": 120, "balanced": 80, "best": 20}
+QUICK_FRAMES = {FLOOR: 60, "fast": 60, "balanced": 40, "best": 20}
+"""Frames N with two processes, in segments of ten; one process gets half as many."""
 JOBS = 2
 PEER_TRIES = 2
 """The quicker one counts."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
+FLOOR_STAGES = ("decode", "shutter", "write")
 PEER_SETTINGS = {"wiener": 0.1, "unsupervised_wiener": 0.0, "richardson_lucy": 30}
+DEEPINV_ROW = "deepinv wiener"
+CAPTURE_S, FPS = 30.0, 30.0
+"""Length of the capture of which the share of estimation, planning included, is told."""
+LEAST_S = 1e-5
+"""A stage that takes less has nothing to do."""
+Facts = dict[str, Any]
 
 
-def speed_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Time each preset, then each peer on one frame."""
+def speed_section(work: Path, scale: Scale) -> tuple[Facts, str]:
+    """Time the floor and each preset with one process and with two, then each peer on one frame."""
     counts = QUICK_FRAMES if scale.quick else FRAMES
     capture = looped_capture(work, 2 * max(counts.values()))
-    presets = [_time_preset(work, capture, preset, counts[preset]) for preset in PRESETS]
-    peers = _time_peers(work)
-    facts = {"jobs": JOBS, "size": "720x1280", "presets": presets, "peers_s_per_frame": peers}
-    return facts, _text(presets, peers)
-
-
-def _time_preset(work: Path, capture: Path, preset: str, frames: int) -> dict[str, Any]:
-    runs = [_run(work, capture, preset, count) for count in (frames, 2 * frames)]
-    per_frame_s = (runs[1].wall_s - runs[0].wall_s) / frames
-    lines = runs[1].lines
-    return {
-        "preset": preset,
-        "frames": [frames, 2 * frames],
-        "wall_s": [run.wall_s for run in runs],
-        "s_per_frame": per_frame_s,
-        "frames_per_s": 1 / per_frame_s,
-        "stage_s": {stage: float(np.mean([line["seconds"].get(stage, 0.0) for line in lines])) for stage in STAGES},
+    measured = [_time_preset(work, capture, name, counts[name]) for name in ARGUMENTS]
+    planning_s = _planning_cpu_s(capture)
+    peers = _time_peers(capture)
+    facts = {
+        "jobs": JOBS,
+        "size": "720x1280",
+        "planning_cpu_s": planning_s,
+        **judged(measured, planning_s),
+        "peers_s_per_frame": peers,
+        "peers_missing": {} if DEEPINV_ROW in peers else {DEEPINV_ROW: GET_DEEPINV},
     }
+    return facts, speed_text(facts)
 
 
-def _run(work: Path, capture: Path, preset: str, frames: int) -> Run:
+# ── the program ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _time_preset(work: Path, capture: Path, name: str, frames: int) -> Facts:
+    """One record: with JOBS processes, and below ``one_process`` with one."""
+    one = timed_difference(work, capture, frames // JOBS, "--jobs", "1", *ARGUMENTS[name])
+    entry = timed_difference(work, capture, frames, "--jobs", str(JOBS), *ARGUMENTS[name])
+    return {"preset": name, **entry, "one_process": one}
+
+
+def timed_difference(work: Path, capture: Path, frames: int, *arguments: str) -> Facts:
+    """Run over N and over 2 N frames; what a frame takes by the difference."""
+    return per_frame(_run(work, capture, frames, *arguments), _run(work, capture, 2 * frames, *arguments), frames)
+
+
+def _run(work: Path, capture: Path, frames: int, *arguments: str) -> Run:
     out = work / "speed"
-    run = run_process(capture, out, "--preset", preset, "--jobs", str(JOBS), "--frames", f":{frames}")
+    run = run_process(capture, out, *arguments, "--frames", f":{frames}")
     shutil.rmtree(out)
     return run
 
 
-def _time_peers(work: Path) -> dict[str, float]:
-    """Seconds of one core for deblurring one colour frame; no decoding, warping or writing."""
-    capture = simulated(work, "loop-source")
+def per_frame(shorter: Run, longer: Run, frames: int) -> Facts:
+    """Wall-clock and CPU seconds a frame, from runs that differ by ``frames``; stages by the longer run's log.
+
+    stage_s is what the workers' clocks say; stage_cpu_s divides the measured CPU time among the stages in proportion.
+    Where others disturb, the longer run may even take less: such a difference is no rate.
+    """
+    wall_s = (longer.wall_s - shorter.wall_s) / frames
+    cpu_s = (longer.timing.cpu_s - shorter.timing.cpu_s) / frames
+    stage_s = {stage: float(np.mean([line["seconds"].get(stage, 0.0) for line in longer.lines])) for stage in STAGES}
+    whole_s = sum(stage_s.values())
+    done = [line for line in longer.lines if line["status"] != "skipped"]
+    return {
+        "frames": [len(shorter.lines), len(longer.lines)],
+        "wall_s": [shorter.wall_s, longer.wall_s],
+        "s_per_frame": wall_s,
+        "frames_per_s": over(1.0, wall_s),
+        "cpu_s_per_frame": cpu_s,
+        "stage_s": stage_s,
+        "stage_cpu_s": {stage: cpu_s * s / whole_s for stage, s in stage_s.items()},
+        "straightened": all(line["shutter"]["method"] != "none" for line in done),
+        "deblurred": float(np.mean([line["deblur"]["method"] != "none" for line in done])),
+        "others_cores": max(shorter.timing.others_cores, longer.timing.others_cores),
+    }
+
+
+def judged(measured: list[Facts], planning_s: float) -> Facts:
+    """Floor and presets, each with its share of the floor, of estimation, and what a second process brings."""
+    floor = next(entry for entry in measured if entry["preset"] == FLOOR)
+    entries = [{**entry, **_shares(entry, floor, planning_s)} for entry in measured]
+    pure = floor["straightened"] and floor["deblurred"] == 0.0
+    kept = {"pure": pure} if pure else {"pure": pure, "share_of_floor": None, "share_of_floor_by_cpu": None}
+    presets = [entry if pure else {**entry, **kept} for entry in entries if entry["preset"] != FLOOR]
+    return {"floor": {**next(e for e in entries if e["preset"] == FLOOR), **kept}, "presets": presets}
+
+
+def _shares(entry: Facts, floor: Facts, planning_s: float) -> Facts:
+    """Ratios of what was measured.
+
+    Figures by CPU time are what a quiet machine allows where no process ever waits; on one that others use too, the
+    wall clock cannot show it.  While one process plans the others have nothing to do, so planning counts in full.
+    """
+    one, stages = entry["one_process"], entry["stage_s"]
+    estimate, frames = stages["estimate"] / sum(stages.values()), CAPTURE_S * FPS
+    frames_s = frames * entry["cpu_s_per_frame"] / JOBS
+    return {
+        "frames_per_s_by_cpu": JOBS / entry["cpu_s_per_frame"],
+        "share_of_floor": over(floor["s_per_frame"], entry["s_per_frame"]),
+        "share_of_floor_by_cpu": floor["cpu_s_per_frame"] / entry["cpu_s_per_frame"],
+        "share_of_floor_by_stages": sum(stages[stage] for stage in FLOOR_STAGES) / sum(stages.values()),
+        "scaling": over(one["s_per_frame"], entry["s_per_frame"]),
+        "scaling_by_cpu": JOBS * one["cpu_s_per_frame"] / entry["cpu_s_per_frame"],
+        "estimate_share": estimate,
+        "estimate_share_with_planning": (planning_s + frames_s * estimate) / (planning_s + frames_s),
+        "busiest_others_cores": max(entry["others_cores"], one["others_cores"]),
+    }
+
+
+def over(above: float, below: float) -> float | None:
+    """Quotient of two times; None where one is not positive."""
+    return above / below if above > 0 and below > 0 else None
+
+
+def _planning_cpu_s(folder: Path) -> float:
+    """CPU seconds for filling what the profile leaves open and for asking whether pictures and gyroscope agree."""
+    prepare_worker()
+    capture = read_capture(folder)
+    profile, _ = resolve_profile(capture, None)
+    index = probe_movie(capture.movie)
+
+    def read(numbers: Any) -> Iterator[tuple[int, Any]]:
+        return ((n, picture) for n, picture in read_gray(capture.movie, index, numbers) if picture is not None)
+
+    began = time.process_time()
+    plan_restoration(capture, profile, SETTINGS["fast"], read)
+    return time.process_time() - began
+
+
+# ── others ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _time_peers(capture: Path) -> dict[str, float]:
+    """CPU seconds for deblurring one colour frame on one thread; no decoding, warping or writing."""
     curve, motions = frame_motions(capture)
-    number, picture = next(recorded_frames(capture))
-    seconds = {}
-    for name, (method, _) in PEERS.items():
-        tries = []
-        for _ in range(PEER_TRIES):
-            began = time.perf_counter()
-            peer_deblurred(method, PEER_SETTINGS[name], picture, motions[number], curve)
-            tries.append(time.perf_counter() - began)
-        seconds[name] = min(tries)
-    return seconds
+    number, picture = next((n, picture) for n, picture in recorded_frames(capture) if n in motions)
+    methods = {name: (method, PEER_SETTINGS[name]) for name, (method, _) in PEERS.items()}
+    if deepinv_available():
+        methods[DEEPINV_ROW] = (deepinv_wiener, PEER_SETTINGS["wiener"])
+        deepinv_wiener(np.zeros((16, 16), np.float32), np.eye(3, dtype=np.float32), 0.1)  # loads the libraries
+
+    def once(method: Any, setting: float) -> Callable[[], Any]:
+        return lambda: peer_deblurred(method, setting, picture, motions[number], curve)
+
+    cv2.setNumThreads(1)
+    return {name: min(_cpu_s(once(*chosen)) for _ in range(PEER_TRIES)) for name, chosen in methods.items()}
 
 
-def _text(presets: list[dict[str, Any]], peers: dict[str, float]) -> str:
-    header = [
-        "preset",
-        "frames/s",
-        "frames",
-        *(f"{stage} ms" for stage in STAGES),
-        *(f"{name} / deblur" for name in peers),
-    ]
+def _cpu_s(work: Callable[[], Any]) -> float:
+    began = time.process_time()
+    work()
+    return time.process_time() - began
+
+
+# ── text ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def speed_text(facts: Facts) -> str:
+    """Both tables."""
+    return _program_text(facts) + "\n\n" + _peers_text(facts)
+
+
+def _program_text(facts: Facts) -> str:
+    header = ["preset", "frames/s", "by CPU", "of floor", "by CPU", "by stages", *STAGES, "estimation", "with planning"]
+    header += ["1 process", "1 -> 2", "by CPU", "CPU ms", "others' cores"]
     rows = []
-    for entry in presets:
-        stages = entry["stage_s"]
-        ratios = [f"{seconds / stages['deblur']:.1f}" for seconds in peers.values()]
-        times = [f"{1000 * stages[stage]:.0f}" for stage in STAGES]
-        counts = "{}, {}".format(*entry["frames"])
-        rows.append([entry["preset"], f"{entry['frames_per_s']:.1f}", counts, *times, *ratios])
-    listed = ", ".join(f"{name} {1000 * seconds:.0f}" for name, seconds in peers.items())
+    for entry in [facts["floor"], *facts["presets"]]:
+        one = entry["one_process"]
+        rows.append([
+            entry["preset"], figure(entry["frames_per_s"]), figure(entry["frames_per_s_by_cpu"]),
+            percent(entry["share_of_floor"]), percent(entry["share_of_floor_by_cpu"]),
+            percent(entry["share_of_floor_by_stages"]), *(stage_rate(entry["stage_cpu_s"][stage]) for stage in STAGES),
+            percent(entry["estimate_share"]), percent(entry["estimate_share_with_planning"]),
+            figure(one["frames_per_s"]), figure(entry["scaling"]), figure(entry["scaling_by_cpu"]),
+            f"{1000 * entry['cpu_s_per_frame']:.0f}", f"{entry['busiest_others_cores']:.1f}",
+        ])  # fmt: skip
+    planned = f"its {facts['planning_cpu_s']:.1f} s in a capture of {CAPTURE_S:.0f} s"
+    pure = "decode, warp and PNG only" if facts["floor"]["pure"] else "NOT MEASURED: these frames are not all warped"
     return (
-        "SPEED: 720x1280 colour, decode to PNG, --jobs 2; from the difference of runs over N and 2 N frames\n"
-        "(stages: one core's ms a frame; last columns: a peer's time for one frame over the deblur stage's)\n"
-        + table(header, rows)
-        + f"\nscikit-image, ms a colour frame on one core, deblurring only: {listed}"
+        f"SPEED: {facts['size']} colour, decode to PNG, --jobs {facts['jobs']}; from runs over N and 2 N frames\n"
+        f"(floor: --deblur none, {pure}; by stages: decode + shutter + write of the preset's own run;\n"
+        f" by CPU: what the CPU times allow; stages: frames/s of one core by CPU time; with planning: {planned};\n"
+        " others' cores: what else kept the machine busy)\n" + table(header, rows)
     )
+
+
+def _peers_text(facts: Facts) -> str:
+    presets = facts["presets"]
+    rows = []
+    for name, seconds in facts["peers_s_per_frame"].items():
+        ratios = [ratio_to_peer(seconds, entry) for entry in presets]
+        rows.append([name, f"{1000 * seconds:.0f}", *("-" if r is None else f"{r:.1f}" for r in ratios)])
+    rows += [[name, why, *("-" for _ in presets)] for name, why in facts["peers_missing"].items()]
+    return (
+        "PEERS: one colour frame deblurred on one core, CPU ms; then how many times the deblur stage's\n"
+        "(scikit-image and deepinv with one kernel for the whole frame)\n"
+        + table(["peer", "ms", *(f"/ {entry['preset']}" for entry in presets)], rows)
+    )
+
+
+def ratio_to_peer(peer_s: float, entry: Facts) -> float | None:
+    """How many times a preset's deblurring a peer takes, by CPU time of one process; None where there was none."""
+    ours_s: float = entry["one_process"]["stage_cpu_s"]["deblur"]
+    return peer_s / ours_s if ours_s > LEAST_S else None
+
+
+def stage_rate(seconds: float) -> str:
+    """Frames a second of one stage on one core."""
+    return f"{1 / seconds:.4g}" if seconds > LEAST_S else "-"
+
+
+def figure(value: float | None) -> str:
+    """A rate or a ratio for people."""
+    return "-" if value is None else f"{value:.2f}"
+
+
+def percent(share: float | None) -> str:
+    """A share for people."""
+    return "-" if share is None else f"{100 * share:.1f} %"

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from fractions import Fraction
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +28,8 @@ PRESETS = ("fast", "balanced", "best")
 TICKS_PER_S = 90_000
 LOOP_FRAMES = 15
 """Half a second at 30 frames a second: the stamps of a loop are whole microseconds."""
+GROUP_FRAMES = 30
+"""From one key frame to the next, as phones and the simulator write them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +107,36 @@ def simulated(work: Path, name: str, **options: Any) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
+class Timing:
+    """What a command took."""
+
+    wall_s: float
+    """From the program's start to its end."""
+    cpu_s: float
+    """Of all its processes, in the program and in the kernel on its behalf."""
+    others_cores: float
+    """Cores that others kept busy in that time; above some 0.1 the wall clock says little."""
+
+
+def timed(command: list[str]) -> Timing:
+    """Run a command that must succeed, its standard output thrown away."""
+    began, before_s = time.perf_counter(), _busy_s()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        _, status, usage = os.wait4(process.pid, 0)  # with all descendants that were waited for
+        process.returncode = os.waitstatus_to_exitcode(status)
+    wall_s, cpu_s = time.perf_counter() - began, usage.ru_utime + usage.ru_stime
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return Timing(wall_s, cpu_s, max(_busy_s() - before_s - cpu_s, 0.0) / wall_s)
+
+
+def _busy_s() -> float:
+    """Seconds that all cores together worked since the machine's start, and that its host took away."""
+    user, nice, system, _, _, irq, softirq, steal = map(int, Path("/proc/stat").read_text().split()[1:9])
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """One finished ``virest process``."""
 
@@ -109,8 +144,12 @@ class Run:
     """OUT/<capture>."""
     lines: list[dict[str, Any]]
     """Of parameters.jsonl."""
-    wall_s: float
-    """From the program's start to its end."""
+    timing: Timing
+
+    @property
+    def wall_s(self) -> float:
+        """From the program's start to its end."""
+        return self.timing.wall_s
 
     def picture(self, line: dict[str, Any]) -> Picture:
         """Read the frame that a line names, RGB."""
@@ -125,12 +164,10 @@ def process_command(capture: Path, out: Path, *arguments: str) -> list[str]:
 
 def run_process(capture: Path, out: Path, *arguments: str) -> Run:
     """Run ``virest process`` as a process of its own and read what it wrote."""
-    began = time.perf_counter()
-    subprocess.run(process_command(capture, out, *arguments), check=True, stdout=subprocess.DEVNULL)
-    wall_s = time.perf_counter() - began
+    timing = timed(process_command(capture, out, *arguments))
     folder = out / capture.name
     lines = [json.loads(line) for line in (folder / "parameters.jsonl").read_text(encoding="utf-8").splitlines()]
-    return Run(folder, lines, wall_s)
+    return Run(folder, lines, timing)
 
 
 def recorded_frames(capture: Path) -> Iterator[tuple[int, Picture]]:
@@ -158,23 +195,43 @@ def read_png(path: Path) -> Picture:
 # ── long captures ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def looped_capture(work: Path, frames: int) -> Path:
-    """Make a 720x1280 capture of any length: half a second of a simulated one, pictures and gyroscope repeated."""
-    folder = work / "captures" / f"loop{frames}"
+def looped_capture(work: Path, frames: int, width: int = 720, height: int = 1280) -> Path:
+    """Make a capture of any length: half a second of a simulated one, pictures and gyroscope repeated."""
+    size = f"{width}x{height}"
+    folder = work / "captures" / f"loop{frames}-{size}"
     if folder.is_dir():
         return folder
-    source = simulated(work, "loop-source", frames=LOOP_FRAMES, exposure_ms=10.0, rate_rad_s=1.2, seed=21)
+    options = {"width": width, "height": height, "frames": LOOP_FRAMES, "exposure_ms": 10.0, "rate_rad_s": 1.2}
+    source = simulated(work, f"loop-source-{size}", **options, seed=21)
     folder.mkdir(parents=True)
     (folder / "camera.yaml").write_bytes((source / "camera.yaml").read_bytes())
     (folder / "edge_epochs.txt").write_bytes((source / "edge_epochs.txt").read_bytes())
     _loop_table(source, folder, "frame_timestamps.txt", frames)
     _loop_table(source, folder, "movie_metadata.csv", frames)
     _loop_gyro(source, folder, frames)
-    pictures = [picture for _, picture in recorded_frames(source)]
-    ticks = np.arange(frames, dtype=np.int64) * (TICKS_PER_S // 30)
-    shown = (pictures[k % len(pictures)] for k in range(frames))
-    write_movie(folder / "movie.mp4", shown, ticks, 30.0, RecordingOptions())
+    _loop_movie(source, folder, frames)
     return folder
+
+
+def _loop_movie(source: Path, folder: Path, frames: int) -> None:
+    """Encode one group of pictures and repeat its packets: minutes of movie cost a copy."""
+    pictures = [picture for _, picture in recorded_frames(source)]
+    count = min(frames, GROUP_FRAMES)
+    group = folder / "group.mp4"
+    shown = (pictures[k % len(pictures)] for k in range(count))
+    write_movie(group, shown, np.arange(count, dtype=np.int64) * (TICKS_PER_S // 30), 30.0, RecordingOptions())
+    with av.open(str(group)) as reader, av.open(str(folder / "movie.mp4"), "w", format="mp4") as writer:
+        coded = reader.streams.video[0]
+        stream = writer.add_stream_from_template(coded)
+        packets = [packet for packet in reader.demux(coded) if packet.size]
+        time_base = coded.time_base or Fraction(1, TICKS_PER_S)
+        step = round(1 / (30 * time_base))
+        for k in range(frames):
+            packet = packets[k % count]
+            packet.stream, packet.time_base = stream, time_base
+            packet.pts = packet.dts = k * step
+            writer.mux(packet)
+    group.unlink()
 
 
 def _loop_table(source: Path, folder: Path, name: str, frames: int) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from virest.app import console
-from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, one_thread_each
+from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, cores, emit_facts, one_thread_each
 
 CALIBRATED_EXTRAS = (
     "focal",
@@ -59,6 +59,7 @@ def calibrate(
     console.configure(quiet=quiet, verbose=verbose)
     one_thread_each()
     from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
+    from virest.app.side_by_side import side_by_side
 
     names = _parse_extras(extra or [])
     output = CalibrationOutput(out, kalibr, overwrite)
@@ -67,8 +68,8 @@ def calibrate(
     if len(paths) != 1:
         raise typer.BadParameter(f"standard input names {len(paths)} captures; a profile is calibrated from one")
     plan = plan_calibration(Path(paths[0]), config, names)
-    with console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
-        facts, text = run_calibration(plan, output, bar.update if bar else None)
+    with side_by_side(cores()) as each, console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
+        facts, text = run_calibration(plan, output, bar.update if bar else None, each)
     emit_facts(facts, text, as_json=json)
     return 0
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from virest.app import console
-from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, on_bar, one_thread_each
+from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, cores, emit_facts, on_bar, one_thread_each
 
 
 def diagnose(
@@ -41,8 +41,9 @@ def diagnose(
     console.configure(quiet=quiet, verbose=verbose)
     one_thread_each()
     from virest.app.diagnose import DiagnosisOptions, run_diagnosis
+    from virest.app.side_by_side import side_by_side
 
-    with console.progress_bar(100, "diagnose", quiet=quiet) as bar:
-        outcome = run_diagnosis(capture, DiagnosisOptions(out, config, overwrite), on_bar(bar))
+    with side_by_side(cores()) as each, console.progress_bar(100, "diagnose", quiet=quiet) as bar:
+        outcome = run_diagnosis(capture, DiagnosisOptions(out, config, overwrite), on_bar(bar), each)
     emit_facts(outcome.facts, outcome.text, as_json=json)
     return outcome.check_code if check else 0

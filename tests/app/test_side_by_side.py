@@ -1,0 +1,35 @@
+"""Calls shared out among processes."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+
+from virest.app.side_by_side import side_by_side
+from virest.motion.shared_out import one_by_one
+
+
+def die_elsewhere(parent: int, value: float) -> float:
+    """End the process at once, but for the one that asks."""
+    if os.getpid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 2 * value
+
+
+def test_results_come_in_the_order_of_the_calls_and_a_worker_s_death_costs_none() -> None:
+    """Two processes give what one gives; the calls of a worker that dies are made here, and so are all later ones."""
+    calls = [(float(k), 3.0) for k in range(7)]
+    with side_by_side(2) as each:
+        told: list[int] = []
+        assert each(math.fmod, calls, told.append) == one_by_one(math.fmod, calls)
+        assert told == list(range(7))
+        assert set(each(os.getpid, [(), ()])) != {os.getpid()}
+        assert each(die_elsewhere, [(os.getpid(), 1.5), (os.getpid(), -4.0)]) == [3.0, -8.0]
+        assert each(os.getpid, [(), ()]) == [os.getpid()] * 2
+
+
+def test_one_job_is_done_here() -> None:
+    """Without a second core no process is started."""
+    with side_by_side(1) as each:
+        assert each(os.getpid, [(), ()]) == [os.getpid()] * 2

@@ -1,0 +1,102 @@
+"""The commands that a person waits for: ``--help``, ``inspect``, ``calibrate`` and ``diagnose``.
+
+$ python -m virest.app.bench --only commands --quick
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from virest.app.bench.tables import table
+from virest.app.bench.workload import Scale, Timing, looped_capture, simulated, timed
+
+HELP_TRIES, INSPECT_TRIES = 5, 2
+"""The quickest counts; one start before fills the system's caches."""
+INSPECTED_FRAMES = 18_000
+"""Ten minutes at 30 frames a second."""
+FITTED_FRAMES, FPS = 960, 30.0
+SIZE, QUICK_SIZE = (640, 480), (320, 240)
+HELP_S, INSPECT_S = 0.3, 5.0
+"""What is asked of the first two; the others are to be quicker than the capture is long."""
+Facts = dict[str, Any]
+
+
+def commands_section(work: Path, scale: Scale) -> tuple[Facts, str]:
+    """Time each as a process of its own, from its start to its end."""
+    rows = [_help(), _inspect(work), *_fits(work, *(QUICK_SIZE if scale.quick else SIZE))]
+    return {"commands": rows}, commands_text(rows)
+
+
+def _virest(*arguments: str) -> list[str]:
+    """Give the installed script's command line, as people call it."""
+    script = Path(sys.executable).with_name("virest")
+    return [*([str(script)] if script.is_file() else [sys.executable, "-m", "virest"]), *arguments]
+
+
+def _help() -> Facts:
+    command = _virest("--help")
+    timed(command)
+    return record("help", "virest --help", [timed(command) for _ in range(HELP_TRIES)], HELP_S)
+
+
+def _inspect(work: Path) -> Facts:
+    """Of ten minutes of 720x1280, half a gigabyte."""
+    capture = looped_capture(work, INSPECTED_FRAMES)
+    tries = [timed(_virest("inspect", str(capture))) for _ in range(INSPECT_TRIES)]
+    shutil.rmtree(capture)
+    return record("inspect", f"inspect, {INSPECTED_FRAMES / FPS:.0f} s of 720x1280", tries, INSPECT_S)
+
+
+def _fits(work: Path, width: int, height: int) -> list[Facts]:
+    """Calibrate and diagnose one capture that was simulated as a whole, without loops."""
+    options: dict[str, Any] = {"exposure_ms": 8.0, "rate_rad_s": 1.0, "noise_levels": 1.5, "seed": 31}
+    capture = simulated(work, f"fits-{width}x{height}", width=width, height=height, frames=FITTED_FRAMES, **options)
+    out, length_s = work / "fits", FITTED_FRAMES / FPS
+    arguments = {
+        "calibrate": ("--out", str(out / "camera.yaml"), "--overwrite", "-q"),
+        "diagnose": ("--out", str(out), "--overwrite", "-q"),
+    }
+    out.mkdir()
+    rows = []
+    for name, rest in arguments.items():
+        title = f"{name}, {length_s:.0f} s of {width}x{height}"
+        try:
+            rows.append(record(name, title, [timed(_virest(name, str(capture), *rest))], length_s))
+        except subprocess.CalledProcessError as failed:
+            rows.append({"command": name, "title": title, "asked_s": length_s, "exit_code": failed.returncode})
+    shutil.rmtree(out)
+    return rows
+
+
+def record(name: str, title: str, tries: list[Timing], asked_s: float) -> Facts:
+    """What the quickest of some tries took, and which part of what is allowed."""
+    best = min(tries, key=lambda timing: timing.wall_s)
+    return {
+        "command": name,
+        "title": title,
+        "asked_s": asked_s,
+        "wall_s": best.wall_s,
+        "cpu_s": best.cpu_s,
+        "part_of_asked": best.wall_s / asked_s,
+        "cpu_part_of_asked": best.cpu_s / asked_s,
+        "others_cores": best.others_cores,
+        "exit_code": 0,
+    }
+
+
+def commands_text(rows: list[Facts]) -> str:
+    """One line a command."""
+    lines = []
+    for row in rows:
+        if row["exit_code"]:
+            lines.append([row["title"], f"{row['asked_s']:g}", f"exit code {row['exit_code']}", "-", "-", "-"])
+            continue
+        others = f"{row['others_cores']:.1f}"
+        found = [f"{row['wall_s']:.2f}", f"{row['cpu_s']:.2f}", f"{row['part_of_asked']:.2f}", others]
+        lines.append([row["title"], f"{row['asked_s']:g}", *found])
+    header = ["command", "asked s", "wall s", "CPU s", "wall / asked", "others' cores"]
+    return "COMMANDS: from start to end; calibrate and diagnose against the capture's length\n" + table(header, lines)

@@ -1,0 +1,184 @@
+"""One table at the end: what is asked, what was measured, and whether that is met."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from virest.app.bench.compare import BUSY_CORES
+from virest.app.bench.growth import exponent_text
+from virest.app.bench.speed import STAGES, figure, percent, ratio_to_peer, stage_rate
+from virest.app.bench.tables import table
+
+Report = dict[str, Any]
+NOT_RUN = "not run"
+LEAST_FLOOR_SHARE, LEAST_SCALING, MOST_ESTIMATION = 0.6, 1.8, 0.05
+LEAST_RATE = {"balanced": 8.0, "best": 0.3}
+MOST_WORKER_MB, MOST_GROWTH = 400.0, 1.05
+MOST_EXPONENT = 1.1
+"""Of the time over frames: twice as many take at most 7 % more each."""
+
+
+YES, NO, BUSY, OPEN = "yes", "NO", "busy", "-"
+"""The last column. ``busy``: others used the machine, and neither clock tells; ``-``: nothing asked or measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One figure beside what is asked of it."""
+
+    figure: str
+    asked: str
+    measured: str
+    met: str = OPEN
+
+
+def judge(by_wall: bool, by_cpu: bool, others_cores: float, *, ratio: bool = False) -> str:
+    """Whether a target is met, on a machine that others may have used too.
+
+    CPU time bounds what a quiet machine can do: a target missed by it is missed.  A wall-clock time that is good enough
+    in spite of others is good enough; of a ratio of two such times nothing is known.
+    """
+    if others_cores <= BUSY_CORES:
+        return YES if by_wall else NO
+    if not by_cpu:
+        return NO
+    return YES if by_wall and not ratio else BUSY
+
+
+def summary_rows(report: Report) -> list[Row]:
+    """All rows; those of sections that were not run say so."""
+    rows: list[Row] = []
+    for section, (build, what) in SECTIONS.items():
+        rows += build(report[section]) if report.get(section) else [Row(what, "-", f"{NOT_RUN}: --only {section}")]
+    return rows
+
+
+def summary_text(report: Report) -> str:
+    """The table; the load beside it, since a busy machine measures itself."""
+    versions = report.get("versions", {})
+    load = f"{versions.get('cores')} cores, load {versions.get('load', 0.0):.1f} at the start"
+    body = table(
+        ["figure", "asked", "measured", "met"], [[r.figure, r.asked, r.measured, r.met] for r in summary_rows(report)]
+    )
+    return f"SUMMARY: virest {versions.get('virest')}, scale {report.get('scale')}, {load}\n" + body
+
+
+# ── rows of each section ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _speed_rows(speed: Report) -> list[Row]:
+    presets = speed["presets"]
+    rows = [_rate_row(entry) for entry in (speed["floor"], *presets)]
+    rows += [_floor_row(entry) for entry in presets]
+    rows += [_scaling_row(entry) for entry in presets]
+    rows += [_estimation_row(entry) for entry in presets]
+    rows += [_stages_row(entry) for entry in (speed["floor"], *presets)]
+    return rows + _peer_rows(speed)
+
+
+def _rate_row(entry: Report) -> Row:
+    rate, allowed, least = entry["frames_per_s"], entry["frames_per_s_by_cpu"], LEAST_RATE.get(entry["preset"])
+    title, measured = f"{entry['preset']}: frames/s, 2 processes", f"{figure(rate)} ({figure(allowed)} by CPU time)"
+    if least is None:
+        return Row(title, OPEN, measured)
+    return Row(title, f">= {least:g}", measured, judge((rate or 0) >= least, allowed >= least, _others(entry)))
+
+
+def _floor_row(entry: Report) -> Row:
+    shares = [entry[key] for key in ("share_of_floor", "share_of_floor_by_cpu", "share_of_floor_by_stages")]
+    measured = "{} ({} by CPU time, {} by its stages)".format(*map(percent, shares))
+    title = f"{entry['preset']}: of the floor"
+    if entry["preset"] != "fast":
+        return Row(title, OPEN, measured)
+    by_wall, by_cpu = ((share or 0.0) >= LEAST_FLOOR_SHARE for share in shares[:2])
+    met = judge(by_wall, by_cpu, _others(entry), ratio=True) if shares[1] is not None else OPEN
+    return Row(title, f">= {percent(LEAST_FLOOR_SHARE)}", measured, met)
+
+
+def _scaling_row(entry: Report) -> Row:
+    scaling, allowed = entry["scaling"], entry["scaling_by_cpu"]
+    met = judge((scaling or 0.0) >= LEAST_SCALING, allowed >= LEAST_SCALING, _others(entry), ratio=True)
+    measured = f"{figure(scaling)} ({figure(allowed)} by CPU time)"
+    return Row(f"{entry['preset']}: 1 -> 2 processes", f">= {LEAST_SCALING:g}", measured, met)
+
+
+def _others(entry: Report) -> float:
+    return float(entry["busiest_others_cores"])
+
+
+def _estimation_row(entry: Report) -> Row:
+    share = entry["estimate_share_with_planning"]
+    measured = f"{percent(share)} with planning, {percent(entry['estimate_share'])} of a frame"
+    met = YES if share < MOST_ESTIMATION else NO
+    return Row(f"{entry['preset']}: estimation", f"< {percent(MOST_ESTIMATION)}", measured, met)
+
+
+def _stages_row(entry: Report) -> Row:
+    rates = ", ".join(f"{stage} {stage_rate(entry['stage_cpu_s'][stage])}" for stage in STAGES)
+    return Row(f"{entry['preset']}: frames/s of a core", "-", rates)
+
+
+def _peer_rows(speed: Report) -> list[Row]:
+    """How many times as long as each preset's deblurring a peer takes for the same frame."""
+    rows = []
+    for name, seconds in speed["peers_s_per_frame"].items():
+        ratios = [(entry["preset"], ratio_to_peer(seconds, entry)) for entry in speed["presets"]]
+        said = ", ".join(f"{preset} {ratio:.2f}" for preset, ratio in ratios if ratio is not None)
+        rows.append(Row(f"{_peer_title(name)} / deblur stage", "-", said))
+    return rows + [Row(f"{_peer_title(name)} / deblur stage", "-", why) for name, why in speed["peers_missing"].items()]
+
+
+def _peer_title(name: str) -> str:
+    return name if " " in name else f"scikit-image {name}"
+
+
+def _growth_rows(growth: Report) -> list[Row]:
+    exponent = growth["frames"]["exponent"]
+    met = OPEN if exponent is None else YES if exponent <= MOST_EXPONENT else NO
+    return [
+        Row("time over frames, exponent", f"<= {MOST_EXPONENT:g}", exponent_text(growth["frames"]), met),
+        Row("time of a frame over pixels, exponent", "-", exponent_text(growth["pixels"])),
+        Row("deblurring over tiles, exponent", "-", exponent_text(growth["tiles"])),
+    ]
+
+
+def _memory_rows(memory: Report) -> list[Row]:
+    worker_mb = max(run["worker_mb"] for run in memory["runs"])
+    grown, counts = memory["grown"], [run["frames"] for run in memory["runs"]]
+    return [
+        Row(
+            "memory of the largest worker",
+            f"< {MOST_WORKER_MB:g} MB",
+            f"{worker_mb:.0f} MB",
+            YES if worker_mb < MOST_WORKER_MB else NO,
+        ),
+        Row(
+            f"memory, {counts[-1]} over {counts[0]} frames",
+            f"<= {MOST_GROWTH:g}",
+            f"worker {grown['worker']:.3f}, all {grown['peak']:.3f}",
+            YES if max(grown.values()) <= MOST_GROWTH else NO,
+        ),
+    ]
+
+
+def _command_rows(commands: Report) -> list[Row]:
+    return [_command_row(row) for row in commands["commands"]]
+
+
+def _command_row(row: Report) -> Row:
+    asked = f"< {row['asked_s']:g} s"
+    if row["exit_code"]:
+        return Row(row["title"], asked, f"exit code {row['exit_code']}", NO)
+    measured = f"{row['wall_s']:.2f} s (CPU {row['cpu_s']:.2f})"
+    met = judge(row["part_of_asked"] < 1.0, row["cpu_part_of_asked"] < 1.0, row["others_cores"])
+    return Row(row["title"], asked, measured, met)
+
+
+SECTIONS: dict[str, tuple[Callable[[Report], list[Row]], str]] = {
+    "speed": (_speed_rows, "speed, floor, scaling, estimation, peers"),
+    "growth": (_growth_rows, "growth with frames, pixels, tiles"),
+    "memory": (_memory_rows, "memory"),
+    "commands": (_command_rows, "help, inspect, calibrate, diagnose"),
+}

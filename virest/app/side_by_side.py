@@ -1,0 +1,86 @@
+"""Independent pieces of one command's work, side by side in processes: `process` has segments, these have calls.
+
+Results come in the order of the calls, so that nothing depends on the number of processes.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+from virest.app.jobs import KEEP_MEMORY_VARIABLES, KEPT_BYTES, THREAD_VARIABLES, _start_worker
+from virest.motion.shared_out import Each, one_by_one
+
+log = logging.getLogger(__name__)
+
+
+@contextmanager
+def side_by_side(jobs: int) -> Iterator[Each]:
+    """Calls shared out among so many processes, which are started when they are first needed; one: done here."""
+    shared = _SharedOut(jobs)
+    try:
+        yield shared if jobs > 1 else one_by_one
+    finally:
+        shared.close()
+
+
+class _SharedOut:
+    """A pool of processes that outlives its calls."""
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __call__(
+        self,
+        function: Callable[..., Any],
+        arguments: Iterable[tuple[Any, ...]],
+        done: Callable[[int], None] | None = None,
+    ) -> list[Any]:
+        """As `Each` says; what a dying worker leaves undone is done here."""
+        calls = list(arguments)
+        if len(calls) < 2 or self.jobs == 1:
+            return one_by_one(function, calls, done)
+        try:
+            futures = [self._submit(function, parts) for parts in calls]
+            return [_told(future, place, done) for place, future in enumerate(futures)]
+        except BrokenExecutor:
+            log.warning("a worker process died; its work is done again in this one")
+            self.close()
+            self.jobs, self._pool = 1, None
+            return one_by_one(function, calls, done)
+
+    def _submit(self, function: Callable[..., Any], parts: tuple[Any, ...]) -> Future[Any]:
+        if self._pool is None:
+            self._pool = self._started()
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
+        try:
+            return self._pool.submit(function, *parts)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+    def _started(self) -> ProcessPoolExecutor:
+        for variable in THREAD_VARIABLES:
+            os.environ[variable] = "1"
+        for variable in KEEP_MEMORY_VARIABLES:
+            os.environ.setdefault(variable, KEPT_BYTES)
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(self.jobs, context, initializer=_start_worker, initargs=(False,))
+
+    def close(self) -> None:
+        """Let the processes go; what they have not begun is not wanted any more."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _told(future: Future[Any], place: int, done: Callable[[int], None] | None) -> Any:
+    result = future.result()
+    if done is not None:
+        done(place)
+    return result
