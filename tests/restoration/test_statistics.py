@@ -8,11 +8,13 @@ import pytest
 from laws import texture
 from numpy.typing import NDArray
 
+from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import KernelField
 from virest.restoration import statistics as statistics_room
 from virest.restoration.statistics import PictureStatistics, measure_picture, on_spectrum
 
 HEIGHT, WIDTH = 420, 560
+STRAIGHT = ResponseCurve("linear")
 
 
 def _field(length_px: float = 15.0, angle_rad: float = 0.4) -> KernelField:
@@ -34,12 +36,25 @@ def _blurred(field: KernelField, noise_levels: float) -> tuple[NDArray[np.uint8]
     return np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, -1), sharp
 
 
+@pytest.mark.parametrize("noise_levels", [0.8, 2.0, 4.0])
+def test_the_curve_of_blurred_edges_is_no_noise(noise_levels: float) -> None:
+    """Light of black and white patches is blurred, then goes through a curve: the noise is what was added after it."""
+    field, curve = _field(13.0), ResponseCurve("srgb")
+    light = 0.02 + 0.9 * (texture(HEIGHT, WIDTH, seed=5) > 0.5)
+    grey = 255 * curve.encode(cv2.filter2D(light, -1, field.arrays()[0].astype(float)))
+    noisy = grey + np.random.default_rng(8).normal(0, noise_levels, grey.shape)
+    picture = np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, -1)
+    measured, taken_for_light = (measure_picture(picture, field, c)[0].noise_levels for c in (curve, STRAIGHT))
+    assert measured == pytest.approx(noise_levels, rel=0.25)
+    assert taken_for_light > 1.3 * measured
+
+
 @pytest.mark.parametrize("noise_levels", [1.5, 4.0, 8.0])
 @pytest.mark.parametrize("angle_rad", [0.4, 1.9])
 def test_white_noise_is_measured(noise_levels: float, angle_rad: float) -> None:
     """A known white noise comes back within 15 per cent, under a known blur."""
     field = _field(angle_rad=angle_rad)
-    luma, _ = measure_picture(_blurred(field, noise_levels)[0], field)
+    luma, _ = measure_picture(_blurred(field, noise_levels)[0], field, STRAIGHT)
     assert luma.noise_levels == pytest.approx(noise_levels, rel=0.15)
 
 
@@ -47,7 +62,7 @@ def test_noise_to_signal_is_of_the_right_order() -> None:
     """Ring by ring, N / S is within a factor of 2.5 of what was put in where the two compete, and rises."""
     field = _field()
     picture, sharp = _blurred(field, 4.0)
-    luma, _ = measure_picture(picture, field)
+    luma, _ = measure_picture(picture, field, STRAIGHT)
     fy, fx = np.fft.fftfreq(HEIGHT)[:, None], np.fft.fftfreq(WIDTH)[None]
     power = np.abs(np.fft.fft2(sharp)) ** 2 / (HEIGHT * WIDTH)
     radius = np.hypot(fx, fy)
@@ -62,7 +77,7 @@ def test_noise_to_signal_is_of_the_right_order() -> None:
 def test_more_noise_promises_less() -> None:
     """The expected gain is positive under a clean blur and shrinks as noise grows."""
     field = _field()
-    gains = [measure_picture(_blurred(field, n)[0], field)[0].expected_gain_db for n in (1.0, 4.0, 12.0)]
+    gains = [measure_picture(_blurred(field, n)[0], field, STRAIGHT)[0].expected_gain_db for n in (1.0, 4.0, 12.0)]
     assert gains[0] > gains[1] > gains[2] >= 0
     assert gains[0] > 1.5
 
@@ -72,13 +87,14 @@ def test_a_blur_that_the_picture_does_not_show_comes_out_as_noise() -> None:
     field = _field()
     picture, sharp = _blurred(field, 1.5)
     unblurred = np.repeat(np.rint(sharp).astype(np.uint8)[..., None], 3, -1)
-    assert measure_picture(unblurred, field)[0].noise_levels > 2 * measure_picture(picture, field)[0].noise_levels
+    seen, missed = (measure_picture(p, field, STRAIGHT)[0].noise_levels for p in (picture, unblurred))
+    assert missed > 2 * seen
 
 
 def test_a_grey_picture_has_no_colour_noise() -> None:
     """Chroma has statistics of its own: where there is no colour, little but rounding is left of it."""
     field = _field()
-    luma, chroma = measure_picture(_blurred(field, 4.0)[0], field)
+    luma, chroma = measure_picture(_blurred(field, 4.0)[0], field, STRAIGHT)
     assert np.all(chroma.signal < 0.05 * luma.signal)
 
 
@@ -93,7 +109,7 @@ def test_a_grey_picture_has_no_colour_noise() -> None:
 )
 def test_a_picture_that_says_nothing_gives_finite_numbers(picture: NDArray[np.uint8]) -> None:
     """Where nothing can be measured all figures are finite and positive."""
-    for statistics in measure_picture(picture, _field()):
+    for statistics in measure_picture(picture, _field(), STRAIGHT):
         for values in (statistics.signal, statistics.noise, statistics.noise_to_signal):
             assert np.isfinite(values).all()
             assert (values > 0).all()
@@ -103,7 +119,7 @@ def test_a_picture_that_says_nothing_gives_finite_numbers(picture: NDArray[np.ui
 def test_rings_are_spread_over_a_packed_spectrum() -> None:
     """Ring values stand at their frequencies, and fall to nothing at the mean, which needs no regularisation."""
     frequency = (np.arange(24) + 0.5) / 48
-    statistics = PictureStatistics(frequency, np.ones(24), np.ones(24), np.ones(24))
+    statistics = PictureStatistics(frequency, np.ones(24), np.ones(24), np.ones(24), 1.0)
     spread = on_spectrum(statistics, 1 + frequency, 96)
     assert spread[0, 0] == 0
     assert spread[0, 2 * 30] == pytest.approx(1 + 30 / 96, rel=1e-3)
@@ -121,16 +137,16 @@ def test_lamps_are_no_noise() -> None:
     picture = np.repeat(np.clip(np.rint(seen), 0, 255).astype(np.uint8)[..., None], 3, -1)
     clipped = (picture[..., 0] >= 254).astype(np.uint8)
     assert 0.01 < clipped.mean() < 0.02
-    known, _ = measure_picture(picture, field, clipped)
+    known, _ = measure_picture(picture, field, STRAIGHT, clipped)
     assert known.noise_levels == pytest.approx(2.0, rel=0.15)
-    taken, _ = measure_picture(picture, field)
+    taken, _ = measure_picture(picture, field, STRAIGHT)
     assert taken.noise_levels > 6.0
 
 
 def test_a_picture_clipped_all_over_gives_finite_statistics() -> None:
     """White from edge to edge: nothing to measure, and no division by nothing."""
     white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    luma, chroma = measure_picture(white, _field(), np.ones((HEIGHT, WIDTH), np.uint8))
+    luma, chroma = measure_picture(white, _field(), STRAIGHT, np.ones((HEIGHT, WIDTH), np.uint8))
     for found in (luma, chroma):
         assert np.isfinite(found.noise_levels)
         assert np.isfinite(found.expected_gain_db)

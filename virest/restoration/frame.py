@@ -285,7 +285,7 @@ def _deblurred(
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
-    luma, chroma = _measured(picture, samples, clipped_anywhere(picture, curve))
+    luma, chroma = _measured(picture, samples, curve)
     share = 1.0 if anchor != 0.5 else _trusted_share(luma)
     why_not = _too_little_to_gain(luma)
     if why_not:
@@ -318,13 +318,15 @@ def _deblurred(
 
 
 def _measured(
-    picture: NDArray[np.uint8], field: KernelField, clipped: NDArray[np.uint8] | None
+    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Statistics of luma and chroma. Noise shows where the paths cancel; a Gaussian, the same all round, hides it.
 
     So the paths alone are fitted, which measures the noise and the defocused picture, and that is focused afterwards.
     """
-    luma, chroma = measure_picture(picture, replace(field, defocus_sigma_px=0.0), clipped)
+    luma, chroma = measure_picture(
+        picture, replace(field, defocus_sigma_px=0.0), curve, clipped_anywhere(picture, curve)
+    )
     return _focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px)
 
 

@@ -6,20 +6,26 @@ picture.  So |G|² = |K|² S + N, fitted over the tiles in rings of equal freque
 is no constant, and a predicted blur that the picture does not show comes out as noise and is left alone.
 
 Grey levels throughout; a white noise of standard deviation σ has N = σ².
+
+Blur adds up light, and a steep curve gives the grey levels of a blurred edge frequencies that no light had: where the
+kernels cancel, they would pass for noise.  So its standard deviation, which weighs the data against the prior, is
+measured in light, brought to grey levels by the curve's slope at each tile's mean.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import KernelField
 
 Array = NDArray[np.float64]
+LUMA_RED, LUMA_BLUE = 0.299, 0.114
 RINGS = 24
 _SIDE = 128
 _WINDOW = np.outer(np.hanning(_SIDE + 2)[1:-1], np.hanning(_SIDE + 2)[1:-1]).astype(np.float32)
@@ -62,6 +68,8 @@ class PictureStatistics:
     """(RINGS,) power of the noise."""
     passed: Array
     """(RINGS,) mean |K|² of the kernels."""
+    noise_levels: float
+    """One standard deviation of the noise: at the frequencies where signal and noise are about equal."""
     measured: bool = True
     """False where the picture told nothing, and the values stand in for it."""
 
@@ -69,13 +77,6 @@ class PictureStatistics:
     def noise_to_signal(self) -> Array:
         """(RINGS,) N / S."""
         return self.noise / self.signal
-
-    @property
-    def noise_levels(self) -> float:
-        """One standard deviation of the noise: at the frequencies where signal and noise are about equal."""
-        through = self.passed * self.signal
-        weight = self.frequency * through * self.noise / (through + self.noise) ** 2
-        return float(np.sqrt(np.sum(weight * self.noise) / np.sum(weight)))
 
     @property
     def gradient_scale(self) -> float:
@@ -98,7 +99,7 @@ class PictureStatistics:
 
 
 def measure_picture(
-    picture: NDArray[np.uint8], field: KernelField, clipped: NDArray[np.uint8] | None = None
+    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve, clipped: NDArray[np.uint8] | None = None
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
@@ -118,8 +119,22 @@ def measure_picture(
         tiles = zip(chosen[::every], known[::every], strict=True)
         return np.stack([_windowed_power(_cut(plane, corners[i]), seen) for i, seen in tiles])
 
+    tiles = zip(chosen, known, strict=True)
+    light = np.stack([_windowed_power(_evenly_steep(_cut(picture, corners[i]), curve), seen) for i, seen in tiles])
     colour = (observed(red, 2) + observed(blue, 2)) * np.float32(0.5)
-    return _fit_rings(observed(luma, 1), passed, white_noise(luma)), _fit_rings(colour, passed[::2], white_noise(red))
+    noise_levels = _fit_rings(light, passed, white_noise(luma)).noise_levels
+    return (
+        replace(_fit_rings(observed(luma, 1), passed, white_noise(luma)), noise_levels=noise_levels),
+        _fit_rings(colour, passed[::2], white_noise(red)),
+    )
+
+
+def _evenly_steep(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
+    """Light of a tile (height, width, 3) as grey levels (height, width) of the straight curve through its mean."""
+    weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
+    light = cv2.transform(cv2.LUT(tile, curve.linear_table()), weights)
+    mean_level = 255 * float(curve.encode(np.array(light.mean())))
+    return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
 
 
 def _least_clipped(clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]]) -> NDArray[np.intp]:
@@ -173,7 +188,9 @@ def _cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]
     return plane[corner[0] : corner[0] + _SIDE, corner[1] : corner[1] + _SIDE]
 
 
-def _windowed_power(tile: NDArray[np.uint8], known: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+def _windowed_power(
+    tile: NDArray[np.uint8] | NDArray[np.float32], known: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
     """Power of a tile less its mean under a Hann window; white noise of variance σ² gives σ² everywhere.
 
     What is not known (0 in ``known``) is filled in smoothly and adds no power.
@@ -274,7 +291,13 @@ def _settled(
     signal = np.where(determined, signal, through)
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
     signal = _as_detail_falls(frequency, signal, passed, noise)
-    return PictureStatistics(frequency, signal, noise, passed)
+    return PictureStatistics(frequency, signal, noise, passed, _standard_deviation(frequency, passed * signal, noise))
+
+
+def _standard_deviation(frequency: Array, through: Array, noise: Array) -> float:
+    """That of the noise, weighted to where about as much of the signal comes through the blur."""
+    weight = frequency * through * noise / (through + noise) ** 2
+    return float(np.sqrt(np.sum(weight * noise) / np.sum(weight)))
 
 
 def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.bool_]) -> Array:
@@ -312,7 +335,7 @@ def falling_power(frequency: Array, signal: Array, ring: int) -> Array:
 def _unknown_picture() -> PictureStatistics:
     """Nothing could be measured: the picture is smaller than a tile, or the blur larger."""
     frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
-    return PictureStatistics(frequency, np.ones(RINGS), np.ones(RINGS), np.ones(RINGS), False)
+    return PictureStatistics(frequency, np.ones(RINGS), np.ones(RINGS), np.ones(RINGS), 1.0, False)
 
 
 @lru_cache(maxsize=8)
