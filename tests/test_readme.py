@@ -7,6 +7,7 @@ from typing import Any
 import typer
 from pydantic import BaseModel
 
+from virest.app.bench import __main__ as bench
 from virest.app.cli import app
 from virest.app.settings import settings_model
 from virest.camera import profile
@@ -66,8 +67,9 @@ def test_every_command_in_the_readme_exists() -> None:
 
 
 def test_every_option_in_the_readme_exists() -> None:
-    """An option that the README names anywhere belongs to some command."""
+    """An option that the README names anywhere belongs to some command, or to the bench."""
     known = set.union(*(options_of(command) for command in COMMANDS.values())) | OTHER_TOOLS | {"--help", "--version"}
+    known |= set(re.findall(r'add_argument\(\s*"(--[a-z-]+)"', Path(bench.__file__).read_text(encoding="utf-8")))
     assert not set(re.findall(r"`(--[a-z][a-z-]*)", TEXT)) - known
 
 
