@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -37,6 +38,7 @@ def _field_type(name: str, kind: Any) -> Any:
     return kind
 
 
+@lru_cache(maxsize=1)
 def settings_model() -> type[BaseModel]:
     """The file's form: one optional key for each field of RestorationSettings, and the form's version."""
     hints = get_type_hints(RestorationSettings)

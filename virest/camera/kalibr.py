@@ -7,6 +7,7 @@ written; ``line_delay_nanoseconds`` of its rolling-shutter calibration is the re
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,7 +72,8 @@ def parse_camchain(content: dict[str, Any], name: str = "camchain", which: str =
     if not isinstance(camera, dict):
         raise SettingsError(f"{name}: {which} has no keys", hint="is it a Kalibr camchain?")
     if camera.get("camera_model", "pinhole") != "pinhole":
-        raise SettingsError(f"{name}: camera_model '{camera['camera_model']}'", hint="only pinhole can be read")
+        said = str(camera["camera_model"])[:40]
+        raise SettingsError(f"{name}: camera_model {said!r}", hint="only pinhole can be read")
     width, height = _numbers(camera, "resolution", 2, name)
     fx, fy, cx, cy = _numbers(camera, "intrinsics", 4, name)
     line_delay_ns = camera.get("line_delay_nanoseconds")
@@ -120,8 +122,9 @@ def parse_imu(content: dict[str, Any], name: str = "imu.yaml") -> ImuNoise:
 
 def _distortion(camera: dict[str, Any], name: str) -> dict[str, Any]:
     kind = camera.get("distortion_model", "none")
-    if kind not in _DISTORTIONS:
-        raise SettingsError(f"{name}: distortion_model '{kind}'", hint=f"one of {', '.join(_DISTORTIONS)} can be read")
+    if not isinstance(kind, str) or kind not in _DISTORTIONS:
+        known = ", ".join(_DISTORTIONS)
+        raise SettingsError(f"{name}: distortion_model {str(kind)[:40]!r}", hint=f"one of {known} can be read")
     model, names = _DISTORTIONS[kind]
     values = _numbers(camera, "distortion_coeffs", len(names), name) if names else []
     return {"model": model, **dict(zip(names, values, strict=True))}
@@ -129,10 +132,13 @@ def _distortion(camera: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _numbers(camera: dict[str, Any], key: str, count: int, name: str) -> list[float]:
     values = camera.get(key)
-    usable = isinstance(values, list) and len(values) == count and all(isinstance(v, int | float) for v in values)
-    if not usable:
+    if not isinstance(values, list) or len(values) != count or not all(map(_is_finite, values)):
         raise SettingsError(f"{name}: cam0.{key} must be {count} numbers", hint="is it a Kalibr camchain?")
-    return [float(v) for v in values]  # type: ignore[union-attr]
+    return [float(v) for v in values]
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _positive(block: dict[str, Any], key: str, name: str) -> float | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,6 +26,9 @@ from virest.errors import SettingsError
 MAX_PROFILE_BYTES = 1_000_000
 MAX_SIDE_PX = 20_000
 MAX_DEPTH = 20
+MAX_DIGITS = 250
+"""No number of so many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
+NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
 ANDROID_R_CAM_IMU = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """Stored portrait picture of an Android phone's rear camera against the device axes."""
 
@@ -121,7 +125,7 @@ def _number(value: Any) -> Any:
         try:
             value = float(value)
         except ValueError:
-            raise ValueError(f"'{value[:40]}' is no number") from None
+            raise ValueError("is no number") from None
     if isinstance(value, int) and abs(value) > 10**15:
         raise ValueError("is too large")
     return value
@@ -193,11 +197,10 @@ class _Imu(_Strict):
         if len(self.T_cam_imu) not in (3, 4) or any(len(row) != 4 for row in self.T_cam_imu):
             raise ValueError("T_cam_imu must be 4 rows of 4 numbers")
         rotation = np.array(self.T_cam_imu)[:3, :3]
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if error > 1e-2 or np.linalg.det(rotation) < 0:
-            raise ValueError(
-                f"T_cam_imu is no rotation: R Rᵀ is off by {error:.2g}, determinant {np.linalg.det(rotation):.2f}"
-            )
+        with np.errstate(over="ignore", invalid="ignore"):  # rows so long that their products are no numbers
+            error, determinant = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation)
+        if not error <= 1e-2 or determinant < 0:
+            raise ValueError(f"T_cam_imu is no rotation: R Rᵀ is off by {error:.2g}, determinant {determinant:.3g}")
         if len(self.T_cam_imu) == 4 and self.T_cam_imu[3] != [0, 0, 0, 1]:
             raise ValueError("the last row of T_cam_imu must be 0, 0, 0, 1")
         return self
@@ -306,8 +309,11 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
         raise SettingsError(
             f"{path.name}:{where} is not plain YAML: {problem}", hint="see the profile in README"
         ) from None
-    except (UnicodeDecodeError, RecursionError, ValueError):
+    except (UnicodeDecodeError, RecursionError):
         raise SettingsError(f"{path.name}: is not YAML text", hint="is it a profile?") from None
+    except (ValueError, LookupError, AttributeError, OverflowError):  # of the library, for dates and tagged values
+        text = f"{path.name}: a value is not of the kind that it is written as, such as a date that is none"
+        raise SettingsError(text, hint="write plain numbers and words, see the profile in README") from None
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}", hint="check the path and its permissions") from None
     if not isinstance(content, dict):
@@ -316,11 +322,14 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
 
 
 def _require_plain(text: str, name: str) -> None:
-    """Refuse aliases and deep nesting before anything is built of them."""
+    """Refuse aliases, deep nesting and endless numbers before anything is built of them."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
             raise SettingsError(f"{name}: YAML aliases are not accepted", hint="write the values out")
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_DIGITS and NUMERIC.fullmatch(event.value):
+            shown = f"{event.value[:20]}…"
+            raise SettingsError(f"{name}: {shown} has {len(event.value)} digits", hint=f"at most {MAX_DIGITS} are read")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
             raise SettingsError(f"{name}: nested more than {MAX_DEPTH} deep", hint="is it a profile?")
@@ -341,9 +350,7 @@ def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfi
 def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
     """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
     first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
-    path = [
-        str(part) for part in first["loc"] if not str(part).startswith(("_", "literal", "function-", "constrained"))
-    ]
+    path = _key_path(first)
     where = _printable(".".join(path))
     if first["type"] == "extra_forbidden":
         known = _keys_at(model, path[:-1])
@@ -351,8 +358,17 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
         hint = f"did you mean '{near}'?" if near else f"known keys: {', '.join(known)}"
         return SettingsError(f"{name}: unknown key '{where[:80]}', {hint}")
     value = "" if isinstance(first.get("input"), dict) else f", got {str(first.get('input'))[:60]!r}"
-    message = first["msg"].removeprefix("Value error, ").split(" or instance of")[0]
+    message = _printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
     return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see the profile in README")
+
+
+def _key_path(fault: Any) -> list[str]:
+    """Where a fault of pydantic lies: its keys, without the names of the forms that pydantic tried between them."""
+    *above, last = map(str, fault["loc"] or ("",))
+    forms = ("_", "literal", "function-", "constrained")
+    is_key = last and not last.startswith(forms)
+    keys = [part for part in above if not part.startswith(forms)]
+    return [*keys, last] if is_key or fault["type"] == "extra_forbidden" else keys  # an unknown key has any name
 
 
 def _printable(text: str) -> str:

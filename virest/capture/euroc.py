@@ -261,7 +261,7 @@ def _shown(values: Any) -> str:
 def _number(value: Any, name: str) -> float:
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise CaptureError(f"{name}: {str(value)[:40]!r} is no number", hint="repair it") from None
 
 
@@ -272,10 +272,12 @@ def _pose(block: Any, name: str) -> Array | None:
     values = block.get("data") if isinstance(block, dict) else block
     try:
         matrix = np.array(values, float).reshape(4, 4)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.full((4, 4), np.nan)
     rotation = matrix[:3, :3]
-    if not np.isfinite(matrix).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2:
+    with np.errstate(over="ignore", invalid="ignore"):  # rows so long that their products are no numbers
+        is_rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-2
+    if not (is_rigid and np.isfinite(matrix).all() and np.allclose(matrix[3], (0, 0, 0, 1))):
         raise CaptureError(f"{name}: T_BS is no rigid motion of 4x4 numbers", hint="repair it")
     return matrix
 

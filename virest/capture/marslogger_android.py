@@ -123,7 +123,7 @@ def _split_rows(
     whole = text.str.fullmatch(INTEGER).to_numpy()
     damaged = text.str.fullmatch(DAMAGED_TIME).to_numpy() | text.str.contains("\t", regex=False).to_numpy()
     if damaged.any():
-        shown = text[damaged].iloc[0][:40].replace("\t", "<tab>")
+        shown = "<tab>".join(" ".join(part.split()) for part in text[damaged].iloc[0][:40].split("\t"))
         raise ClockError(f"{label(path)}: time '{shown}' is no whole number of nanoseconds", hint=EXCEL_HINT)
     enough = (chunk[min_fields - 1] != "").to_numpy()
     times = np.zeros(len(chunk), np.int64)
@@ -151,8 +151,8 @@ def read_gyro_accel(path: Path) -> GyroTable:
     """
     scan = scan_text(path, ImuError, "a capture needs its gyro_accel.csv")
     _require_kind(scan, path, GYRO, ImuError)
-    header = next(line for line in scan.head.splitlines() if "gx[rad/s]" in line.lower().replace(" ", ""))
-    columns = normalised_columns(header)
+    lines = map(normalised_columns, scan.head.splitlines())
+    columns = next((names for names in lines if any("gx[rad/s]" in name for name in names)), ("",))
     _check_gyro_header(columns, path)
     dropped: Counter[str] = Counter()
     times: list[Int64] = [np.zeros(0, np.int64)]

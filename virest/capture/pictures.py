@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from virest.capture.files import label, require_regular_file, scan_text
 from virest.capture.location import is_remote
 from virest.capture.marslogger_android import STAMPS, read_frame_timestamps
-from virest.capture.tables import INTEGER, Int64, exact_times_ns, keep_rising, text_chunks
+from virest.capture.tables import INTEGER, MAX_FIELDS, Int64, exact_times_ns, keep_rising, text_chunks
 from virest.errors import CaptureError, ClockError, VideoError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
@@ -105,7 +105,7 @@ def _rising(path: Path, time_ns: Int64, names: list[str], rows: int, dropped: Co
 
 
 def _list_rows(path: Path, head: str) -> tuple[Int64, list[str], int, Counter[str]] | None:
-    """(times, names, rows, dropped) of a list; None where its rows have no names."""
+    """(times, names, rows, dropped) of a list; None where its rows have no names. Raises VideoError, ClockError."""
     lines = [line.strip() for line in head.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     separator = "," if any("," in line for line in lines[:2]) else r"\s+"
     row = next((re.split(separator, line) for line in lines if re.match(r"[+-]?\d", line)), [])
@@ -113,6 +113,9 @@ def _list_rows(path: Path, head: str) -> tuple[Int64, list[str], int, Counter[st
     column = next((i for i, field in enumerate(fields) if field.endswith(SUFFIXES)), None)
     if column is None:
         return None
+    if column >= MAX_FIELDS:
+        text = f"{label(path)}: the picture's name is field {column + 1} of its row, at most {MAX_FIELDS} are read"
+        raise VideoError(text, hint="write a line time,name for each picture")
     clock = 1 if column == 0 else 0
     dropped: Counter[str] = Counter()
     times: list[Int64] = [np.zeros(0, np.int64)]
@@ -165,7 +168,7 @@ def _pictures(folder: Path) -> list[str]:
 
 
 def _natural(name: str) -> list[Any]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def _place(base: Path, names: list[str]) -> str:

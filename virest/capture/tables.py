@@ -127,7 +127,9 @@ def text_chunks(path: Path, separator: str = ",", fields: int = MAX_FIELDS) -> I
         except pd.errors.EmptyDataError:
             return
         except (pd.errors.ParserError, OSError) as fault:
-            raise CaptureError(f"{label(path)}: {fault}", hint="copy the logger's file again") from None
+            raise CaptureError(
+                f"{label(path)}: {' '.join(str(fault).split())}", hint="copy the logger's file again"
+            ) from None
 
 
 def numbers(column: Any) -> Float64:

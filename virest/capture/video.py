@@ -11,6 +11,7 @@ software encoders put it whatever they tag; at the price of half a pixel of chro
 from __future__ import annotations
 
 import ctypes
+import errno
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -161,6 +162,8 @@ class GrayReader:
 
 
 def _reason(fault: Exception) -> str:
+    if getattr(fault, "errno", None) == errno.ENOMEM:
+        return "a piece of it claims a size that cannot be"  # FFmpeg has not asked for it, see _bound_memory
     return (getattr(fault, "strerror", None) or str(fault)).lower()
 
 
