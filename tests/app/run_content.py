@@ -18,10 +18,12 @@ def content(run: Path) -> dict[str, Any]:
 
 
 def without_clocks(files: dict[str, bytes], *elsewhere: str) -> dict[str, Any]:
-    """Files of a run without seconds, command, and the named keys of run.json."""
+    """Files of a run without seconds, command, and the named keys of run.json; with such keys, without paths too."""
     found: dict[str, Any] = dict(files)
     lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
     found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
     account = json.loads(found["run.json"])
+    if elsewhere:
+        account["inputs"] = [{k: v for k, v in facts.items() if k != "path"} for facts in account["inputs"]]
     found["run.json"] = {k: v for k, v in account.items() if k not in (*CLOCKS, *elsewhere)}
     return found

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -203,15 +204,22 @@ def test_frames_is_a_python_slice(virest: Virest, tiny: Path, tmp_path: Path, fr
 
 
 def refuse(virest: Virest, tiny: Path, code: int, *says: str) -> None:
-    """Process the damaged capture: refused in one line, and nothing is written."""
+    """Process the damaged capture: refused in one line, which run.json repeats; nothing else is written."""
     result = virest("process", tiny, "--out", tiny.parent / "out", *FAST)
     assert_refused(result, code, *says)
-    assert below(tiny.parent / "out") == set()
+    assert below(tiny.parent / "out") == {"tiny", "tiny/run.json", "tiny/parameters.jsonl"}
+    account = json.loads((tiny.parent / "out/tiny/run.json").read_text())
+    assert (account["status"], account["exit_code"], sum(account["counts"].values())) == ("failed", code, 0)
+    for text in says:
+        assert text in "; ".join(account["failure"].values())
+    assert account["source"]["resolved"] == os.path.realpath(tiny)
 
 
 def test_a_path_that_does_not_exist(virest: Virest, tmp_path: Path) -> None:
-    """Exit 4, and the path is named."""
-    refuse(virest, tmp_path / "tiny", 4, "no such folder")
+    """Exit 4, and the path is named; a slip of the pen leaves nothing behind."""
+    result = virest("process", tmp_path / "tiny", "--out", tmp_path / "out", *FAST)
+    assert_refused(result, 4, "no such folder")
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_empty_folder(virest: Virest, tmp_path: Path) -> None:
@@ -381,12 +389,53 @@ def test_two_captures_of_one_name_are_refused_before_any_work(virest: Virest, ti
     assert not (tiny.parent / "virest-out").exists()
 
 
-def test_a_batch_with_a_failure_does_the_rest_and_exits_9(virest: Virest, tiny: Path) -> None:
-    """The failure has its line; the other capture its row."""
-    result = virest("process", tiny.parent / "none", tiny, *FAST, "--frames", "0:1", cwd=tiny.parent)
+def accounts(out: Path) -> dict[str, dict[str, Any]]:
+    """Every run.json of an output folder, by capture."""
+    return {path.parent.name: json.loads(path.read_text()) for path in out.glob("*/run.json")}
+
+
+def test_a_batch_with_failures_does_the_rest_and_exits_9(virest: Virest, tiny: Path) -> None:
+    """A failure has its line and its run.json, the other capture its row; --resume tries again what failed."""
+    arguments = ("process", "./tiny", "none", "odd", *FAST, "--frames", "0:1")
+    shutil.copytree(tiny, tiny.parent / "odd")
+    (tiny.parent / "odd/gyro_accel.csv").write_bytes(b"")
+    result = virest(*arguments, cwd=tiny.parent)
     assert result.returncode == 9
-    assert len([line for line in result.stderr.splitlines() if line.startswith("virest: error: ")]) == 1
+    assert len([line for line in result.stderr.splitlines() if line.startswith("virest: error: ")]) == 2
     assert [line.split()[0] for line in result.stdout.splitlines()] == ["capture", "tiny"]
+    found = accounts(tiny.parent / "virest-out")
+    assert {name: (a["status"], a["exit_code"]) for name, a in found.items()} == {
+        "tiny": ("done", 0), "none": ("failed", 4), "odd": ("failed", 4)
+    }  # fmt: skip
+    assert found["tiny"]["source"] == {"given": "./tiny", "resolved": os.path.realpath(tiny)}
+    assert {f["path"] for f in found["tiny"]["inputs"]} >= {os.path.realpath(tiny / "movie.mp4")}
+    assert {f["file"]: f["bytes"] for f in found["odd"]["inputs"]}["gyro_accel.csv"] == 0
+    for source in ("gyro_accel.csv", "camera.yaml"):
+        shutil.copy(tiny / source, tiny.parent / "odd")
+    again = virest(*arguments, "--resume", cwd=tiny.parent)
+    assert again.returncode == 9, again.stderr
+    assert {n: a["status"] for n, a in accounts(tiny.parent / "virest-out").items()} == {
+        "tiny": "done", "none": "failed", "odd": "done"
+    }  # fmt: skip
+    assert not [name for name in below(tiny.parent / "virest-out") if ".run" in name.split("/") or ".part" in name]
+
+
+@pytest.mark.scenario
+def test_a_batch_says_and_writes_the_same_for_any_number_of_jobs(virest: Virest, tiny: Path) -> None:
+    """Captures are planned by the workers, several at once; lines come in the order of the captures, bytes stay."""
+    names = ["tiny", "b", "c", "d"]
+    for name in names[1:]:
+        shutil.copytree(tiny, tiny.parent / name)
+    (tiny.parent / "b/movie.mp4").write_bytes(b"")
+    (tiny.parent / "d/camera.yaml").unlink()
+    said = {}
+    for jobs in (1, 2):
+        result = virest("process", *names, "--out", f"out{jobs}", *FAST[:2], "--jobs", jobs, cwd=tiny.parent)
+        assert result.returncode == 9, result.stderr
+        said[jobs] = result.stderr
+    assert said[1] == said[2]
+    for name in names:
+        assert content(tiny.parent / "out1" / name) == content(tiny.parent / "out2" / name)
 
 
 def test_an_undecodable_frame_fails_alone(virest: Virest, tiny: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from virest.app import jobs
-from virest.app.jobs import Segment, Workers, cut_frames, cut_imu, run_segment, run_segments
+from virest.app.jobs import Ahead, Segment, Workers, cut_frames, cut_imu, run_segment, run_segments
 from virest.app.outputs import RunFolder
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
@@ -283,3 +283,31 @@ def test_a_worker_that_dies_takes_only_its_own_segment(segment: Segment, monkeyp
     assert done == {i: {"failed": 1} for i in range(5)}
     reasons = [json.loads(part.log_path.read_text())["warnings"][0] for part in parts]
     assert ["died" in reason for reason in reasons] == [False, False, True, False, False]
+
+
+# ── calls ahead of their turn ────────────────────────────────────────────────────────────────────────────────────
+
+
+def _square_or_die(number: int) -> int:
+    if number == 2:
+        os._exit(1)
+    if number == 3:
+        raise VideoError("movie.mp4: is empty")
+    return number**2
+
+
+@pytest.mark.scenario
+def test_a_call_that_kills_its_worker_fails_alone() -> None:
+    """Its neighbours' results come all the same, in order; an error is raised when its turn comes."""
+    workers = Workers(2)
+    ahead = Ahead(_square_or_die, [(number,) for number in range(6)], workers)
+    results: list[Any] = []
+    try:
+        for number in range(6):
+            try:
+                results.append(ahead.result(number, "trip"))
+            except (RestorationError, VideoError) as error:
+                results.append(type(error))
+    finally:
+        workers.kill()
+    assert results == [0, 1, RestorationError, VideoError, *(number**2 for number in range(4, 6))]

@@ -20,6 +20,7 @@ from virest.app.outputs import (
     json_line,
     opened_run,
     plain,
+    write_failure,
     write_picture,
     write_whole,
 )
@@ -183,6 +184,53 @@ def test_resume_with_another_request_is_refused_and_says_what_differs(tmp_path: 
     with pytest.raises(OutputError, match="--resume") as caught:
         check_run(run, {**REQUEST, **change}, "resume")
     assert says in str(caught.value)
+
+
+FAILURE = {"virest_run": 1, "profile_sha256": None, "failure": {"error": "ImuError", "reason": "empty", "hint": ""}}
+
+
+@pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
+def test_the_account_of_a_failure_is_no_obstacle(tmp_path: Path, mode: str) -> None:
+    """It says why, is replaced by that of a later failure, and goes when a run begins."""
+    run = RunFolder(tmp_path / "out/trip")
+    for reason in ("empty", "of another session"):
+        assert write_failure(run, {**FAILURE, "failure": {"reason": reason}})
+        assert names(run.path) == {"run.json", "parameters.jsonl"}
+        assert json.loads(run.run_json.read_bytes())["failure"]["reason"] == reason
+    with opened_run(run, REQUEST, mode) as found:  # type: ignore[arg-type]
+        assert found == "nothing"
+        assert names(run.path) == {".run", ".lock", "frames", ".segments"}
+    with pytest.raises(RuntimeError), opened_run(run, REQUEST, "overwrite"):
+        raise RuntimeError
+    assert not run.path.exists() or not names(run.path)
+
+
+def test_the_account_of_a_failure_spares_whatever_stands_there(tmp_path: Path) -> None:
+    """A run, finished or not, and what is none of ours; a folder that cannot be made is an OutputError."""
+    run = RunFolder(tmp_path / "trip")
+    finish(run)
+    before = {name: (run.path / name).read_bytes() for name in names(run.path) if (run.path / name).is_file()}
+    assert not write_failure(run, FAILURE)
+    (run.path / ".run").write_bytes((run.path / "run.json").read_bytes())
+    (run.path / "run.json").unlink()
+    assert not write_failure(run, FAILURE)
+    assert not run.run_json.exists()
+    assert run.parameters.read_bytes() == before["parameters.jsonl"]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("mine")
+    for place in ("mine", "mine/notes.txt", "mine/notes.txt/deeper"):
+        with pytest.raises(OutputError):
+            write_failure(RunFolder(tmp_path / place), FAILURE)
+    assert names(tmp_path / "mine") == {"notes.txt"}
+
+
+def test_a_capture_that_was_moved_is_continued(tmp_path: Path) -> None:
+    """Where the inputs lay is told, but what counts is what they hold."""
+    run = RunFolder(tmp_path / "trip")
+    moved = {**REQUEST, "inputs": [{**REQUEST["inputs"][0], "path": "/old/movie.mp4"}]}  # type: ignore[dict-item]
+    with opened_run(run, REQUEST, "new"):
+        outputs.finish_run(run, [], moved)
+    assert check_run(run, REQUEST, "resume") == "finished"
 
 
 def test_overwrite_removes_what_a_run_made_and_nothing_else(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from virest.errors import OutputError, SettingsError, VideoError
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 FAST = ("--preset", "fast", "--jobs", 1)
-ELSEWHERE = ("folder", "movie", "profile_source")
+ELSEWHERE = ("folder", "movie", "profile_source", "source")
 """Keys of run.json that name a place."""
 REQUEST = {"version": "1", "settings": {}, "frames": "0:1:1", "profile_sha256": "ab", "inputs": []}
 

@@ -132,7 +132,7 @@ def _read_account(run: RunFolder, capture: Capture) -> Json:
         account = json.loads(run.run_json.read_bytes())
     except (OSError, ValueError):
         account = None
-    if not isinstance(account, dict) or not isinstance(account.get("profile"), dict):
+    if not isinstance(account, dict) or not isinstance(account.get("profile"), dict) or account.get("failure"):
         raise CaptureError(f"{run.path}: holds no finished run", hint="pass OUT/<capture> of virest process")
     if account.get("capture") != capture.name:
         text = f"{run.path}: is a run of {str(account.get('capture'))[:60]!r}, not of {capture.name!r}"

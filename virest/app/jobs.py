@@ -12,7 +12,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from itertools import chain, islice
 from multiprocessing.connection import wait as wait_for_handles
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -53,9 +53,12 @@ IMU_MARGIN_S = 1.0
 KEEP_MEMORY_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
 KEPT_BYTES = str(256 * 2**20)
 """glibc hands pictures back to the system and fetches them anew, page by page, unless told to keep them."""
+MOST_AHEAD = 8
+"""Calls begun before their results are wanted: enough to keep many workers in work, few enough to keep memory flat."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 Picture = NDArray[np.uint8]
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +117,8 @@ def make_segment(
     frames: tuple[Frame, ...], capture: Capture, name: str, index: MovieIndex, plan: RestorationPlan, run: RunFolder
 ) -> Segment:
     """One segment as a worker takes it."""
-    place = RunFolder(run.path.absolute())  # a worker may stand in another folder
-    return Segment(name, capture.movie, index, frames, cut_imu(capture.imu, frames, plan), plan.of(frames), place)
+    place, movie = RunFolder(run.path.absolute()), capture.movie.absolute()  # a worker may stand in another folder
+    return Segment(name, movie, index, frames, cut_imu(capture.imu, frames, plan), plan.of(frames), place)
 
 
 # ── the work on one segment ──────────────────────────────────────────────────────────────────────────────────────
@@ -279,7 +282,7 @@ def prepare_worker() -> None:
         _prepared.append(os.getpid())
 
 
-def _start_worker(verbose: bool) -> None:
+def start_worker(verbose: bool) -> None:
     """Set up a worker process: no Ctrl-C of its own (the parent decides), and no life after the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -323,7 +326,7 @@ class Workers:
         """Segments in flight at once: enough to keep every worker busy, few enough to keep memory flat."""
         if isinstance(self._executor, ClusterExecutor):
             return self._executor.slots
-        return 1 if self.jobs == 1 and self.scheduler is None else self.jobs + 1
+        return 1 if self.here else self.jobs + 1
 
     def start(self, *places: Path) -> None:
         """Have workers at hand that see these places. Raises SettingsError where a cluster's do not."""
@@ -334,15 +337,29 @@ class Workers:
 
     def submit(self, segment: Segment) -> Future[dict[str, int]]:
         """Hand a segment to the executor."""
+        return self.call(run_segment, segment)
+
+    def call(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """Have a function called by a worker."""
         if self._executor is None:
             self._executor = self._start()
         if not isinstance(self._executor, ProcessPoolExecutor):
-            return self._executor.submit(run_segment, segment)
+            return self._executor.submit(function, *arguments)
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
         try:
-            return self._executor.submit(run_segment, segment)
+            return self._executor.submit(function, *arguments)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+    @property
+    def here(self) -> bool:
+        """Whether this process is the only worker."""
+        return self.jobs == 1 and self.scheduler is None
+
+    @property
+    def started(self) -> Executor | None:
+        """The executor at hand, another one after a restart: then what was given to the last one is lost."""
+        return self._executor
 
     def _start(self) -> Executor:
         if self.scheduler is not None:
@@ -354,7 +371,7 @@ class Workers:
         for variable in KEEP_MEMORY_VARIABLES:
             os.environ.setdefault(variable, KEPT_BYTES)
         context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.jobs, context, initializer=_start_worker, initargs=(self.verbose,))
+        return ProcessPoolExecutor(self.jobs, context, initializer=start_worker, initargs=(self.verbose,))
 
     def check(self) -> None:
         """Look whether anybody is still at work; called while nothing comes back. Raises RestorationError."""
@@ -425,8 +442,12 @@ def _fill(
 
 
 def _await_some(running: Running, workers: Workers) -> set[Future[dict[str, int]]]:
+    return _await_first(running, workers)
+
+
+def _await_first(futures: Iterable[Future[Result]], workers: Workers) -> set[Future[Result]]:
     while True:
-        done = wait(running, timeout=LOOK_S, return_when=FIRST_COMPLETED).done
+        done = wait(futures, timeout=LOOK_S, return_when=FIRST_COMPLETED).done
         if done:
             return done
         workers.check()
@@ -445,7 +466,7 @@ def _collect(future: Future[dict[str, int]], segment: Segment, workers: Workers)
     except Exception as error:  # explained in the frames' lines; the other segments go on
         if is_unreachable(error):
             raise
-        if type(error).__name__ == "KilledWorker":
+        if _is_killed(error):
             return None
         log.debug("segment %s", segment.log_path.stem, exc_info=True)
         return fail_segment(segment, _reason(error))
@@ -470,3 +491,76 @@ def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator
             fail_segment(segment, "the worker process died twice on this segment") if counts is None else counts,
         )
     workers.renew()
+
+
+def _is_killed(error: Exception) -> bool:
+    """Whether an error says that a call's workers died: a pool's, or Dask's once it gives a call up."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+
+
+class Ahead(Generic[Result]):
+    """Calls whose results are wanted one after the other; workers begin some of them before it is their turn.
+
+    A call that was lost with its worker is tried once more, alone; lost again, it raises RestorationError.
+    """
+
+    def __init__(self, function: Callable[..., Result], calls: Sequence[tuple[Any, ...]], workers: Workers) -> None:
+        self._function = function
+        self._calls = calls
+        self._workers = workers
+        self._begun: dict[int, tuple[Future[Result], Executor | None]] = {}
+
+    def result(self, number: int, name: str) -> Result:
+        """The result of a call, or what it raised; ``name`` is for the log."""
+        if number not in self._begun or self._begun[number][1] is not self._workers.started:
+            self._begun.pop(number, None)
+            self.begin(number)
+        future = self._taken(number)
+        if future is not None:
+            try:
+                return self._awaited(future)
+            except Exception as error:
+                if not _is_killed(error):
+                    raise
+        log.warning("%s: a worker died while this capture or a neighbour was planned; trying again", name)
+        return self._alone(number)
+
+    def begin(self, number: int) -> None:
+        """Have the call and some after it begun: best done where workers will soon have nothing else to do.
+
+        One that was lost waits for its turn: it may be the one that kills its worker.
+        """
+        last = number + min(self._workers.slots, MOST_AHEAD)
+        for following in range(number, min(last, len(self._calls))):
+            if following in self._begun:
+                continue
+            try:
+                future = self._workers.call(self._function, *self._calls[following])
+            except BrokenExecutor:
+                return
+            self._begun[following] = (future, self._workers.started)
+
+    def _taken(self, number: int) -> Future[Result] | None:
+        """The call's future; None where the workers that had it are gone."""
+        future, executor = self._begun.pop(number, (None, None))
+        return future if executor is self._workers.started else None
+
+    def _awaited(self, future: Future[Result]) -> Result:
+        _await_first([future], self._workers)
+        try:
+            return future.result()
+        except CancelledError:
+            raise self._workers.lost() from None
+
+    def _alone(self, number: int) -> Result:
+        """The call once more in fresh workers that have nothing else to do."""
+        self._begun.clear()
+        self._workers.renew()
+        try:
+            return self._awaited(self._workers.call(self._function, *self._calls[number]))
+        except Exception as error:
+            if not _is_killed(error):
+                raise
+            self._workers.renew()
+            text = "the worker process died twice while this capture was read and planned"
+            raise RestorationError(text, hint="--resume tries again; fewer --jobs take less memory") from None

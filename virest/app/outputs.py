@@ -2,7 +2,7 @@
 
 A run's folder tells its own state::
 
-    run.json          the run is finished
+    run.json          the run is finished; or its ``failure`` says why there is none: no obstacle for a run
     .run              it is not: the request it was started with; --resume continues it
     .segments/        logs of the finished segments of an unfinished run
     .lock             held (flock) by the process that works here; the system lets go of it when that dies
@@ -139,6 +139,12 @@ def file_facts(path: Path) -> dict[str, Any]:
     return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}
 
 
+def resolved(place: str | os.PathLike[str]) -> str:
+    """Where a path really lies, links followed; an address as it is."""
+    found = locate(place)
+    return str(found) if is_remote(found) else os.path.realpath(found)
+
+
 def capture_name(path: str) -> str:
     """The name of a capture's output folder: the last part of its path, ``.`` and ``..`` resolved.
 
@@ -232,7 +238,7 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
     for file, found in ((run.state, "unfinished"), (run.run_json, "finished")):
         old = _read_request(file)
         if old is not None:
-            return found, old  # type: ignore[return-value]
+            return ("nothing", {}) if _tells_of_failure(old) else (found, old)  # type: ignore[return-value]
     try:
         inside = run.path.iterdir() if run.path.is_dir() else ()
         foreign = [p.name for p in inside if p != run.lock and p.name not in BESIDE and not _is_own_part(p.name)]
@@ -263,11 +269,16 @@ def _read_request(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) and "profile_sha256" in content else None
 
 
+def _tells_of_failure(account: dict[str, Any]) -> bool:
+    """Whether a run.json is that of a capture that could not be processed: there is nothing in it to be kept."""
+    return isinstance(account.get("failure"), dict)
+
+
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Which parts of two requests differ, in words."""
     names = []
     for key in REQUEST_KEYS:
-        before, now = old.get(key), new.get(key)
+        before, now = (_without_places(request.get(key)) for request in (old, new))
         if before == now:
             continue
         if key == "settings" and isinstance(before, dict) and isinstance(now, dict):
@@ -279,6 +290,13 @@ def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
             words = {"profile_sha256": "camera profile", "frames": f"frames ({before}, now {now})"}
             names.append(words.get(key, f"{key} ({before}, now {now})"))
     return names
+
+
+def _without_places(value: Any) -> Any:
+    """Facts of files without their folders: a capture that was moved is still the same one."""
+    if not isinstance(value, list):
+        return value
+    return [{k: v for k, v in facts.items() if k != "path"} if isinstance(facts, dict) else facts for facts in value]
 
 
 def _changed_files(before: Any, now: Any) -> list[str]:
@@ -306,6 +324,8 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
             try:
                 if found != "finished" or mode == "overwrite":
                     _make_ready(run, request, mode)
+                    if found == "nothing":
+                        _remove_failure(run)
                 else:
                     _clear_scaffolding(run)  # a run killed in its last moment leaves some
                 yield found if mode == "resume" else "nothing"
@@ -366,6 +386,16 @@ def _remove_own(run: RunFolder) -> None:
     for folder in (run.path, run.frames):
         own = [file for file in folder.iterdir() if OWN_FILES.fullmatch(file.name) and file != run.state]
         remove_files([file for file in own if is_remote(file) or not file.is_dir()])
+
+
+def _remove_failure(run: RunFolder) -> None:
+    """Take away the account of an attempt that failed; run.json stands for what comes of this one."""
+    try:
+        for file in (run.run_json, run.parameters):
+            if file.exists():
+                file.unlink(missing_ok=True)
+    except OSError as error:
+        raise output_error(run.path, error) from error
 
 
 def _clear_scaffolding(run: RunFolder) -> None:
@@ -450,11 +480,39 @@ def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any]) ->
     """Join the segments' lines in frame order, write run.json last, and take away the scaffolding."""
     try:
         _join(run.parameters, logs)
-        write_whole(run.run_json, (json.dumps(plain(account), allow_nan=False, indent=2) + "\n").encode())
+        _write_account(run, account)
         run.state.unlink(missing_ok=True)
     except OSError as error:
         raise output_error(run.path, error) from error
     _clear_scaffolding(run)
+
+
+def write_failure(run: RunFolder, account: dict[str, Any]) -> bool:
+    """Write the account of a capture that could not be processed; False where a run stands there, which is kept.
+
+    run.json comes first and says all.  parameters.jsonl, without a line, is for those who read the lines of many runs.
+    Raises OutputError where the account cannot be written.
+    """
+    fresh = False
+    try:
+        fresh = not run.path.exists()
+        run.path.mkdir(parents=True, exist_ok=True)
+        with nullcontext() if is_remote(run.path) else _locked(run):
+            if find_run(run)[0] != "nothing":
+                return False
+            _write_account(run, account)
+            write_whole(run.parameters, b"")
+            return True
+    except OSError as error:
+        raise output_error(run.path, error) from error
+    finally:
+        if fresh:
+            with suppress(OSError):
+                run.path.rmdir()
+
+
+def _write_account(run: RunFolder, account: dict[str, Any]) -> None:
+    write_whole(run.run_json, (json.dumps(plain(account), allow_nan=False, indent=2) + "\n").encode())
 
 
 def _join(path: Path, logs: Iterable[Path]) -> None:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.pictures import is_picture_source, read_picture_list
 from virest.capture.records import Capture, Frame
 from virest.capture.video import probe_movie, read_frames, read_gray
-from virest.errors import CaptureError, OutputError, SettingsError
+from virest.errors import CaptureError, OutputError, SettingsError, VirestError
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import vector_from_rotation
 from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration, restore_frames
@@ -32,8 +33,10 @@ Json = dict[str, Any]
 NEAREST_PART = 0.25
 """The scene is the calmest of this part of the frames: those that look most nearly where all look on average."""
 MAX_TRIES = 5
+MOST_PICTURES = 64
+"""Looked at for the bits of a pixel, where a capture is a list of pictures."""
 BITS_PER_PX = (0.03, 2.0)
-"""The movie's own rate of bits is taken over, within this."""
+"""The recording's own rate of bits is taken over, within this."""
 
 
 def simulate_like(
@@ -88,9 +91,12 @@ def simulate_like(
 
 
 def count_frames(like: Path, frames: slice | None = None) -> int:
-    """How many frames a re-creation is about to render, at most: for the progress bar."""
-    movie = like / "movie.mp4"
-    return len(range(len(probe_movie(movie)))[frames or slice(None)]) if movie.is_file() else 0
+    """How many frames a re-creation is about to render, for the progress bar; 0 where the capture cannot be read."""
+    try:
+        capture = read_capture(like, look_at_pictures=False)
+    except VirestError:  # said by whoever renders
+        return 0
+    return len(known_frames(capture.frames[frames or slice(None)]))
 
 
 def scene_plan(
@@ -178,8 +184,14 @@ def _fps(frames: Sequence[Frame]) -> float:
 
 
 def _bits_per_px(capture: Capture) -> float:
-    bits = 8 * capture.movie.stat().st_size / (len(capture.frames) * capture.width * capture.height)
-    return float(np.clip(bits, *BITS_PER_PX))
+    """Bits of a pixel in the movie, or in the files of listed pictures: the mean of some, evenly over the list."""
+    if is_picture_source(capture.movie):
+        found = read_picture_list(capture.movie)
+        files = [found.base / name for name in found.names[:: -(-len(found.names) // MOST_PICTURES)]]
+        frame_bytes = float(np.mean([file.stat().st_size for file in files]))
+    else:
+        frame_bytes = capture.movie.stat().st_size / len(capture.frames)
+    return float(np.clip(8 * frame_bytes / (capture.width * capture.height), *BITS_PER_PX))
 
 
 def _range_ms(frames: Sequence[Frame]) -> list[float]:

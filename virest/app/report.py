@@ -122,6 +122,8 @@ class _Account(_Lenient):
     counts: dict[str, _Count]
     verdict: str
     warnings: list[str] = Field(default_factory=list)
+    failure: dict[str, Any] | None = None
+    """Of a capture that could not be processed; there are no pictures then."""
 
 
 class _Tile(_Lenient):
@@ -358,7 +360,7 @@ def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
     chosen = choose_frames(frames, options.frames or max(1, min(FRAMES_SHOWN, MOST_FRAMES // among)))
     numbers = {facts.frame for facts in chosen}
     tiles = _read_tiles(folder, {n for n, facts in by_line.items() if facts.frame in numbers})
-    movie, complaint = find_movie(account, folder, options.capture)
+    movie, complaint = (None, "") if account.failure else find_movie(account, folder, options.capture)
     notes += [complaint] if complaint else []
     shown = [_show(folder, facts, tiles[facts.frame], movie, PICTURE_BYTES // among // len(chosen)) for facts in chosen]
     return RunRecord(account.model_dump(), frames, shown, tuple(notes))

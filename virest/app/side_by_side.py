@@ -14,7 +14,7 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-from virest.app.jobs import KEEP_MEMORY_VARIABLES, KEPT_BYTES, THREAD_VARIABLES, _start_worker
+from virest.app.jobs import KEEP_MEMORY_VARIABLES, KEPT_BYTES, THREAD_VARIABLES, start_worker
 from virest.motion.shared_out import Each, one_by_one
 
 log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class _SharedOut:
         for variable in KEEP_MEMORY_VARIABLES:
             os.environ.setdefault(variable, KEPT_BYTES)
         context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.jobs, context, initializer=_start_worker, initargs=(False,))
+        return ProcessPoolExecutor(self.jobs, context, initializer=start_worker, initargs=(False,))
 
     def close(self) -> None:
         """Let the processes go; what they have not begun is not wanted any more."""

@@ -25,6 +25,7 @@ from virest.app.process import ProcessOptions, process_capture
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.orb_slam import format_orb_slam
 from virest.camera.profile import CameraProfile, read_profile
+from virest.capture.euroc import format_picture_list
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_frames
@@ -161,13 +162,12 @@ def _write_euroc(folder: Path, pictures: Iterator[tuple[int, NDArray[np.uint8]]]
     """Write mav0/cam0/data/<ns>.png, its data.csv, and times.txt with one stamp a line."""
     data = folder / "mav0" / "cam0" / "data"
     data.mkdir(parents=True)
-    rows = ["#timestamp [ns],filename"]
+    written = []
     for number, picture in pictures:
-        name = f"{stamps_ns[number]}.png"
-        cv2.imwrite(str(data / name), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        rows.append(f"{stamps_ns[number]},{name}")
-    (data.parent / "data.csv").write_text("\n".join(rows) + "\n", encoding="ascii")
-    (folder / "times.txt").write_text("".join(f"{row.split(',')[0]}\n" for row in rows[1:]), encoding="ascii")
+        cv2.imwrite(str(data / f"{stamps_ns[number]}.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        written.append(stamps_ns[number])
+    (data.parent / "data.csv").write_text(format_picture_list(written), encoding="ascii")
+    (folder / "times.txt").write_text("".join(f"{stamp}\n" for stamp in written), encoding="ascii")
 
 
 def _seconds(sequences: SlamSequences) -> Array:

@@ -43,9 +43,9 @@ class RestorationSettings:
 
 
 PRESETS: dict[str, RestorationSettings] = {
-    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144, strength=0.85),
-    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5, tile_px=104, strength=1.2),
+    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144, strength=0.75),
+    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5, tile_px=104, strength=1.1),
     "best": RestorationSettings(
-        "best", "hyper-laplacian-global", iterations=4, inner_iterations=5, tile_px=104, strength=1.2
+        "best", "hyper-laplacian-global", iterations=4, inner_iterations=5, tile_px=104, strength=1.1
     ),
 }

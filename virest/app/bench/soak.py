@@ -6,6 +6,7 @@ the second, since the first one fills caches.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -168,10 +169,10 @@ def _growth(samples: list[tuple[float, int]]) -> dict[str, Any]:
 
 
 def _judge(folders: list[Path], broken: dict[str, str], out: Path, errors: str) -> dict[str, Any]:
-    """Which good captures are done, and which broken ones are explained: by a line of the log, or by their run."""
-    done = {folder.name for folder in folders if (out / folder.name / "run.json").is_file()}
-    said = {name: [line for line in errors.splitlines() if name in line and "camera profile from" not in line]
-            for name in broken}  # fmt: skip
+    """Which good captures are done, and which broken ones are explained by their run.json, whatever the log says."""
+    accounts = {file.parent.name: json.loads(file.read_bytes()) for file in out.glob("*/run.json")}
+    done = {name for name, account in accounts.items() if account["status"] == "done" and account["exit_code"] == 0}
+    said = {name: _explanation(accounts.get(name)) for name in broken}
     return {
         "good": len(folders) - len(broken),
         "good_done": sum(folder.name in done for folder in folders if folder.name not in broken),
@@ -181,6 +182,15 @@ def _judge(folders: list[Path], broken: dict[str, str], out: Path, errors: str) 
         "tracebacks": errors.count("Traceback"),
         "left_over": sorted(p.name for p in out.rglob("*") if p.name.endswith((".part", ".lock")) or p.name == ".run"),
     }
+
+
+def _explanation(account: dict[str, Any] | None) -> list[str]:
+    """Why a capture was not processed, or what is wrong with it; nothing where its account is silent."""
+    if account is None:
+        return []
+    failed = [f"{account['counts']['failed']} frames failed"] if account["counts"]["failed"] else []
+    reason = [account["failure"]["reason"]] if account["failure"] else []
+    return [*reason, *failed, *account["warnings"]]
 
 
 def _text(facts: dict[str, Any]) -> str:

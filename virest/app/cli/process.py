@@ -56,7 +56,7 @@ def process(
     ] = None,
     jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes. [the cores]")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler does the work.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue what was interrupted or failed.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
     keep_start_up: Annotated[
         bool, typer.Option("--keep-start-up", help="Process the frames of the recorder's start-up too.")
