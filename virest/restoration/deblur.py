@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -274,7 +275,7 @@ def _filled_in(planes: list[Image], known: Image) -> list[Image]:
 def _holes(blurred: BlurredPicture) -> Image | None:
     """1.0 where any channel is clipped: what is recorded there is no measurement."""
     masks = [mask for mask in blurred.clipped if mask is not None]
-    return np.maximum.reduce(masks) if masks else None
+    return functools.reduce(cv2.max, masks) if masks else None
 
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:

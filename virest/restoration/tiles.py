@@ -242,7 +242,7 @@ def packed_power(spectrum: Image) -> Image:
     """|K|² of a packed spectrum, as a real factor for packed spectra; as :func:`packed_product`."""
     power, ends = np.empty_like(spectrum), _ends(spectrum).copy()
     numbers, powers = _inner_numbers(spectrum), _inner_numbers(power)
-    np.multiply(numbers, numbers.conj(), out=powers)
+    np.multiply(numbers, np.conjugate(numbers, out=powers), out=powers)
     powers *= np.complex64(1 + 1j)  # what is real, onto the imaginary places too
     _ends(power)[:] = doubled(cv2.mulSpectrums(ends, ends, 0, conjB=True))
     return power
