@@ -1,0 +1,139 @@
+"""The content of run.json: what came out of a capture, or why nothing did."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from virest import __version__
+from virest.app import console
+from virest.app.outputs import file_facts, parse_lines, resolved
+from virest.app.planning import Job, ProcessOptions
+from virest.camera.profile import profile_mapping
+from virest.capture.location import is_remote, locate, read_each
+from virest.errors import VirestError
+from virest.restoration.capture import RestorationPlan
+
+PARTLY_FAILED = 9
+STATUSES = ("restored", "copied", "skipped", "failed")
+STAGES = ("decode", "estimate", "deblur", "shutter", "write")
+MOST_FILES, MOST_BYTES = 32, 1 << 30
+"""Of a capture that cannot be read: what is looked at for run.json."""
+
+
+def run_totals(logs: list[Path]) -> dict[str, Any]:
+    """Counts by status, warnings by text, and seconds by stage, over all lines."""
+    counts: Counter[str] = Counter()
+    seconds: Counter[str] = Counter()
+    for content in read_each(logs):
+        for line in parse_lines(content):
+            counts[line["status"]] += 1
+            seconds.update({stage: line["seconds"].get(stage, 0.0) for stage in STAGES})
+    return {"counts": {status: counts[status] for status in STATUSES}, "seconds": dict(seconds)}
+
+
+def run_account(job: Job, plan: RestorationPlan, totals: dict[str, Any], wall_s: float) -> dict[str, Any]:
+    """The content of run.json."""
+    notes = [note.text for note in job.capture.notes if note.severity != "info"]
+    counts = totals["counts"]
+    return {
+        "virest_run": 1,
+        "version": __version__,
+        "capture": job.name,
+        "status": "done",
+        "exit_code": PARTLY_FAILED if counts["failed"] else 0,
+        "failure": None,
+        "source": _source(job.path),
+        "folder": str(job.capture.folder.absolute()),
+        "movie": str(job.capture.movie.absolute()),
+        "command": job.request["command"],
+        "profile": profile_mapping(plan.profile),
+        "profile_source": job.profile_source,
+        "profile_sha256": job.request["profile_sha256"],
+        "settings": dataclasses.asdict(plan.settings),
+        "frames": job.request["frames"],
+        "inputs": _inputs(job),
+        "counts": counts,
+        "totals": _sums(len(job.selected), totals["seconds"], wall_s),
+        "verdict": verdict(counts, plan.copy_reason),
+        "warnings": [*notes, *plan.warnings, *([plan.copy_reason] if plan.copy_reason else [])],
+    }
+
+
+def failure_account(
+    path: str, name: str, options: ProcessOptions, job: Job | None, error: Exception, wall_s: float
+) -> dict[str, Any]:
+    """The content of run.json for a capture that could not be processed; what was not found out is empty."""
+    kind = type(error).__name__
+    known = error if isinstance(error, VirestError) else VirestError(f"{kind}: {error}", hint=console.OUR_FAULT)
+    return {
+        "virest_run": 1,
+        "version": __version__,
+        "capture": name,
+        "status": "failed",
+        "exit_code": known.exit_code,
+        "failure": {"error": kind, "reason": known.message, "hint": known.hint},
+        "source": _source(path),
+        "folder": str(locate(path).absolute()),
+        "movie": str(job.capture.movie.absolute()) if job else None,
+        "command": options.command,
+        "profile": profile_mapping(job.profile) if job else {},
+        "profile_source": job.profile_source if job else "",
+        "profile_sha256": job.request["profile_sha256"] if job else None,
+        "settings": dataclasses.asdict(options.settings),
+        "frames": job.request["frames"] if job else None,
+        "inputs": _inputs(job) if job else _facts_of_folder(locate(path)),
+        "counts": dict.fromkeys(STATUSES, 0),
+        "totals": _sums(0, {}, wall_s),
+        "verdict": f"not processed: {known.message}",
+        "warnings": [text for text in (known.message, known.hint) if text],
+    }
+
+
+def _source(path: str) -> dict[str, str]:
+    """Where the capture is: as it was given, and where that lies, links followed."""
+    return {"given": path, "resolved": resolved(path)}
+
+
+def _facts_of_folder(folder: Path) -> list[dict[str, Any]]:
+    """Facts of plain files in the folder of a capture that could not be read, in bounded time; none at an address."""
+    facts: list[dict[str, Any]] = []
+    left = 0 if is_remote(folder) else MOST_BYTES
+    with suppress(OSError):
+        for file in sorted(folder.iterdir())[:MOST_FILES] if left else ():
+            with suppress(OSError):
+                if file.is_file() and (size := file.stat().st_size) <= left:
+                    left -= size
+                    facts.append({**file_facts(file), "path": resolved(file)})
+    return facts
+
+
+def _inputs(job: Job) -> list[dict[str, Any]]:
+    """Facts of the input files with their places."""
+    known = zip(job.request["inputs"], job.inputs, strict=True)
+    return [{**facts, "path": resolved(file)} for facts, file in known]
+
+
+def _sums(frames: int, seconds: Mapping[str, float], wall_s: float) -> dict[str, Any]:
+    return {
+        "frames": frames,
+        "seconds": {**{stage: round(seconds.get(stage, 0.0), 3) for stage in STAGES}, "wall": round(wall_s, 3)},
+        "frames_per_s": round(frames / wall_s, 3) if wall_s > 0 else None,
+    }
+
+
+def verdict(counts: dict[str, int], copy_reason: str | None) -> str:
+    """One word or sentence for the whole run."""
+    if counts.get("failed"):
+        return "some frames failed"
+    if copy_reason:
+        return f"copied: {copy_reason}"
+    if counts.get("restored"):
+        return "restored"
+    return (
+        "nothing to restore" if counts.get("copied") else "all frames skipped" if counts.get("skipped") else "no frames"
+    )
