@@ -50,9 +50,6 @@ LOOK_S = 5.0
 """How often to look after the workers while nothing comes back."""
 MIN_SEGMENT_FRAMES, USUAL_SEGMENT_FRAMES, MAX_SEGMENT_FRAMES = 5, 10, 30
 IMU_MARGIN_S = 1.0
-KEEP_MEMORY_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
-KEPT_BYTES = str(256 * 2**20)
-"""glibc hands pictures back to the system and fetches them anew, page by page, unless told to keep them."""
 MOST_AHEAD = 8
 """Calls begun before their results are wanted: enough to keep many workers in work, few enough to keep memory flat."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -282,7 +279,24 @@ def prepare_worker() -> None:
         _prepared.append(os.getpid())
 
 
-def start_worker(verbose: bool) -> None:
+def process_pool(jobs: int, *, verbose: bool = False) -> ProcessPoolExecutor:
+    """So many processes, set up as workers; they start when they are first needed."""
+    for variable in THREAD_VARIABLES:
+        os.environ[variable] = "1"
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(jobs, context, initializer=_start_worker, initargs=(verbose,))
+
+
+def submit_uninterrupted(pool: ProcessPoolExecutor, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+    """Hand a call to a pool; processes that this starts never see the Ctrl-C meant for the parent."""
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
+    try:
+        return pool.submit(function, *arguments)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _start_worker(verbose: bool) -> None:
     """Set up a worker process: no Ctrl-C of its own (the parent decides), and no life after the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -345,11 +359,7 @@ class Workers:
             self._executor = self._start()
         if not isinstance(self._executor, ProcessPoolExecutor):
             return self._executor.submit(function, *arguments)
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
-        try:
-            return self._executor.submit(function, *arguments)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        return submit_uninterrupted(self._executor, function, *arguments)
 
     @property
     def here(self) -> bool:
@@ -366,12 +376,7 @@ class Workers:
             return ClusterExecutor(self.scheduler, verbose=self.verbose)
         if self.jobs == 1:
             return SerialExecutor()
-        for variable in THREAD_VARIABLES:
-            os.environ[variable] = "1"
-        for variable in KEEP_MEMORY_VARIABLES:
-            os.environ.setdefault(variable, KEPT_BYTES)
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.jobs, context, initializer=start_worker, initargs=(self.verbose,))
+        return process_pool(self.jobs, verbose=self.verbose)
 
     def check(self) -> None:
         """Look whether anybody is still at work; called while nothing comes back. Raises RestorationError."""
@@ -418,7 +423,7 @@ def run_segments(segments: Iterable[Segment], workers: Workers) -> Iterator[tupl
         lost = _fill(running, waiting, workers)
         if not running and not lost:
             return
-        for future in _await_some(running, workers) if running else ():
+        for future in _await_first(running, workers) if running else ():
             segment = running.pop(future)
             counts = _collect(future, segment, workers)
             if counts is None:
@@ -439,10 +444,6 @@ def _fill(
         except BrokenExecutor:
             return [segment]
     return []
-
-
-def _await_some(running: Running, workers: Workers) -> set[Future[dict[str, int]]]:
-    return _await_first(running, workers)
 
 
 def _await_first(futures: Iterable[Future[Result]], workers: Workers) -> set[Future[Result]]:

@@ -6,15 +6,12 @@ Results come in the order of the calls, so that nothing depends on the number of
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import os
-import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-from virest.app.jobs import KEEP_MEMORY_VARIABLES, KEPT_BYTES, THREAD_VARIABLES, start_worker
+from virest.app.jobs import process_pool, submit_uninterrupted
 from virest.motion.shared_out import Each, one_by_one
 
 log = logging.getLogger(__name__)
@@ -58,20 +55,8 @@ class _SharedOut:
 
     def _submit(self, function: Callable[..., Any], parts: tuple[Any, ...]) -> Future[Any]:
         if self._pool is None:
-            self._pool = self._started()
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
-        try:
-            return self._pool.submit(function, *parts)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-    def _started(self) -> ProcessPoolExecutor:
-        for variable in THREAD_VARIABLES:
-            os.environ[variable] = "1"
-        for variable in KEEP_MEMORY_VARIABLES:
-            os.environ.setdefault(variable, KEPT_BYTES)
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.jobs, context, initializer=start_worker, initargs=(False,))
+            self._pool = process_pool(self.jobs)
+        return submit_uninterrupted(self._pool, function, *parts)
 
     def close(self) -> None:
         """Let the processes go; what they have not begun is not wanted any more."""
