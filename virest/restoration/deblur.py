@@ -46,7 +46,11 @@ BORDER_NOISE_TO_SIGNAL = 0.003
 """Least N / S of tiles that see beyond the picture."""
 RESIDUAL_SHARE = 0.05
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
-SlopeMaker = Callable[[int], Image]
+WEIGHED_PX = 5
+"""Side of the neighbourhood whose grey levels tell a pixel's slope: in it the recorded noise evens out."""
+SHRUNK_PARTS = 8
+"""Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more."""
+SlopeMaker = Callable[[int, int], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
 
 
@@ -57,7 +61,10 @@ class BlurredPicture:
     light: list[Image]
     """Linear light of each channel, (height, width)."""
     slopes: SlopeMaker
-    """Grey levels per unit of light of a channel, by its number, smoothed over the neighbourhood, (height, width)."""
+    """Grey levels per unit of light of a channel, by its number, over neighbourhoods of a side in pixels.
+
+    (height, width); see :func:`_slopes_around`.
+    """
     dark: list[Image | None]
     """1.0 where a channel's light was too little to be measured; None: nowhere."""
     clipped: list[Image | None]
@@ -79,16 +86,38 @@ def blurred_picture(
     longest_px: float,
 ) -> BlurredPicture:
     """Take a picture (height, width, 3) through the inverse of the exposure curve."""
-    reach = 2 * int(np.ceil(longest_px / 2)) + 3
     channels = cv2.split(picture)
     light = [cv2.LUT(channel, curve.linear_table()) for channel in channels]
     dark = [_dark(channel, curve) for channel in channels]
     clipped = [_clipped(channel, curve) for channel in channels]
 
-    def slopes(channel: int) -> Image:
-        return cv2.LUT(cv2.blur(channels[channel], (reach, reach)), curve.slope_table())
+    def slopes(channel: int, side_px: int) -> Image:
+        return _slopes_around(channels[channel], curve, side_px)
 
     return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px)
+
+
+def _slopes_around(channel: NDArray[np.uint8], curve: ResponseCurve, side_px: int) -> Image:
+    """The slope that gives a neighbourhood's mean noise in light, (height, width): 1 / s² is the mean of its 1 / s².
+
+    Grey levels have about the same noise everywhere; in light that is their noise over the curve's slope, so that
+    nearly all of it is in what is bright.  A deconvolution that weighs all pixels of a tile alike spreads the bright
+    parts' noise over the dark ones, where a steep curve would show it as detail.
+    """
+    variances = cv2.LUT(channel, _light_variances(curve))
+    height, width = channel.shape
+    shrunk = max(1, side_px // SHRUNK_PARTS)
+    if shrunk == 1:
+        return np.asarray(cv2.blur(variances, (side_px, side_px)) ** np.float32(-0.5), np.float32)
+    size = max(1, width // shrunk), max(1, height // shrunk)
+    around = cv2.blur(cv2.resize(variances, size, interpolation=cv2.INTER_AREA), (SHRUNK_PARTS, SHRUNK_PARTS))
+    return cv2.resize(around ** np.float32(-0.5), (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _light_variances(curve: ResponseCurve) -> NDArray[np.float32]:
+    """Variance in light of a noise of one grey level, at each of the 256; censored levels have their neighbours'."""
+    levels, known = np.arange(256), ~curve.censored_table()
+    return np.interp(levels, levels[known], curve.slope_table()[known].astype(float) ** -2).astype(np.float32)
 
 
 def _dark(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
@@ -332,7 +361,7 @@ def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings
     projected = _projected_luma(blurred, deconvolution, settings)
     ratios = _noise_to_signal(deconvolution, settings, statistics)
     sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
-    before, scale = sharp, blurred.slopes(1) * np.float32(1.0 / unit)
+    before, scale = sharp, blurred.slopes(1, settings.tile_px) * np.float32(1.0 / unit)
     for step, beta in enumerate(_beta_schedule(settings.iterations)):
         ahead, before = _further_on(sharp, before, step), sharp
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
@@ -441,7 +470,7 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
     Near clipped light the tiles' solution stays: its lamps were found with light held positive.
     """
     operator, near = _whole_operator(blurred), near_clipped(blurred)
-    statistics, slope = blurred.statistics, blurred.slopes(1)
+    statistics, slope = blurred.statistics, blurred.slopes(1, WEIGHED_PX)
     start = _tile_hyper_laplacian(blurred, replace(settings, iterations=START_ITERATIONS))
     result = hyper_laplacian(
         _luma(blurred.light),

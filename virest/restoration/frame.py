@@ -348,8 +348,8 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
     """The picture without flicker and vignetting: both came after the blur, so they go before it is undone."""
     planes = [light.evened(plane, mask) for plane, mask in zip(blurred.light, blurred.clipped, strict=True)]
-    recorded_slopes = blurred.slopes
-    return replace(blurred, light=planes, slopes=lambda channel: recorded_slopes(channel) * light.recorded)
+    recorded = blurred.slopes
+    return replace(blurred, light=planes, slopes=lambda number, side_px: recorded(number, side_px) * light.recorded)
 
 
 def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
