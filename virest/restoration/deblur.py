@@ -222,7 +222,7 @@ def _tile_factors(
             ratio = np.full((deconvolution.size,) * 2, settings.strength**2 * flat, np.float32)
             ratio[0, 0] = 0.0  # the mean is no noise
             return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
-    ratio, guarded = _noise_to_signal(deconvolution, settings, statistics)
+    ratio, guarded = _noise_to_signal(deconvolution, settings, statistics.between_rings_and_level)
     return deconvolution.filters(
         lambda power: tiles.wiener_filter(power, ratio), lambda power: tiles.wiener_filter(power, guarded)
     )
@@ -359,7 +359,7 @@ def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings
     trust, guarded = (float(t) for t in (unit / noise) ** 2)
     gradients = tiles.gradient_power(deconvolution.size)
     projected = _projected_luma(blurred, deconvolution, settings)
-    ratios = _noise_to_signal(deconvolution, settings, statistics)
+    ratios = _noise_to_signal(deconvolution, settings, statistics.between_rings_and_level)
     sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
     before, scale = sharp, blurred.slopes(1, settings.tile_px) * np.float32(1.0 / unit)
     for step, beta in enumerate(_beta_schedule(settings.iterations)):

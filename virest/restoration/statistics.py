@@ -79,6 +79,15 @@ class PictureStatistics:
         return self.noise / self.signal
 
     @property
+    def between_rings_and_level(self) -> PictureStatistics:
+        """The same with noise half way, by its logarithm, from the rings' own to the level that was measured in light.
+
+        The rings' takes in the overtones of blurred edges, most of all at low frequencies; the level is that of the
+        frequencies where signal and noise are about equal, and a coder's noise is not level.  The truth lies between.
+        """
+        return replace(self, noise=np.sqrt(self.noise) * self.noise_levels)
+
+    @property
     def gradient_scale(self) -> float:
         """Unit u of the prior exp(−|∇f/u|^⅔): of edges, that stand out of the sharp picture's mean square gradient."""
         # forward differences pass 4 sin²(π f_x); its mean over a ring's directions is 2 − 2 J0(2π f)
