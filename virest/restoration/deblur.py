@@ -47,7 +47,7 @@ BORDER_NOISE_TO_SIGNAL = 0.003
 RESIDUAL_SHARE = 0.05
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
 WEIGHED_PX = 5
-"""Side of the neighbourhood whose grey levels tell a pixel's slope: in it the recorded noise evens out."""
+"""Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
 SHRUNK_PARTS = 8
 """Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more."""
 SlopeMaker = Callable[[int, int], Image]
@@ -92,32 +92,31 @@ def blurred_picture(
     clipped = [_clipped(channel, curve) for channel in channels]
 
     def slopes(channel: int, side_px: int) -> Image:
-        return _slopes_around(channels[channel], curve, side_px)
+        return _slopes_around(light[channel], curve, side_px)
 
     return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px)
 
 
-def _slopes_around(channel: NDArray[np.uint8], curve: ResponseCurve, side_px: int) -> Image:
-    """The slope that gives a neighbourhood's mean noise in light, (height, width): 1 / s² is the mean of its 1 / s².
+def _slopes_around(light: Image, curve: ResponseCurve, side_px: int) -> Image:
+    """The curve's slope at a neighbourhood's mean light, (height, width).
 
     Grey levels have about the same noise everywhere; in light that is their noise over the curve's slope, so that
-    nearly all of it is in what is bright.  A deconvolution that weighs all pixels of a tile alike spreads the bright
-    parts' noise over the dark ones, where a steep curve would show it as detail.
+    nearly all of it is in what is bright, and so is most of the mean light.  A deconvolution that weighs all pixels of
+    a tile alike spreads that noise over the dark parts, where a slope of their own would show it as detail.
     """
-    variances = cv2.LUT(channel, _light_variances(curve))
-    height, width = channel.shape
+    height, width = light.shape
     shrunk = max(1, side_px // SHRUNK_PARTS)
-    if shrunk == 1:
-        return np.asarray(cv2.blur(variances, (side_px, side_px)) ** np.float32(-0.5), np.float32)
-    size = max(1, width // shrunk), max(1, height // shrunk)
-    around = cv2.blur(cv2.resize(variances, size, interpolation=cv2.INTER_AREA), (SHRUNK_PARTS, SHRUNK_PARTS))
-    return cv2.resize(around ** np.float32(-0.5), (width, height), interpolation=cv2.INTER_LINEAR)
+    size, side = (max(1, width // shrunk), max(1, height // shrunk)), max(1, side_px // shrunk)
+    around = cv2.blur(cv2.resize(light, size, interpolation=cv2.INTER_AREA), (side, side))
+    slopes = cv2.LUT(np.rint(255 * curve.encode(around)).astype(np.uint8), _measured_slopes(curve))
+    return cv2.resize(slopes, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def _light_variances(curve: ResponseCurve) -> NDArray[np.float32]:
-    """Variance in light of a noise of one grey level, at each of the 256; censored levels have their neighbours'."""
+@functools.lru_cache(maxsize=8)
+def _measured_slopes(curve: ResponseCurve) -> NDArray[np.float32]:
+    """The curve's slope table; levels that tell no light have their neighbours'."""
     levels, known = np.arange(256), ~curve.censored_table()
-    return np.interp(levels, levels[known], curve.slope_table()[known].astype(float) ** -2).astype(np.float32)
+    return np.interp(levels, levels[known], curve.slope_table()[known]).astype(np.float32)
 
 
 def _dark(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
@@ -353,13 +352,14 @@ def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSetti
 
 def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> Image:
     deconvolution = _luma_tiles(blurred, settings)
-    statistics = blurred.statistics
-    unit = statistics.gradient_scale * (FEW_SCALE if settings.iterations <= FEW_ITERATIONS else 1.0)
+    statistics, few = blurred.statistics, settings.iterations <= FEW_ITERATIONS
+    unit = statistics.gradient_scale * (FEW_SCALE if few else 1.0)
     noise = settings.strength * np.array([statistics.noise_levels, _border_noise(blurred)])
     trust, guarded = (float(t) for t in (unit / noise) ** 2)
     gradients = tiles.gradient_power(deconvolution.size)
     projected = _projected_luma(blurred, deconvolution, settings)
-    ratios = _noise_to_signal(deconvolution, settings, statistics.between_rings_and_level)
+    start = statistics.between_rings_and_level if few else statistics
+    ratios = _noise_to_signal(deconvolution, settings, start)
     sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
     before, scale = sharp, blurred.slopes(1, settings.tile_px) * np.float32(1.0 / unit)
     for step, beta in enumerate(_beta_schedule(settings.iterations)):
