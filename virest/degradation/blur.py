@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
-FAST_SIZES = (64, 80, 96, 128, 144, 160, 176, 192, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
+FAST_SIZES = (64, 80, 96, 112, 128, 144, 160, 176, 192, 208, 224, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +50,13 @@ class TileGrid:
 
 @lru_cache(maxsize=8)
 def _windows(grid: TileGrid) -> list[Image]:
-    """The same for every frame of a movie; not to be written to."""
+    """The same for every frame of a movie, and one array for all that are alike; not to be written to."""
     rows = _ramps(grid.tops, grid.side, grid.overlap)
     columns = _ramps(grid.lefts, grid.side, grid.overlap)
-    return [np.outer(r, c).astype(np.float32) for r in rows for c in columns]
+    windows: dict[tuple[bytes, bytes], Image] = {}
+    return [
+        windows.setdefault((r.tobytes(), c.tobytes()), np.outer(r, c).astype(np.float32)) for r in rows for c in columns
+    ]
 
 
 def tile_grid(height: int, width: int, side: int, overlap: int) -> TileGrid:
