@@ -119,10 +119,10 @@ def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
 def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.uint8] | None:
     """1 where any channel of a picture (height, width, 3) is clipped; None: nowhere."""
     table = curve.clipped_table(CLIPPED_LEVELS)
-    brightest = cv2.max(cv2.max(*cv2.split(picture)[:2]), cv2.extractChannel(picture, 2))
-    if not table[int(brightest.max())]:
+    if not table[int(picture.max())]:
         return None
-    return np.asarray(cv2.LUT(brightest, table.astype(np.uint8)), np.uint8)
+    brightest = int(np.argmax(table)) - 1
+    return (cv2.inRange(picture, (0, 0, 0), (brightest,) * 3) == 0).view(np.uint8)
 
 
 def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
@@ -305,8 +305,17 @@ def _measured_part(holes: Image) -> Image:
 
     A sharp edge of the weights would show as an outline around the lamp.
     """
-    wide = cv2.GaussianBlur(cv2.dilate(holes, np.ones((5, 5), np.uint8)), (0, 0), CODEC_REACH_PX)
-    return (1 - holes) * (1 - wide)
+    part = np.ones_like(holes)
+    near = _around(holes, int(4 * CODEC_REACH_PX) + 3)
+    wide = cv2.GaussianBlur(cv2.dilate(holes[near], np.ones((5, 5), np.uint8)), (0, 0), CODEC_REACH_PX)
+    part[near] = (1 - holes[near]) * (1 - wide)
+    return part
+
+
+def _around(mask: Image, reach: int) -> tuple[slice, slice]:
+    """Rows and columns of all that is not 0 in a mask (height, width), and so many pixels more on each side."""
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
 
 
 def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:

@@ -34,7 +34,7 @@ _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 _ROUNDING_POWER = 1 / 12
 _FIT_STEPS = 6
 _CELLS = 64
-_MAX_TILES = 12
+_MAX_TILES = 8
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _STEEPEST_NOISE, _LEVEL_BELOW = 2.0, 0.08
@@ -122,10 +122,11 @@ def measure_picture(
     tiles = zip(chosen, known, strict=True)
     light = np.stack([_windowed_power(_evenly_steep(_cut(picture, corners[i]), curve), seen) for i, seen in tiles])
     colour = (observed(red, 2) + observed(blue, 2)) * np.float32(0.5)
-    noise_levels = _fit_rings(light, passed, white_noise(luma)).noise_levels
+    cells, white_levels = _RingCells(passed), white_noise(luma)
+    noise_levels = _fit_rings(light, cells, white_levels).noise_levels
     return (
-        replace(_fit_rings(observed(luma, 1), passed, white_noise(luma)), noise_levels=noise_levels),
-        _fit_rings(colour, passed[::2], white_noise(red)),
+        replace(_fit_rings(observed(luma, 1), cells, white_levels), noise_levels=noise_levels),
+        _fit_rings(colour, _RingCells(passed[::2]), white_noise(red)),
     )
 
 
@@ -138,7 +139,7 @@ def _evenly_steep(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.f
 
 
 def _least_clipped(clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]]) -> NDArray[np.intp]:
-    """Numbers of the tiles to measure: a dozen, evenly over those with the least clipped light."""
+    """Numbers of the tiles to measure: at most eight, evenly over those with the least clipped light."""
     chosen = np.arange(len(corners))
     if clipped is not None:
         parts = np.array([np.count_nonzero(_cut(clipped, corner)) for corner in corners]) / _SIDE**2
@@ -240,25 +241,37 @@ def _ring_index(side: int) -> NDArray[np.intp]:
     )
 
 
-def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32], white_levels: float) -> PictureStatistics:
-    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
-    share = np.minimum((passed * _CELLS).astype(np.intp), _CELLS - 1)
-    cell = (_ring_index(_SIDE) * _CELLS + share).ravel()
+class _RingCells:
+    """The places of all tiles' spectra, sorted into cells of equal ring and nearly equal |K|²."""
 
-    def per_cell(values: NDArray[np.float32] | None) -> Array:
-        weights = None if values is None else values.ravel()
-        sums = np.bincount(cell, weights, (RINGS + 1) * _CELLS).astype(np.float64)
+    def __init__(self, passed: NDArray[np.float32]) -> None:
+        """passed: |K|² of each tile, as :func:`_power` orders it."""
+        share = np.minimum((passed * np.float32(_CELLS)).astype(np.intp), _CELLS - 1)
+        self._cell = (_ring_index(_SIDE) * _CELLS + share).ravel()
+        self.count = self._sums(None)
+        """(RINGS, _CELLS) places in each cell."""
+        self.passed = self.means(passed)
+
+    def means(self, values: NDArray[np.float32]) -> Array:
+        """(RINGS, _CELLS) mean of each cell; 0 where it is empty."""
+        return np.asarray(self._sums(values.ravel()) / np.maximum(self.count, 1))
+
+    def _sums(self, weights: NDArray[np.float32] | None) -> Array:
+        sums = np.bincount(self._cell, weights, (RINGS + 1) * _CELLS).astype(np.float64)
         return sums[: RINGS * _CELLS].reshape(RINGS, _CELLS)
 
-    count = per_cell(None)
-    g, k = (per_cell(v) / np.maximum(count, 1) for v in (observed, passed))
+
+def _fit_rings(observed: NDArray[np.float32], cells: _RingCells, white_levels: float) -> PictureStatistics:
+    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
+    count, g, k = cells.count, cells.means(observed), cells.passed
     in_ring = np.maximum(count.sum(1), 1)
     mean_k, mean_g = (count * k).sum(1) / in_ring, (count * g).sum(1) / in_ring
     signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
+    products = np.stack([np.ones_like(k), k, k * k, g, k * g], -1)
     for _ in range(_FIT_STEPS):
         expected = np.maximum(noise[:, None] + signal[:, None] * k, 1e-6)
         weight = count / (expected * np.sqrt(expected))
-        w, wk, wkk, wg, wkg = (np.sum(weight * v, 1) for v in (np.ones_like(k), k, k * k, g, k * g))
+        w, wk, wkk, wg, wkg = (weight[:, None] @ products)[:, 0].T
         determinant = np.maximum(w * wkk - wk * wk, 1e-30)
         signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
