@@ -38,12 +38,12 @@ CODEC_REACH_PX = 2.5
 FEW_ITERATIONS, FEW_SCALE = 2, 0.6
 """Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
 MARGIN_PER_PATH = 0.75
-LEAST_MARGIN_PX, LEAST_BRIDGE_PX = 12, 16
+LEAST_MARGIN_PX, LEAST_BRIDGE_PX = 9, 12
 """What a tile sees around it, per length of the blur path, and at least; its bridge is as long as the path.
 
 A steep bridge is an edge that the deconvolution carries into the tile.
 """
-COARSE_OVERLAP, FINE_OVERLAP = 5, 4
+COARSE_OVERLAP, FINE_OVERLAP = 4, 4
 """Tiles overlap by this part of their side, with few iterations and with more."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
 """Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
@@ -339,7 +339,38 @@ def _projected_luma(
 
 def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
-    return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
+    if settings.reduction == 1.0:
+        return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
+    height, width = blurred.light[0].shape
+    small = _reduced(blurred, settings.reduction)
+    sharp = _tile_hyper_laplacian(small, replace(settings, tile_px=round(settings.tile_px / settings.reduction)))
+    return _with_colour(blurred, cv2.resize(sharp, (width, height), interpolation=cv2.INTER_CUBIC), settings)
+
+
+def _reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
+    """The luma of a picture so many times smaller, and all that restoring it needs, to its measure; no colour."""
+    height, width = blurred.light[0].shape
+    size = (int(np.ceil(width / times)), int(np.ceil(height / times)))
+
+    def slopes(channel: int) -> Image:
+        return cv2.resize(blurred.slopes(channel), size, interpolation=cv2.INTER_LINEAR)
+
+    def field(centres_px: NDArray[np.float64]) -> KernelField:
+        return blurred.field((centres_px + 0.5) * times - 0.5).scaled(1 / times)
+
+    luma, holes = cv2.resize(_luma(blurred.light), size, interpolation=cv2.INTER_LINEAR), _holes(blurred)
+    if holes is not None:
+        holes = (cv2.resize(holes, size, interpolation=cv2.INTER_AREA) > 0).astype(np.float32)
+    return replace(
+        blurred,
+        light=[luma] * 3,
+        slopes=slopes,
+        dark=[None] * 3,
+        clipped=[holes] * 3,
+        statistics=blurred.statistics.scaled(1 / times),
+        field=field,
+        longest_px=blurred.longest_px / times,
+    )
 
 
 def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> Image:

@@ -83,8 +83,18 @@ class PictureStatistics:
         """Unit u of the prior exp(−|∇f/u|^⅔): of edges, that stand out of the sharp picture's mean square gradient."""
         # forward differences pass 4 sin²(π f_x); its mean over a ring's directions is 2 − 2 J0(2π f)
         gain = 2 - 2 * _bessel_j0(2 * np.pi * self.frequency)
-        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0])
+        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]) * (self.frequency < 0.5)
         return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
+
+    def scaled(self, scale: float) -> PictureStatistics:
+        """Those of the same picture ``scale`` times as large, each pixel the mean of what it covers; the rings stay."""
+        return replace(
+            self,
+            frequency=self.frequency / scale,
+            signal=scale**2 * self.signal,
+            noise=scale**2 * self.noise,
+            noise_levels=scale * self.noise_levels,
+        )
 
     @property
     def expected_gain_db(self) -> float:
@@ -369,7 +379,7 @@ def on_spectrum(
 
     scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.
     """
-    below, part, falling = _between_rings(size, scale)
+    below, part, falling = _between_rings(size, scale * float(statistics.frequency[0] + statistics.frequency[-1]) / 0.5)
     levels = np.log(ring_values).astype(np.float32)
     values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below])
     return np.asarray(values * falling, np.float32)
