@@ -37,6 +37,8 @@ CODEC_REACH_PX = 2.5
 """A lamp's edge is smeared about so far by the movie's codec."""
 FEW_ITERATIONS, FEW_SCALE = 2, 0.6
 """Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
+NOISY_REDUCTION = 1.5
+"""A picture so many times smaller holds all that stands out of the noise, if the finest of it is coarse enough."""
 MARGIN_PER_PATH = 0.75
 LEAST_MARGIN_PX, LEAST_BRIDGE_PX = 9, 12
 """What a tile sees around it, per length of the blur path, and at least; its bridge is as long as the path.
@@ -342,8 +344,9 @@ def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSetti
     if settings.reduction == 1.0:
         return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
     height, width = blurred.light[0].shape
-    small = _reduced(blurred, settings.reduction)
-    sharp = _tile_hyper_laplacian(small, replace(settings, tile_px=round(settings.tile_px / settings.reduction)))
+    times = max(settings.reduction, NOISY_REDUCTION if 0.5 / blurred.statistics.finest > NOISY_REDUCTION else 1.0)
+    small = _reduced(blurred, times)
+    sharp = _tile_hyper_laplacian(small, replace(settings, tile_px=round(settings.tile_px / times)))
     return _with_colour(blurred, cv2.resize(sharp, (width, height), interpolation=cv2.INTER_CUBIC), settings)
 
 

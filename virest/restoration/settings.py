@@ -35,7 +35,7 @@ class RestorationSettings:
     tile_px: int = 128
     """Side of a tile; each has a kernel of its own."""
     reduction: float = 1.0
-    """Tiles of the iterative method show the luma so many times smaller: beyond, a fast preset has little to gain."""
+    """The iterative method's tiles show the luma so many times smaller, or more where noise hides its detail."""
     strength: float = 1.0
     """Multiplies the measured noise in the regularisation: 1 trusts it, more is smoother."""
     min_blur_px: float = 1.0

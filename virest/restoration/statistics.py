@@ -86,6 +86,12 @@ class PictureStatistics:
         area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]) * (self.frequency < 0.5)
         return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
 
+    @property
+    def finest(self) -> float:
+        """Highest frequency, in cycles per pixel, at which more of the picture than of noise comes through the blur."""
+        clear = np.flatnonzero(self.passed * self.signal > self.noise)
+        return float(self.frequency[clear[-1] if len(clear) else 0])
+
     def scaled(self, scale: float) -> PictureStatistics:
         """Those of the same picture ``scale`` times as large, each pixel the mean of what it covers; the rings stay."""
         return replace(

@@ -21,8 +21,8 @@ LEAST_SIDE, LARGEST_SIDE = 0.8, 1.15
 """Tiles may be so much smaller or larger than asked for, where that makes their transforms quick."""
 LITTLE_LONGER = 1.05
 """Time that tiles may take over the quickest ones, where their side is nearer to what was asked for."""
-SETTLING_ITERATIONS, SETTLING_RELAXATION = 6, 1.7
-"""About as good as ten plain steps of Richardson-Lucy's."""
+SETTLING_ITERATIONS, SETTLING_RELAXATION = 4, 1.7
+"""About as good as seven plain steps of Richardson-Lucy's."""
 LAMP_DOUBT = 0.02
 """Lamp light in a streak, in units of the recorded range, from which on half of the light there is the steps' own."""
 Filter = Callable[[Image], Image]
