@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
-FAST_SIZES = (64, 80, 96, 112, 128, 144, 160, 176, 192, 208, 224, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
+FAST_SIZES = (64, 80, 96, 128, 144, 160, 176, 192, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
 
 
 @dataclass(frozen=True, slots=True)

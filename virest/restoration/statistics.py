@@ -34,7 +34,8 @@ _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 _ROUNDING_POWER = 1 / 12
 _FIT_STEPS = 6
 _CELLS = 64
-_MAX_TILES = 8
+MANY_TILES, FEW_TILES = 12, 8
+"""So many are measured at most; fewer tell weak noise to a third only."""
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _STEEPEST_NOISE, _LEVEL_BELOW = 2.0, 0.08
@@ -115,7 +116,11 @@ class PictureStatistics:
 
 
 def measure_picture(
-    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve, clipped: NDArray[np.uint8] | None = None
+    picture: NDArray[np.uint8],
+    field: KernelField,
+    curve: ResponseCurve,
+    clipped: NDArray[np.uint8] | None = None,
+    most_tiles: int = MANY_TILES,
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
@@ -126,7 +131,7 @@ def measure_picture(
     corners = _corners(field, luma.shape)
     if not corners or field.radius_px >= _SIDE // 2:
         return _unknown_picture(), _unknown_picture()
-    chosen = _least_clipped(clipped, corners)
+    chosen = _least_clipped(clipped, corners, most_tiles)
     kernels = field.chosen(chosen).arrays()
     passed = np.stack([_passed(kernel) for kernel in kernels])
     known = [None if clipped is None else _known(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)]
@@ -154,13 +159,15 @@ def _evenly_steep(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.f
     return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
 
 
-def _least_clipped(clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]]) -> NDArray[np.intp]:
-    """Numbers of the tiles to measure: at most eight, evenly over those with the least clipped light."""
+def _least_clipped(
+    clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]], most_tiles: int
+) -> NDArray[np.intp]:
+    """Numbers of the tiles to measure: at most so many, evenly over those with the least clipped light."""
     chosen = np.arange(len(corners))
     if clipped is not None:
         parts = np.array([np.count_nonzero(_cut(clipped, corner)) for corner in corners]) / _SIDE**2
         chosen = np.flatnonzero(parts <= max(_MAX_CLIPPED, float(np.quantile(parts, 0.25))))
-    return chosen[:: int(np.ceil(len(chosen) / _MAX_TILES))]
+    return chosen[:: int(np.ceil(len(chosen) / most_tiles))]
 
 
 def _known(
