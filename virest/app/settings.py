@@ -23,6 +23,7 @@ _RANGES: dict[str, dict[str, float]] = {
     "iterations": {"ge": 1, "le": 1000},
     "inner_iterations": {"ge": 1, "le": 1000},
     "tile_px": {"ge": 32, "le": 1024},
+    "reduction": {"ge": 1, "le": 4},
     "strength": {"gt": 0, "le": 1000},
     "min_blur_px": {"ge": 0, "le": 1000},
 }

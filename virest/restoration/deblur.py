@@ -358,7 +358,7 @@ def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSetti
 def _reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
     """The luma of a picture so many times smaller, and all that restoring it needs, to its measure; no colour."""
     height, width = blurred.light[0].shape
-    size = (int(np.ceil(width / times)), int(np.ceil(height / times)))
+    size = (max(round(width / times), 1), max(round(height / times), 1))
 
     def slopes(channel: int) -> Image:
         return cv2.resize(blurred.slopes(channel), size, interpolation=cv2.INTER_LINEAR)

@@ -45,7 +45,7 @@ class RestorationSettings:
 
 
 PRESETS: dict[str, RestorationSettings] = {
-    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144, reduction=4 / 3, strength=0.8),
+    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144, reduction=1.333, strength=0.8),
     "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5, tile_px=104, strength=1.1),
     "best": RestorationSettings(
         "best", "hyper-laplacian-global", iterations=4, inner_iterations=5, tile_px=104, strength=1.1
