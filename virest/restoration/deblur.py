@@ -27,11 +27,11 @@ CLIPPED_LEVELS = 2.0
 """A pixel this close to the top was clipped."""
 PULLED_DOWN_LEVELS = 8.0
 """Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
-COLOUR_SCALE, COARSE_COLOUR_SCALE = 2.0, 4.0
+COLOUR_SCALE, COARSE_COLOUR_SCALE = 2.0, 3.0
 COLOUR_TILE_PX = 384
 """Colour differences hold so little detail that kernels need not follow the paths as closely, nor pixels the movie's.
 
-The coarse scale, with few iterations, costs 0.02 dB.
+The coarse scale, with few iterations, costs up to 0.05 dB.
 """
 CODEC_REACH_PX = 2.5
 """A lamp's edge is smeared about so far by the movie's codec."""
