@@ -126,6 +126,40 @@ def test_rings_are_spread_over_a_packed_spectrum() -> None:
     assert spread[2 * 20, 0] == pytest.approx(1 + 20 / 96, rel=1e-3)
 
 
+def test_scaled_statistics_are_those_of_the_scaled_picture() -> None:
+    """White noise of a picture 4/3 times smaller is weaker by as much; its rings stand at higher frequencies."""
+    frequency = (np.arange(24) + 0.5) / 48
+    statistics = PictureStatistics(frequency, 1 + frequency, np.full(24, 4.0), np.ones(24), 2.0)
+    small = statistics.scaled(0.75)
+    assert small.noise_levels == pytest.approx(1.5)
+    np.testing.assert_allclose(small.noise, 1.5**2)
+    ratio = statistics.noise_to_signal
+    np.testing.assert_allclose(on_spectrum(small, ratio, 96), on_spectrum(statistics, ratio, 96, 4 / 3), rtol=1e-6)
+
+
+def test_gradients_of_a_smaller_picture_are_steeper_from_pixel_to_pixel() -> None:
+    """Over f⁻³ power, whose gradients lie at all scales, the unit grows, by less than the pixels do."""
+    frequency = (np.arange(24) + 0.5) / 48
+    statistics = PictureStatistics(frequency, frequency**-3.0, np.ones(24), np.ones(24), 1.0)
+    assert 1.0 < statistics.scaled(0.5).gradient_scale / statistics.gradient_scale < 2.0
+
+
+def test_the_finest_frequency_is_the_last_that_stands_out_of_the_noise() -> None:
+    """The highest ring whose power, as the blur passes it, is above the noise; the lowest where none is."""
+    frequency = (np.arange(24) + 0.5) / 48
+    signal = np.where(frequency < 0.3, 8.0, 1.0)
+    statistics = PictureStatistics(frequency, signal, np.full(24, 2.0), np.full(24, 0.5), 1.0)
+    assert statistics.finest == frequency[frequency < 0.3][-1]
+    assert PictureStatistics(frequency, signal, np.full(24, 9.0), np.ones(24), 3.0).finest == frequency[0]
+
+
+def test_few_tiles_measure_a_plain_noise_too() -> None:
+    """With a third of the tiles a known white noise still comes back within 15 per cent."""
+    field = _field()
+    luma, _ = measure_picture(_blurred(field, 4.0)[0], field, STRAIGHT, None, 4)
+    assert luma.noise_levels == pytest.approx(4.0, rel=0.15)
+
+
 def test_lamps_are_no_noise() -> None:
     """Clipped streaks all over leave the measured noise within 15 per cent; taken for light, they would triple it."""
     field = _field()

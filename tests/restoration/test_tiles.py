@@ -153,12 +153,21 @@ def test_what_pulls_is_0_beyond_the_picture(border: float) -> None:
 @pytest.mark.parametrize(("height", "width", "margin"), [(480, 640, 16), (1280, 720, 23), (360, 640, 8), (90, 70, 41)])
 def test_quick_tiles_cover_the_picture_and_fill_their_transforms(height: int, width: int, margin: int) -> None:
     """The grid reaches every pixel, with tiles near the side asked for and windows that sum to one."""
-    grid = quick_grid(height, width, 120, margin, 5)
+    grid = quick_grid(height, width, 120, 3 * margin, 5)
     total = np.zeros((grid.tops[-1] + grid.side, grid.lefts[-1] + grid.side))
     for (top, left), window in zip(grid.corners(), grid.windows(), strict=True):
         total[top : top + grid.side, left : left + grid.side] += window
     np.testing.assert_allclose(total[:height, :width], 1, atol=1e-6)
     assert 0.8 * 120 <= grid.side <= 1.15 * 120
+
+
+def test_a_bridge_may_be_longer_than_the_margins() -> None:
+    """Thin margins and a long bridge make one period together, and tiles that look alike share a window."""
+    grid = tile_grid(300, 260, 80, 20)
+    deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16, 40)
+    assert deconvolution.patch == 80 + 2 * 16
+    assert deconvolution.size >= deconvolution.patch + 40
+    assert len({id(window) for window in grid.windows()}) == 9
 
 
 def _lamp_behind_a_blur() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

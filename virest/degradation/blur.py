@@ -50,10 +50,13 @@ class TileGrid:
 
 @lru_cache(maxsize=8)
 def _windows(grid: TileGrid) -> list[Image]:
-    """The same for every frame of a movie; not to be written to."""
+    """The same for every frame of a movie, and one array for all that are alike; not to be written to."""
     rows = _ramps(grid.tops, grid.side, grid.overlap)
     columns = _ramps(grid.lefts, grid.side, grid.overlap)
-    return [np.outer(r, c).astype(np.float32) for r in rows for c in columns]
+    windows: dict[tuple[bytes, bytes], Image] = {}
+    return [
+        windows.setdefault((r.tobytes(), c.tobytes()), np.outer(r, c).astype(np.float32)) for r in rows for c in columns
+    ]
 
 
 def tile_grid(height: int, width: int, side: int, overlap: int) -> TileGrid:

@@ -68,9 +68,9 @@ def rotation_from_vector(vector: Array) -> Array:
     """exp: rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     squared = x * x + y * y + z * z
-    angle = np.sqrt(squared)
-    sine = np.sinc(angle / np.pi)
-    cosine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    half = np.maximum(0.5 * np.sqrt(squared), 1e-150)
+    part = np.sin(half) / half
+    sine, cosine = part * np.cos(half), 0.5 * part * part
     matrix = np.empty((*vector.shape[:-1], 3, 3))
     matrix[..., 0, 0] = 1 - cosine * (y * y + z * z)
     matrix[..., 1, 1] = 1 - cosine * (x * x + z * z)

@@ -27,17 +27,29 @@ CLIPPED_LEVELS = 2.0
 """A pixel this close to the top was clipped."""
 PULLED_DOWN_LEVELS = 8.0
 """Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
-COLOUR_SCALE = 2.0
+COLOUR_SCALE, COARSE_COLOUR_SCALE = 2.0, 3.0
 COLOUR_TILE_PX = 384
-"""Colour differences hold so little detail that kernels need not follow the paths as closely."""
+"""Colour differences hold so little detail that kernels need not follow the paths as closely, nor pixels the movie's.
+
+The coarse scale, with few iterations, costs up to 0.05 dB.
+"""
 CODEC_REACH_PX = 2.5
 """A lamp's edge is smeared about so far by the movie's codec."""
 FEW_ITERATIONS, FEW_SCALE = 2, 0.6
 """Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
+REDUCTIONS = (1.5, 4 / 3)
+"""A picture so many times smaller serves few iterations as well, where noise hides all finer detail."""
+Surroundings = tuple[float, int, int]
+FULL_MARGIN, THIN_MARGIN = (1.0, 16, 16), (0.75, 9, 12)
+"""What a tile sees around it, per length of the blur path, and at least, px; and the least length of its bridge.
+
+The bridge is as long as the path: a steep one is an edge that the deconvolution carries into the tile.  Thin margins,
+for reduced pictures, cost 0.1 dB.
+"""
 COARSE_OVERLAP, FINE_OVERLAP = 6, 4
-"""Tiles overlap by this part of their side, with few iterations and with more."""
-FIRST_BETA, LAST_BETA = 0.2, 12.0
-"""Penalties of the splitting, in units of the gradients' own scale."""
+"""Tiles overlap by this part of their side, those of colour and those of luma."""
+FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
+"""Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
 START_ITERATIONS, SETTLED_BETA = 5, 0.3
 """The whole-picture method starts from that many steps of the tiled one, so its penalties can start higher."""
 BAND_ROWS = 64
@@ -138,10 +150,10 @@ def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
 def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.uint8] | None:
     """1 where any channel of a picture (height, width, 3) is clipped; None: nowhere."""
     table = curve.clipped_table(CLIPPED_LEVELS)
-    brightest = cv2.max(cv2.max(*cv2.split(picture)[:2]), cv2.extractChannel(picture, 2))
-    if not table[int(brightest.max())]:
+    if not table[int(picture.max())]:
         return None
-    return np.asarray(cv2.LUT(brightest, table.astype(np.uint8)), np.uint8)
+    brightest = int(np.argmax(table)) - 1
+    return (cv2.inRange(picture, (0, 0, 0), (brightest,) * 3) == 0).view(np.uint8)
 
 
 def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
@@ -182,22 +194,29 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
 # ── tile by tile ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _luma_tiles(blurred: BlurredPicture, settings: RestorationSettings) -> tiles.TileDeconvolution:
-    """Tiles over the picture; more steps are worth a closer blend of neighbouring kernels."""
-    overlap_parts = FINE_OVERLAP if settings.iterations > FEW_ITERATIONS else COARSE_OVERLAP
-    return _tile_deconvolution(blurred, settings.tile_px, overlap_parts)
+def _luma_tiles(
+    blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
+) -> tiles.TileDeconvolution:
+    """Tiles over the picture."""
+    return _tile_deconvolution(blurred, settings.tile_px, FINE_OVERLAP, around=around)
 
 
 def _tile_deconvolution(
-    blurred: BlurredPicture, side: int, overlap_parts: int, scale: float = 1.0
+    blurred: BlurredPicture,
+    side: int,
+    overlap_parts: int,
+    scale: float = 1.0,
+    around: Surroundings = FULL_MARGIN,
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture, or over one that is ``scale`` times smaller, with kernels to its measure."""
     height, width = (int(np.ceil(length / scale)) for length in blurred.light[0].shape)
-    margin = int(np.clip(blurred.longest_px / scale, 16 / scale, 96))
-    grid = tiles.quick_grid(height, width, int(side / scale), margin, overlap_parts)
+    per_path, least_margin_px, least_bridge_px = around
+    margin = int(np.clip(per_path * blurred.longest_px / scale, least_margin_px / scale, 96))
+    bridge = int(np.clip(blurred.longest_px / scale, least_bridge_px / scale, 96))
+    grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts)
     field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
     kernels = field.scaled(1 / scale).arrays()
-    return tiles.TileDeconvolution(grid, kernels, margin)
+    return tiles.TileDeconvolution(grid, kernels, margin, bridge)
 
 
 def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
@@ -252,11 +271,12 @@ def _luma(light: list[Image]) -> Image:
 def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> list[Image]:
     """Red, green and blue of a sharp luma and the colour differences, which hold little detail.
 
-    These are filtered at half size, since a movie stores no more of them, by the measured Wiener filter.
+    These are filtered at half size or less, since a movie stores no more of them, by the measured Wiener filter.
     """
     height, width = sharp.shape
-    deconvolution = _tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, COLOUR_SCALE)
-    ratios = _noise_to_signal(deconvolution, settings, blurred.chroma, COLOUR_SCALE)
+    scale = COLOUR_SCALE if settings.iterations > FEW_ITERATIONS else COARSE_COLOUR_SCALE
+    deconvolution = _tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, scale)
+    ratios = _noise_to_signal(deconvolution, settings, blurred.chroma, scale)
     red, blue = (
         cv2.resize(
             deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(plane), *ratios)),
@@ -322,8 +342,17 @@ def _measured_part(holes: Image) -> Image:
 
     A sharp edge of the weights would show as an outline around the lamp.
     """
-    wide = cv2.GaussianBlur(cv2.dilate(holes, np.ones((5, 5), np.uint8)), (0, 0), CODEC_REACH_PX)
-    return (1 - holes) * (1 - wide)
+    part = np.ones_like(holes)
+    near = _around(holes, int(4 * CODEC_REACH_PX) + 3)
+    wide = cv2.GaussianBlur(cv2.dilate(holes[near], np.ones((5, 5), np.uint8)), (0, 0), CODEC_REACH_PX)
+    part[near] = (1 - holes[near]) * (1 - wide)
+    return part
+
+
+def _around(mask: Image, reach: int) -> tuple[slice, slice]:
+    """Rows and columns of all that is not 0 in a mask (height, width), and so many pixels more on each side."""
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
 
 
 def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
@@ -347,11 +376,51 @@ def _projected_luma(
 
 def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
-    return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
+    times = _reduction(blurred.statistics, settings)
+    if times == 1.0:
+        return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
+    height, width = blurred.light[0].shape
+    small = replace(settings, tile_px=round(settings.tile_px / times))
+    sharp = _tile_hyper_laplacian(_reduced(blurred, times), small, THIN_MARGIN)
+    return _with_colour(blurred, cv2.resize(sharp, (width, height), interpolation=cv2.INTER_CUBIC), settings)
 
 
-def _tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> Image:
-    deconvolution = _luma_tiles(blurred, settings)
+def _reduction(statistics: PictureStatistics, settings: RestorationSettings) -> float:
+    """How many times smaller the luma is restored: as much as loses nothing that stands out of the noise."""
+    few = settings.iterations <= FEW_ITERATIONS
+    return next((times for times in REDUCTIONS if few and statistics.finest < 0.5 / times), 1.0)
+
+
+def _reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
+    """The luma of a picture so many times smaller, and all that restoring it needs, to its measure; no colour."""
+    height, width = blurred.light[0].shape
+    size = (max(round(width / times), 1), max(round(height / times), 1))
+
+    def slopes(channel: int, side_px: int) -> Image:
+        return cv2.resize(blurred.slopes(channel, round(side_px * times)), size, interpolation=cv2.INTER_LINEAR)
+
+    def field(centres_px: NDArray[np.float64]) -> KernelField:
+        return blurred.field((centres_px + 0.5) * times - 0.5).scaled(1 / times)
+
+    luma, holes = cv2.resize(_luma(blurred.light), size, interpolation=cv2.INTER_LINEAR), _holes(blurred)
+    if holes is not None:
+        holes = (cv2.resize(holes, size, interpolation=cv2.INTER_AREA) > 0).astype(np.float32)
+    return replace(
+        blurred,
+        light=[luma] * 3,
+        slopes=slopes,
+        dark=[None] * 3,
+        clipped=[holes] * 3,
+        statistics=blurred.statistics.scaled(1 / times),
+        field=field,
+        longest_px=blurred.longest_px / times,
+    )
+
+
+def _tile_hyper_laplacian(
+    blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
+) -> Image:
+    deconvolution = _luma_tiles(blurred, settings, around)
     statistics, few = blurred.statistics, settings.iterations <= FEW_ITERATIONS
     unit = statistics.gradient_scale * (FEW_SCALE if few else 1.0)
     noise = settings.strength * np.array([statistics.noise_levels, _border_noise(blurred)])
@@ -436,7 +505,7 @@ def _pull_along(
 def _beta_schedule(iterations: int, first: float = FIRST_BETA) -> tuple[float, ...]:
     """Rising penalties of the half-quadratic splitting, in units of the gradients' own scale."""
     if iterations <= FEW_ITERATIONS:
-        return (FIRST_BETA, 2.0)[-max(iterations, 1) :]
+        return FEW_BETAS[-max(iterations, 1) :]
     return tuple(float(b) for b in np.geomspace(first, LAST_BETA, iterations))
 
 

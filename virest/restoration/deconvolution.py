@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,14 +40,14 @@ def richardson_lucy(
     f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.  relaxation: each step goes so many times
     as far, but never below a fifth.
     """
-    sharp: Image = np.maximum(start, 1e-4).astype(np.float32)
-    seen = adjoint(weight) + _UNSEEN
+    sharp: Image = cv2.max(start, 1e-4)
+    seen, weighted = cv2.add(adjoint(weight), _UNSEEN), cv2.multiply(weight, observed)
     for _ in range(iterations):
-        ratio: Image = (weight * observed / np.maximum(apply(sharp), 1e-4)).astype(np.float32)
-        change = np.maximum(adjoint(ratio) + _UNSEEN, 0) / seen
+        ratio = cv2.divide(weighted, cv2.max(apply(sharp), 1e-4))
+        change = cv2.divide(cv2.max(cv2.add(adjoint(ratio), _UNSEEN), 0.0), seen)
         if relaxation != 1.0:
-            change = np.maximum(1 + np.float32(relaxation) * (change - 1), _LEAST_CHANGE)
-        sharp = np.maximum(sharp * change, 1e-5).astype(np.float32)
+            change = cv2.max(cv2.addWeighted(change, relaxation, change, 0.0, 1 - relaxation), _LEAST_CHANGE)
+        sharp = cv2.max(cv2.multiply(sharp, change), 1e-5)
     return sharp
 
 

@@ -22,6 +22,7 @@ from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
 from virest.restoration.deblur import (
     BAND_ROWS,
+    FEW_ITERATIONS,
     BlurredPicture,
     blurred_picture,
     clipped_anywhere,
@@ -31,7 +32,7 @@ from virest.restoration.deblur import (
 )
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
-from virest.restoration.statistics import PictureStatistics, falling_power, measure_picture
+from virest.restoration.statistics import FEW_TILES, MANY_TILES, PictureStatistics, falling_power, measure_picture
 
 LOG_TILE_PX = 128
 """Spacing of the tiles in the log."""
@@ -285,7 +286,8 @@ def _deblurred(
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
-    luma, chroma = _measured(picture, samples, curve)
+    tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
+    luma, chroma = _measured(picture, samples, curve, tiles)
     share = 1.0 if anchor != 0.5 else _trusted_share(luma)
     why_not = _too_little_to_gain(luma)
     if why_not:
@@ -318,14 +320,14 @@ def _deblurred(
 
 
 def _measured(
-    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve
+    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve, most_tiles: int
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Statistics of luma and chroma. Noise shows where the paths cancel; a Gaussian, the same all round, hides it.
 
     So the paths alone are fitted, which measures the noise and the defocused picture, and that is focused afterwards.
     """
     luma, chroma = measure_picture(
-        picture, replace(field, defocus_sigma_px=0.0), curve, clipped_anywhere(picture, curve)
+        picture, replace(field, defocus_sigma_px=0.0), curve, clipped_anywhere(picture, curve), most_tiles
     )
     return _focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px)
 

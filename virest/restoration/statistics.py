@@ -34,7 +34,8 @@ _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 _ROUNDING_POWER = 1 / 12
 _FIT_STEPS = 6
 _CELLS = 64
-_MAX_TILES = 12
+MANY_TILES, FEW_TILES = 12, 8
+"""So many are measured at most; fewer tell weak noise to a third only."""
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _STEEPEST_NOISE, _LEVEL_BELOW = 2.0, 0.08
@@ -92,8 +93,24 @@ class PictureStatistics:
         """Unit u of the prior exp(−|∇f/u|^⅔): of edges, that stand out of the sharp picture's mean square gradient."""
         # forward differences pass 4 sin²(π f_x); its mean over a ring's directions is 2 − 2 J0(2π f)
         gain = 2 - 2 * _bessel_j0(2 * np.pi * self.frequency)
-        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0])
+        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]) * (self.frequency < 0.5)
         return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
+
+    @property
+    def finest(self) -> float:
+        """Highest frequency, in cycles per pixel, at which more of the picture than of noise comes through the blur."""
+        clear = np.flatnonzero(self.passed * self.signal > self.noise)
+        return float(self.frequency[clear[-1] if len(clear) else 0])
+
+    def scaled(self, scale: float) -> PictureStatistics:
+        """Those of the same picture ``scale`` times as large, each pixel the mean of what it covers; the rings stay."""
+        return replace(
+            self,
+            frequency=self.frequency / scale,
+            signal=scale**2 * self.signal,
+            noise=scale**2 * self.noise,
+            noise_levels=scale * self.noise_levels,
+        )
 
     @property
     def expected_gain_db(self) -> float:
@@ -108,7 +125,11 @@ class PictureStatistics:
 
 
 def measure_picture(
-    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve, clipped: NDArray[np.uint8] | None = None
+    picture: NDArray[np.uint8],
+    field: KernelField,
+    curve: ResponseCurve,
+    clipped: NDArray[np.uint8] | None = None,
+    most_tiles: int = MANY_TILES,
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
@@ -119,7 +140,7 @@ def measure_picture(
     corners = _corners(field, luma.shape)
     if not corners or field.radius_px >= _SIDE // 2:
         return _unknown_picture(), _unknown_picture()
-    chosen = _least_clipped(clipped, corners)
+    chosen = _least_clipped(clipped, corners, most_tiles)
     kernels = field.chosen(chosen).arrays()
     passed = np.stack([_passed(kernel) for kernel in kernels])
     known = [None if clipped is None else _known(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)]
@@ -131,10 +152,11 @@ def measure_picture(
     tiles = zip(chosen, known, strict=True)
     light = np.stack([_windowed_power(_evenly_steep(_cut(picture, corners[i]), curve), seen) for i, seen in tiles])
     colour = (observed(red, 2) + observed(blue, 2)) * np.float32(0.5)
-    noise_levels = _fit_rings(light, passed, white_noise(luma)).noise_levels
+    cells, white_levels = _RingCells(passed), white_noise(luma)
+    noise_levels = _fit_rings(light, cells, white_levels).noise_levels
     return (
-        replace(_fit_rings(observed(luma, 1), passed, white_noise(luma)), noise_levels=noise_levels),
-        _fit_rings(colour, passed[::2], white_noise(red)),
+        replace(_fit_rings(observed(luma, 1), cells, white_levels), noise_levels=noise_levels),
+        _fit_rings(colour, _RingCells(passed[::2]), white_noise(red)),
     )
 
 
@@ -146,13 +168,15 @@ def _evenly_steep(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.f
     return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
 
 
-def _least_clipped(clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]]) -> NDArray[np.intp]:
-    """Numbers of the tiles to measure: a dozen, evenly over those with the least clipped light."""
+def _least_clipped(
+    clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]], most_tiles: int
+) -> NDArray[np.intp]:
+    """Numbers of the tiles to measure: at most so many, evenly over those with the least clipped light."""
     chosen = np.arange(len(corners))
     if clipped is not None:
         parts = np.array([np.count_nonzero(_cut(clipped, corner)) for corner in corners]) / _SIDE**2
         chosen = np.flatnonzero(parts <= max(_MAX_CLIPPED, float(np.quantile(parts, 0.25))))
-    return chosen[:: int(np.ceil(len(chosen) / _MAX_TILES))]
+    return chosen[:: int(np.ceil(len(chosen) / most_tiles))]
 
 
 def _known(
@@ -249,25 +273,37 @@ def _ring_index(side: int) -> NDArray[np.intp]:
     )
 
 
-def _fit_rings(observed: NDArray[np.float32], passed: NDArray[np.float32], white_levels: float) -> PictureStatistics:
-    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
-    share = np.minimum((passed * _CELLS).astype(np.intp), _CELLS - 1)
-    cell = (_ring_index(_SIDE) * _CELLS + share).ravel()
+class _RingCells:
+    """The places of all tiles' spectra, sorted into cells of equal ring and nearly equal |K|²."""
 
-    def per_cell(values: NDArray[np.float32] | None) -> Array:
-        weights = None if values is None else values.ravel()
-        sums = np.bincount(cell, weights, (RINGS + 1) * _CELLS).astype(np.float64)
+    def __init__(self, passed: NDArray[np.float32]) -> None:
+        """passed: |K|² of each tile, as :func:`_power` orders it."""
+        share = np.minimum((passed * np.float32(_CELLS)).astype(np.intp), _CELLS - 1)
+        self._cell = (_ring_index(_SIDE) * _CELLS + share).ravel()
+        self.count = self._sums(None)
+        """(RINGS, _CELLS) places in each cell."""
+        self.passed = self.means(passed)
+
+    def means(self, values: NDArray[np.float32]) -> Array:
+        """(RINGS, _CELLS) mean of each cell; 0 where it is empty."""
+        return np.asarray(self._sums(values.ravel()) / np.maximum(self.count, 1))
+
+    def _sums(self, weights: NDArray[np.float32] | None) -> Array:
+        sums = np.bincount(self._cell, weights, (RINGS + 1) * _CELLS).astype(np.float64)
         return sums[: RINGS * _CELLS].reshape(RINGS, _CELLS)
 
-    count = per_cell(None)
-    g, k = (per_cell(v) / np.maximum(count, 1) for v in (observed, passed))
+
+def _fit_rings(observed: NDArray[np.float32], cells: _RingCells, white_levels: float) -> PictureStatistics:
+    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
+    count, g, k = cells.count, cells.means(observed), cells.passed
     in_ring = np.maximum(count.sum(1), 1)
     mean_k, mean_g = (count * k).sum(1) / in_ring, (count * g).sum(1) / in_ring
     signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
+    products = np.stack([np.ones_like(k), k, k * k, g, k * g], -1)
     for _ in range(_FIT_STEPS):
         expected = np.maximum(noise[:, None] + signal[:, None] * k, 1e-6)
         weight = count / (expected * np.sqrt(expected))
-        w, wk, wkk, wg, wkg = (np.sum(weight * v, 1) for v in (np.ones_like(k), k, k * k, g, k * g))
+        w, wk, wkk, wg, wkg = (weight[:, None] @ products)[:, 0].T
         determinant = np.maximum(w * wkk - wk * wk, 1e-30)
         signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
@@ -365,7 +401,7 @@ def on_spectrum(
 
     scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.
     """
-    below, part, falling = _between_rings(size, scale)
+    below, part, falling = _between_rings(size, scale * float(statistics.frequency[0] + statistics.frequency[-1]) / 0.5)
     levels = np.log(ring_values).astype(np.float32)
     values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below])
     return np.asarray(values * falling, np.float32)

@@ -1,0 +1,73 @@
+"""A picture whose luma is restored smaller: to the measure of the smaller picture in everything."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from virest.camera.response import ResponseCurve
+from virest.degradation.kernels import KernelField
+from virest.restoration import deblur
+from virest.restoration.statistics import PictureStatistics
+
+HEIGHT, WIDTH = 120, 168
+CURVE = ResponseCurve("srgb")
+
+
+def _field(centres_px: NDArray[np.float64]) -> KernelField:
+    """Straight paths along x, longer by a hundredth of a pixel for every pixel to the right."""
+    length = 10 + 0.01 * centres_px[:, 0, None]
+    along = length * np.linspace(-0.5, 0.5, 31)
+    return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5)
+
+
+def _blurred(picture: NDArray[np.uint8]) -> deblur.BlurredPicture:
+    frequency = (np.arange(24) + 0.5) / 48
+    statistics = PictureStatistics(frequency, frequency**-3.0, np.ones(24), np.ones(24), 1.0)
+    return deblur.blurred_picture(picture, CURVE, (statistics, statistics), _field, 12.0)
+
+
+def test_kernels_and_light_go_to_the_smaller_picture() -> None:
+    """A pixel of the small picture has the kernel of the place that it shows, shortened; one grey stays that grey."""
+    small = deblur._reduced(_blurred(np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8)), 1.5)
+    assert small.light[0].shape == (80, 112)
+    assert np.ptp(small.light[0]) < 1e-6
+    assert small.slopes(1, 40).shape == (80, 112)
+    at = np.array([[20.0, 30.0]])
+    np.testing.assert_allclose(small.field(at).paths_px * 1.5, _field((at + 0.5) * 1.5 - 0.5).paths_px)
+    assert small.longest_px == pytest.approx(8.0)
+    assert small.clipped == [None] * 3
+
+
+def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
+    """A lamp of one channel is a hole of the small picture that covers all of it, and nothing far from it."""
+    picture = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+    picture[40:47, 90:101, 0] = 255
+    hole = deblur._reduced(_blurred(picture), 1.5).clipped[0]
+    assert hole is not None
+    rows, columns = np.nonzero(hole)
+    assert (rows.min(), rows.max()) == (26, 31)
+    assert (columns.min(), columns.max()) == (60, 67)
+
+
+def test_the_measured_part_is_looked_for_around_holes_only() -> None:
+    """It is 0 in the holes, rises within the codec's reach, and is 1 beyond; at the picture's corner too."""
+    holes = np.zeros((HEIGHT, WIDTH), np.float32)
+    holes[2:9, 3:14] = 1
+    part = deblur._measured_part(holes)
+    assert part[holes > 0].max() == 0
+    assert 0 < part[5, 18] < part[5, 22] < 1
+    assert part[5, 40] == part[60, 5] == 1
+    assert (np.diff(part[5, 14:40]) >= -1e-6).all()
+
+
+def test_any_channel_may_be_clipped() -> None:
+    """1 where the brightest channel is clipped, whichever it is, and None where none is."""
+    picture = np.full((30, 44, 3), 100, np.uint8)
+    assert deblur.clipped_anywhere(picture, CURVE) is None
+    picture[3, 5, 0] = picture[7, 11, 1] = picture[13, 17, 2] = 255
+    found = deblur.clipped_anywhere(picture, CURVE)
+    assert found is not None
+    assert np.argwhere(found).tolist() == [[3, 5], [7, 11], [13, 17]]
+    assert found.max() == 1
