@@ -139,12 +139,16 @@ def _exponential_means(x: Array) -> tuple[Array, Array]:
 
 
 def _running_response(decay: Array, drive: Array) -> Array:
-    """θ[0] = 0, θ[k + 1] = decay[k] θ[k] + drive[k], by doubling: log2(n) vectorised passes. Returns (n + 1, 2)."""
-    value = np.concatenate([np.zeros((1, drive.shape[1])), drive])
-    kept = np.concatenate([[0.0], decay])
-    reach = 1
-    while reach < len(kept):
-        value[reach:] = value[reach:] + kept[reach:, None] * value[:-reach]
-        kept[reach:] = kept[reach:] * kept[:-reach]
-        reach *= 2
-    return value
+    """θ[0] = 0, θ[k + 1] = decay[k] θ[k] + drive[k]. Returns (n + 1, 2)."""
+    return np.concatenate([np.zeros((1, drive.shape[1])), _responses(decay[:, None], drive)])
+
+
+def _responses(decay: Array, drive: Array) -> Array:
+    """θ[1:], from every other step: two steps are one with both decays. log2(n) vectorised passes, 2 n steps in all."""
+    if len(drive) < 2:
+        return drive
+    found = np.empty_like(drive)
+    found[0] = drive[0]
+    found[1::2] = _responses(decay[:-1:2] * decay[1::2], decay[1::2] * drive[:-1:2] + drive[1::2])
+    found[2::2] = decay[2::2] * found[1:-1:2] + drive[2::2]
+    return found

@@ -21,8 +21,8 @@ from scipy.interpolate import CubicHermiteSpline
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.motion.displacement import Displacement, integrate_accelerometer
-from virest.motion.integration import integrate_gyro
+from virest.motion.displacement import Displacement, force_at_samples, integrate_accelerometer
+from virest.motion.integration import gyro_polynomials, integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.tracking import TrackPair
@@ -103,6 +103,17 @@ class Ground:
     trajectory: Trajectory
     displacement: Displacement | None
     lens: MovingLens
+    measured: Measured
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the inertial samples say whatever the profile: the work that is done once."""
+
+    gyro: Array
+    """As :func:`gyro_polynomials` gives it."""
+    force: tuple[Array, Array] | None
+    """As :func:`force_at_samples` gives it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,11 +156,14 @@ class Prediction:
         return self.poses.second_s
 
 
-def ground(imu: ImuSamples, profile: CameraProfile, *, translation: bool) -> Ground:
-    """Integrate the inertial samples with a profile's bias, scale and rotation."""
-    trajectory = integrate_gyro(imu, profile)
-    displacement = integrate_accelerometer(imu, profile, trajectory) if translation else None
-    return Ground(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S))
+def ground(
+    imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None
+) -> Ground:
+    """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier ground."""
+    measured = measured or Measured(gyro_polynomials(imu), force_at_samples(imu) if translation else None)
+    trajectory = integrate_gyro(imu, profile, measured.gyro)
+    displacement = integrate_accelerometer(imu, profile, trajectory, measured.force) if translation else None
+    return Ground(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S), measured)
 
 
 def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Ground:
@@ -157,7 +171,7 @@ def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Grou
     before, kept = known.profile, known
     same = ("gyro_bias_rad_s", "gyro_scale", "p_cam_imu_m")
     if any(getattr(before, name) != getattr(profile, name) for name in same):
-        return ground(imu, profile, translation=known.displacement is not None)
+        return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
     if before.r_cam_imu != profile.r_cam_imu:
         known = _turned_about(known, profile.rotation_cam_imu @ before.rotation_cam_imu.T)
     if known.trajectory is not kept.trajectory or before.intrinsics != profile.intrinsics or _moves(before, profile):
