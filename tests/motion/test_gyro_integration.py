@@ -60,7 +60,7 @@ def test_steps_are_multiplied_up_in_order(samples: int) -> None:
     """The turns at the samples are those of one step after another, for odd and even numbers of them."""
     imu = recorded(np.arange(samples) * 0.02)
     found = integrate_gyro(imu, PROFILE, gyro_polynomials(imu))
-    a, b, c, d = found.rate_polynomials * np.array([1 / 4, 1 / 3, 1 / 2, 1.0])[:, None, None]
+    a, b, c, d = np.swapaxes(found.rate_polynomials, 1, 2) * np.array([1 / 4, 1 / 3, 1 / 2, 1.0])[:, None, None]
     step = 0.02
     turn = np.eye(3)
     for k in range(samples - 1):

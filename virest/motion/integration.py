@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
-from virest.motion.trajectory import Trajectory, coning, rotation_from_vector
+from virest.motion.trajectory import Trajectory, rotation_from_vector, turned_angle
 
 Array = NDArray[np.float64]
 GAP_PERIODS = 5.0
@@ -24,16 +24,12 @@ def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: Array | No
     ImuError if fewer than two samples are given.
     """
     polynomials = _camera_rate(gyro_polynomials(imu) if measured is None else measured, profile)
-    step_s = np.diff(imu.time_s)[:, None]
-    a, b, c, d = polynomials
-    angle = step_s * (d + step_s * (c / 2 + step_s * (b / 3 + step_s * a / 4)))
-    end_rate = ((a * step_s + b) * step_s + c) * step_s + d
-    steps = rotation_from_vector(angle + coning(d, end_rate, step_s))
+    steps = rotation_from_vector(turned_angle(*polynomials, np.diff(imu.time_s)).T)
     return Trajectory(imu.time_s, _running_product(steps), polynomials)
 
 
 def gyro_polynomials(imu: ImuSamples) -> Array:
-    """Measured rate between the samples, IMU axes: cubic pieces (4, n − 1, 3), highest power first.
+    """Measured rate between the samples, IMU axes: cubic pieces (4, 3, n − 1), highest power first.
 
     Straight lines across gaps and in runs too short for a spline.  No profile changes them.  Raises ImuError if fewer
     than two samples are given.
@@ -42,21 +38,22 @@ def gyro_polynomials(imu: ImuSamples) -> Array:
         raise ImuError(f"{len(imu)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
     time_s, rate = imu.time_s, imu.gyro_rad_s
     step = np.diff(time_s)
-    pieces = np.zeros((4, len(step), 3))
-    pieces[2] = np.diff(rate, axis=0) / step[:, None]
-    pieces[3] = rate[:-1]
+    pieces = np.zeros((4, 3, len(step)))
+    pieces[2] = np.diff(rate.T) / step
+    pieces[3] = rate[:-1].T
     breaks = np.flatnonzero(step > GAP_PERIODS * np.median(step)) + 1
     for run in np.split(np.arange(len(time_s)), breaks):
         if len(run) >= 4:
-            pieces[:, run[0] : run[-1]] = CubicSpline(time_s[run], rate[run], axis=0).c
+            spline = CubicSpline(time_s[run], rate[run], axis=0)
+            pieces[:, :, run[0] : run[-1]] = np.swapaxes(spline.c, 1, 2)
     return pieces
 
 
 def _camera_rate(measured: Array, profile: CameraProfile) -> Array:
-    """True rate in camera axes of measured pieces (4, n − 1, 3): R_cam_imu (measured − bias) / scale, which is linear."""
+    """True rate in camera axes of measured pieces (4, 3, n − 1): R_cam_imu (measured − bias) / scale, which is linear."""
     unbiased = measured.copy()
-    unbiased[3] -= np.array(profile.gyro_bias_rad_s)
-    return np.asarray(unbiased @ (profile.rotation_cam_imu / np.array(profile.gyro_scale)).T)
+    unbiased[3] -= np.array(profile.gyro_bias_rad_s)[:, None]
+    return np.asarray((profile.rotation_cam_imu / np.array(profile.gyro_scale)) @ unbiased)
 
 
 def _running_product(steps: Array) -> Array:

@@ -26,7 +26,7 @@ from virest.motion.integration import gyro_polynomials, integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.tracking import TrackPair
-from virest.motion.trajectory import Trajectory, rotation_from_vector
+from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -156,9 +156,7 @@ class Prediction:
         return self.poses.second_s
 
 
-def ground(
-    imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None
-) -> Ground:
+def ground(imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None) -> Ground:
     """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier ground."""
     measured = measured or Measured(gyro_polynomials(imu), force_at_samples(imu) if translation else None)
     trajectory = integrate_gyro(imu, profile, measured.gyro)
@@ -188,7 +186,7 @@ def _moves(before: CameraProfile, after: CameraProfile) -> bool:
 def _turned_about(known: Ground, turn: Array) -> Ground:
     """The ground with the camera's axes turned on the IMU, (3, 3): everything in camera and world axes turns along."""
     way = known.trajectory
-    trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, way.rate_polynomials @ turn.T)
+    trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, turn @ way.rate_polynomials)
     if known.displacement is None:
         return replace(known, trajectory=trajectory)
     old = known.displacement
@@ -294,8 +292,8 @@ def _poses(known: Ground, table: TrackTable, like: Prediction | None) -> Poses:
         same = old.trajectory is known.trajectory and old.exposure_scale == scale
         if same and np.array_equal(first_s, old.first_s) and np.array_equal(second_s, old.second_s):
             return old
-    before = mean_orientation(known.trajectory, first_s, scale * table.first_exposure_s)
-    after = mean_orientation(known.trajectory, second_s, scale * table.second_exposure_s)
+    before = known.trajectory.mean_orientation(first_s, scale * table.first_exposure_s)
+    after = known.trajectory.mean_orientation(second_s, scale * table.second_exposure_s)
     return Poses(known.trajectory, scale, first_s, second_s, before, np.swapaxes(after, -1, -2))
 
 
@@ -397,12 +395,6 @@ def centre(
     """Camera centre (n, 3) from its place at origin_s, world axes, and its changes per bias (n, 3, 3), delay (n, 3)."""
     path = Paths(time_s - origin_s, *displacement.at(time_s, origin_s))
     return path.centre(scene, velocity), path.per_bias, path.per_delay
-
-
-def mean_orientation(trajectory: Trajectory, middle_s: Array, exposure_s: Array) -> Array:
-    """R_world_cam averaged over exposures about the times (n,): R exp(ω' E² / 24), to second order."""
-    bend = trajectory.angular_acceleration_rad_s2(middle_s) * (exposure_s**2 / 24)[:, None]
-    return trajectory.orientation(middle_s) @ rotation_from_vector(bend)
 
 
 def turned(rotation: Array, rays: Array) -> Array:
