@@ -24,7 +24,7 @@ def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: Array | No
     ImuError if fewer than two samples are given.
     """
     polynomials = _camera_rate(gyro_polynomials(imu) if measured is None else measured, profile)
-    steps = rotation_from_vector(turned_angle(*polynomials, np.diff(imu.time_s)).T)
+    steps = rotation_from_vector(turned_angle(polynomials, np.diff(imu.time_s)).T)
     return Trajectory(imu.time_s, _running_product(steps), polynomials)
 
 
@@ -50,7 +50,7 @@ def gyro_polynomials(imu: ImuSamples) -> Array:
 
 
 def _camera_rate(measured: Array, profile: CameraProfile) -> Array:
-    """True rate in camera axes of measured pieces (4, 3, n − 1): R_cam_imu (measured − bias) / scale, which is linear."""
+    """True rate in camera axes of measured pieces (4, 3, n − 1): R_cam_imu (measured − bias) / scale."""
     unbiased = measured.copy()
     unbiased[3] -= np.array(profile.gyro_bias_rad_s)[:, None]
     return np.asarray((profile.rotation_cam_imu / np.array(profile.gyro_scale)) @ unbiased)

@@ -46,7 +46,7 @@ class Trajectory:
     def orientation(self, time_s: Any) -> Array:
         """R_world_cam (..., 3, 3) at times (...)."""
         interval, since = self._locate(np.asarray(time_s, float))
-        angle = turned_angle(*self.rate_polynomials.take(interval, axis=2), since)
+        angle = turned_angle(self.rate_polynomials.take(interval, axis=2), since)
         return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*angle))
 
     def mean_orientation(self, middle_s: Array, exposure_s: Array) -> Array:
@@ -55,8 +55,9 @@ class Trajectory:
         The two turns since the knot are put together as exp(u) exp(v) ≈ exp(u + v + ½ u × v): v is some 1e-4 rad.
         """
         interval, since = self._locate(middle_s)
-        a, b, c, d = self.rate_polynomials.take(interval, axis=2)
-        angle = turned_angle(a, b, c, d, since)
+        pieces = self.rate_polynomials.take(interval, axis=2)
+        angle = turned_angle(pieces, since)
+        a, b, c, _ = pieces
         bend = ((3 * a * since + 2 * b) * since + c) * (exposure_s**2 / 24)
         both = angle + bend + 0.5 * _cross(angle, bend)
         return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*both))
@@ -68,12 +69,13 @@ class Trajectory:
         return interval, held - self.time_s[interval]
 
 
-def turned_angle(a: Array, b: Array, c: Array, d: Array, since_s: Array) -> Array:
-    """Rotation vector (3, ...) after so many seconds at the rate ((a t + b) t + c) t + d, each (3, ...).
+def turned_angle(pieces: Array, since_s: Array) -> Array:
+    """Rotation vector (3, ...) after so many seconds at the rate of polynomials (4, 3, ...), highest power first.
 
     The rate's integral and the second term of the Magnus series for a rate that changes linearly: Δt²/12 ω₀ × ω₁ (body
     axes).
     """
+    a, b, c, d = pieces
     end_rate = ((a * since_s + b) * since_s + c) * since_s + d
     angle = since_s * (d + since_s * (c / 2 + since_s * (b / 3 + since_s * (a / 4))))
     return np.asarray(angle + since_s**2 / 12.0 * _cross(d, end_rate))
