@@ -375,10 +375,9 @@ def climb_blur(
         verdict.notes.append("too little texture to measure local blur")
         return verdict, False
     effects: tuple[Any, ...] = (local_blur_fit.ExposureTime(), local_blur_fit.Defocus())
-    fitted = local_blur_fit.fit(observations, profile, trajectory, effects)
+    fitted, plain = each(local_blur_fit.fit, [(observations, profile, trajectory, some) for some in (effects, ())])
     log.debug("blur: %s ± %s", fitted.values, fitted.std)
     everything = np.ones(len(observations), bool)
-    plain = local_blur_fit.fit(observations, profile, trajectory, ())
     verdict.blur_rms_px = local_blur_fit.judge(observations, plain, trajectory, everything)
     is_exposure = _exposure_holds(fitted, exposure_hypothesis)
     named = []
