@@ -172,8 +172,10 @@ def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Grou
         return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
     if before.r_cam_imu != profile.r_cam_imu:
         known = _turned_about(known, profile.rotation_cam_imu @ before.rotation_cam_imu.T)
-    if known.trajectory is not kept.trajectory or before.intrinsics != profile.intrinsics or _moves(before, profile):
-        known = replace(known, lens=moving_lens(known.trajectory, profile, SHIFT_STEP_S))
+    turned_along = known.trajectory is not kept.trajectory
+    if turned_along or before.intrinsics != profile.intrinsics or _moves(before, profile):
+        like = None if turned_along else kept.lens
+        known = replace(known, lens=moving_lens(known.trajectory, profile, SHIFT_STEP_S, like))
     return replace(known, profile=profile)
 
 
