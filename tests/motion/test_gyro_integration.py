@@ -10,7 +10,8 @@ from synthetic_motion import R_CAM_IMU, Motion
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
-from virest.motion.integration import camera_rate, integrate_gyro
+from virest.motion.integration import gyro_polynomials, integrate_gyro
+from virest.motion.trajectory import rotation_from_vector
 
 MOTION = Motion(
     amplitude_rad_s=np.array([[0.8, -0.3, 0.5], [0.2, 0.6, -0.4]]),
@@ -48,9 +49,25 @@ def test_partial_intervals_are_integrated_exactly(jitter_s: float) -> None:
 def test_rate_is_the_analytic_one() -> None:
     """Bias, scale and axes are undone, also between samples."""
     imu = recorded(np.arange(0, 1, 1 / 400))
-    np.testing.assert_allclose(camera_rate(imu, PROFILE), MOTION.rate(imu.time_s), atol=1e-12)
+    trajectory = integrate_gyro(imu, PROFILE)
+    np.testing.assert_allclose(trajectory.rate_rad_s(imu.time_s), MOTION.rate(imu.time_s), atol=1e-12)
     between_s = np.array([0.1234, 0.5678])
-    np.testing.assert_allclose(integrate_gyro(imu, PROFILE).rate_rad_s(between_s), MOTION.rate(between_s), atol=2e-5)
+    np.testing.assert_allclose(trajectory.rate_rad_s(between_s), MOTION.rate(between_s), atol=2e-5)
+
+
+@pytest.mark.parametrize("samples", [2, 3, 4, 5, 8, 9, 64, 157])
+def test_steps_are_multiplied_up_in_order(samples: int) -> None:
+    """The turns at the samples are those of one step after another, for odd and even numbers of them."""
+    imu = recorded(np.arange(samples) * 0.02)
+    found = integrate_gyro(imu, PROFILE, gyro_polynomials(imu))
+    a, b, c, d = np.swapaxes(found.rate_polynomials, 1, 2) * np.array([1 / 4, 1 / 3, 1 / 2, 1.0])[:, None, None]
+    step = 0.02
+    turn = np.eye(3)
+    for k in range(samples - 1):
+        start, end = found.rate_rad_s(imu.time_s[k]), found.rate_rad_s(imu.time_s[k + 1])
+        angle = step * (d[k] + step * (c[k] + step * (b[k] + step * a[k])))
+        turn = turn @ rotation_from_vector(angle + step**2 / 12 * np.cross(start, end))
+        np.testing.assert_allclose(found.rotation_world_cam[k + 1], turn, atol=1e-12)
 
 
 def test_a_gap_is_bridged_by_a_straight_line() -> None:

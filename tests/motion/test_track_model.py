@@ -16,7 +16,7 @@ from virest.motion import profile_terms as terms_of
 from virest.motion.integration import integrate_gyro
 from virest.motion.scene_motion import DirectedMotion
 from virest.motion.track_fit import Term
-from virest.motion.track_model import ground, mean_orientation, predict, seen_s, with_profile
+from virest.motion.track_model import ground, predict, seen_s, with_profile
 
 LANDSCAPE = {"width": 640, "height": 480, "centre_px": (331.0, 226.0)}
 FAR = {
@@ -128,7 +128,7 @@ def test_mean_orientation_is_the_mean_over_the_exposure() -> None:
     recording = recorded(replace(FAR["portrait, read from the right"], rate_rad_s=1.5))
     trajectory = integrate_gyro(recording.imu, recording.profile)
     middle_s, exposure_s = np.array([0.21, 0.4, 0.77]), np.array([0.04, 0.03, 0.04])
-    found = Rotation.from_matrix(mean_orientation(trajectory, middle_s, exposure_s))
+    found = Rotation.from_matrix(trajectory.mean_orientation(middle_s, exposure_s))
     nodes = np.linspace(-0.5, 0.5, 401)[:-1] + 0.5 / 400
     truth = Rotation.concatenate(
         [
@@ -140,7 +140,7 @@ def test_mean_orientation_is_the_mean_over_the_exposure() -> None:
     bend = (plain.inv() * truth).magnitude()
     assert bend.min() > 1e-4
     assert ((found.inv() * truth).magnitude() < 0.05 * bend).all()
-    np.testing.assert_allclose(mean_orientation(trajectory, middle_s, 0 * exposure_s), plain.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(trajectory.mean_orientation(middle_s, 0 * exposure_s), plain.as_matrix(), atol=1e-12)
 
 
 # ── times of rows ────────────────────────────────────────────────────────────────────────────────────────────────

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -242,48 +242,66 @@ def draw_figures(
     capture: Capture, found: Diagnosis, each: Each = one_by_one
 ) -> tuple[dict[str, bytes], list[list[str]]]:
     """PNG files by their path below the capture's folder, and the paths that belong to each cause."""
-    files: dict[str, bytes] = {}
+    drawings: dict[str, tuple[Any, ...]] = {}
     before, after = found.residuals.get("before"), found.residuals.get("after")
     if before and after:
-        files[f"{FIGURES}/residuals.png"] = residual_figure(
-            before, after, f"{capture.name}: tracked − predicted points"
-        )
+        title = f"{capture.name}: tracked − predicted points"
+        drawings[f"{FIGURES}/residuals.png"] = (residual_figure, before, after, title)
     if found.ladder:
         rungs = [_bars(rung) for rung in found.ladder[:MAX_RUNGS]]
-        files[f"{FIGURES}/ladder.png"] = ladder_figure(rungs, f"{capture.name}: what was tried")
-    pictures = _pictures_figure(capture, found, each)
-    if pictures is not None:
-        files[f"{FIGURES}/pictures.png"] = pictures
-    common = list(files)
+        drawings[f"{FIGURES}/ladder.png"] = (ladder_figure, rungs, f"{capture.name}: what was tried")
+    common = list(drawings)
     drawn = []
     for number, cause in enumerate(found.causes, start=1):
         rung = next((rung for rung in found.ladder if rung.entered == cause.name), None)
         own = f"{FIGURES}/{number:02d}_{cause.name}.png"
         if rung is not None:
-            files[own] = ladder_figure([_bars(rung)], f"{capture.name}: {cause.name}")
-        drawn.append([*([own] if rung is not None else []), *common])
-    return files, drawn
+            drawings[own] = (ladder_figure, [_bars(rung)], f"{capture.name}: {cause.name}")
+        drawn.append([own] if rung is not None else [])
+    shots = _shots(capture, found)
+    calls = [(simulated_frame, *shot) for shot in shots.values()]
+    done = each(_called, [*calls, *drawings.values()])
+    files = dict(zip(drawings, done[len(shots) :], strict=True))
+    pictures = _pictures_figure(capture, dict(zip(shots, done, strict=False)), shots)
+    if pictures is not None:
+        files[f"{FIGURES}/pictures.png"] = pictures
+        common.append(f"{FIGURES}/pictures.png")
+    return files, [[*own, *common] for own in drawn]
+
+
+def _called(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Different functions as calls of one, for `Each`."""
+    return function(*arguments)
 
 
 def _bars(rung: Rung) -> tuple[str, float, dict[str, float], str | None]:
     return rung.quantity, rung.before, rung.tried, rung.entered
 
 
-def _pictures_figure(capture: Capture, found: Diagnosis, each: Each) -> bytes | None:
-    """A lively frame against its simulation from its neighbour's restored picture, with either profile."""
+def _shots(capture: Capture, found: Diagnosis) -> dict[str, tuple[Capture, CameraProfile, int]]:
+    """What of a lively frame is simulated, by what stands beside it: with either profile."""
     firsts = chosen_pairs(capture, found.extended_profile)
     if not firsts:
-        return None
-    number = firsts[len(firsts) // 2]
-    _, measured = next(read_frames(capture.movie, probe_movie(capture.movie), number, number), (number, None))
+        return {}
     profiles = {"profile as given": found.nominal_profile}
     if found.causes:
         profiles["causes built in"] = found.extended_profile
-    rows = []
-    shown = each(simulated_frame, [(capture, profile, number) for profile in profiles.values()])
-    for label, simulated in zip(profiles, shown, strict=True):
-        if measured is not None and simulated is not None:
-            rows.append((label, measured, simulated))
+    return {label: (capture, profile, firsts[len(firsts) // 2]) for label, profile in profiles.items()}
+
+
+def _pictures_figure(
+    capture: Capture, simulated: Mapping[str, Picture | None], shots: Mapping[str, tuple[Capture, CameraProfile, int]]
+) -> bytes | None:
+    """A lively frame against its simulation from its neighbour's restored picture, with either profile."""
+    number = next((number for _, _, number in shots.values()), None)
+    if number is None:
+        return None
+    _, measured = next(read_frames(capture.movie, probe_movie(capture.movie), number, number), (number, None))
+    rows = [
+        (label, measured, picture)
+        for label, picture in simulated.items()
+        if measured is not None and picture is not None
+    ]
     return comparison_figure(rows, f"{capture.name}: frame {number}") if rows else None
 
 

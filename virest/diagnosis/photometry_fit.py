@@ -17,6 +17,7 @@ from scipy import stats
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
+from virest.motion.shared_out import Each, one_by_one
 
 _CAUCHY = 2.5
 """Residuals, in noises, at which the weight has fallen to a half."""
@@ -138,7 +139,10 @@ def fit_photometry(
 
 
 def judge(
-    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect]
+    observations: PhotometricObservations,
+    profile: CameraProfile,
+    effects: Sequence[PhotometricEffect],
+    each: Each = one_by_one,
 ) -> HeldOut:
     """Fit on one half, judge on the other, and the reverse.
 
@@ -147,13 +151,12 @@ def judge(
     """
     by_place = any(effect.per_frame for effect in effects)
     half = (observations.place if by_place else time_blocks(observations)) % 2 == 0
+    halves = [fitted for fitted in (half, ~half) if fitted.any() and not fitted.all()]
+    calls = [(observations, profile, some, fitted) for fitted in halves for some in (effects, ())]
+    fits = each(fit_photometry, calls)
     before, after, noise = [], [], []
-    for fitted in (half, ~half):
-        if not fitted.any() or fitted.all():
-            continue
-        fit = fit_photometry(observations, profile, effects, fitted)
+    for fitted, fit, without in zip(halves, fits[::2], fits[1::2], strict=True):
         held = _seen_twice(observations.subset(~fitted))
-        without = fit_photometry(observations, profile, (), fitted)
         before.append(normalised_rms(held.with_memory(without.memory), profile))
         after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
         noise.append(before[-1][1])

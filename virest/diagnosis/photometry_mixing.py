@@ -57,7 +57,8 @@ AGREEMENT = 0.07
 """How well what an encoder leaves may agree with a change of the curve: their correlation, of movies with 0.1 to 0.4
 bits a pixel whose curve is the profile's."""
 _MIN_TILE_PIXELS = 400
-_MARGIN_PX = 24
+_EVERY = 2
+"""Pixels are compared this far apart along both sides: neighbours of a blurred picture say the same."""
 _NODE_PX = 16
 _MAX_CHROMA_RANGE = 40
 """Levels of Cr or Cb within a blur's reach."""
@@ -74,6 +75,8 @@ class MixingSettings:
     """The sharp frame's path is at most this part of the blurred one's."""
     reach_frames: int = 8
     tile_px: int = 80
+    tiles: int = 60
+    """At most so many of a pair's tiles, evenly over the picture: more of a large picture's tell what these do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,9 +250,7 @@ def _choose_pairs(
     lens = profile.intrinsics
     if lens is None or any(frame.exposure_s is None for frame in frames) or len(frames) < 2:
         return []
-    centre = np.array([[(profile.width - 1) / 2, (profile.height - 1) / 2]])
-    paths = np.array([path_over_exposure(centre, frame, trajectory, profile)[0, [0, -1]] for frame in frames])
-    length = np.linalg.norm(paths[:, 1] - paths[:, 0], axis=-1)
+    length = _central_blur_px(frames, trajectory, profile)
     index = np.array([frame.index for frame in frames])
     found = []
     for i in np.flatnonzero((length > settings.blurred_px[0]) & (length < settings.blurred_px[1])):
@@ -258,6 +259,24 @@ def _choose_pairs(
         if length[best] < min(settings.sharp_px, settings.sharp_part * length[i]):
             found.append((float(length[i] - 1.5 * length[best]), int(index[best]), int(index[i])))
     return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[: settings.pairs]]
+
+
+def _central_blur_px(frames: Sequence[Frame], trajectory: Trajectory, profile: CameraProfile) -> Array:
+    """How far apart the ends of the exposure see the point that its middle has at the picture's centre, (n,)."""
+    lens, shutter = profile.intrinsics, profile.shutter
+    assert lens is not None, "paths need a focal length"
+    centre = np.tile([(profile.width - 1) / 2, (profile.height - 1) / 2], (len(frames), 1))
+    logged_s = np.array([frame.exposure_s or 0.0 for frame in frames])
+    exposure_s = np.asarray(shutter.true_exposure_s(logged_s))
+    first_row_s = shutter.first_row_start_s(np.array([frame.time_s for frame in frames]), logged_s)
+    waited_s = shutter.readout_fraction(centre, profile.width, profile.height) * shutter.readout_time_s
+    middle_s = profile.imu_time_s(first_row_s) + waited_s + 0.5 * exposure_s
+    world = trajectory.orientation(middle_s) @ lens.rays(centre)[..., None]
+    first, last = (
+        lens.project(np.squeeze(np.swapaxes(trajectory.orientation(middle_s + side * exposure_s), -1, -2) @ world, -1))
+        for side in (-0.5, 0.5)
+    )
+    return np.asarray(np.linalg.norm(last - first, axis=-1))
 
 
 def _darkest(pictures: Sequence[Rgb]) -> float:
@@ -288,43 +307,67 @@ def _compare(
         [_kernel(path) for path in path_over_exposure(middles, frame, trajectory, profile)]
         for frame in (sharp[0], blurred[0])
     ]
+    told = _spread([k for k, tile in enumerate(tiles) if _tells(usable[tile])], settings.tiles)
+    pixels = [_compared(usable, tiles[k]) for k in told]
+    if not told:
+        return []
     curve = profile.response or ResponseCurve("srgb")
 
-    def difference(changed: ResponseCurve) -> tuple[Plane, Plane]:
-        table = changed.linear_table()
-        light = cv2.remap(table[sharp[1]], place, None, cv2.INTER_CUBIC), table[blurred[1]]
-        from_sharp, from_blurred = _blurred(light[0], kernels[1], tiles), _blurred(light[1], kernels[0], tiles)
-        grey = (255 * changed.encode(from_sharp)) @ LUMA
-        return (255 * changed.encode(from_blurred)) @ LUMA - grey, grey
+    def light(seen: ResponseCurve) -> list[tuple[Plane, list[Plane]]]:
+        """Either picture's light where the blurred one has it, with the other's kernels."""
+        table = seen.linear_table()
+        moved = cv2.remap(table[sharp[1]], place, None, cv2.INTER_CUBIC)
+        return [(np.asarray(moved, np.float32), kernels[1]), (table[blurred[1]], kernels[0])]
 
-    nominal, grey = difference(curve)
+    def levels(changed: ResponseCurve) -> Array:
+        """Difference of luma (n,) in the compared pixels of all tiles that tell."""
+        first, second = (
+            np.concatenate([_filtered(one, by[k], tiles[k])[at] for k, at in zip(told, pixels, strict=True)])
+            for one, by in light(changed)
+        )
+        return np.asarray((255 * (changed.encode(second) - changed.encode(first))) @ LUMA, float)
+
+    from_sharp = light(curve)[0]
+    whole = np.empty_like(from_sharp[0])
+    for kernel, tile in zip(from_sharp[1], tiles, strict=True):
+        whole[tile] = _filtered(from_sharp[0], kernel, tile)
+    nominal, nuisance = levels(curve), _nuisances((255 * curve.encode(whole)) @ LUMA)
     gammas = [
-        difference(replace(curve, extra_gamma=curve.extra_gamma * float(np.exp(s))))[0]
+        levels(replace(curve, extra_gamma=curve.extra_gamma * float(np.exp(s))))
         for s in steps["response_curve"][[0, 2]]
     ]
-    blacks = [difference(replace(curve, black_level=curve.black_level + float(s)))[0] for s in steps["black_level"][1:]]
-    stacks = [gammas[0], nominal, gammas[1]], [nominal, *blacks]
-    nuisance = _nuisances(grey)
-    rows = (_tile_scores(stacks, tuple(steps.values()), nuisance, tile, usable[tile]) for tile in tiles)
-    return [row for row in rows if row is not None]
+    blacks = [levels(replace(curve, black_level=curve.black_level + float(s))) for s in steps["black_level"][1:]]
+    stacks = [np.stack(stack, axis=-1) for stack in ((gammas[0], nominal, gammas[1]), (nominal, *blacks))]
+    free = np.concatenate(
+        [np.stack([plane[tiles[k]][at] for plane in nuisance], axis=-1) for k, at in zip(told, pixels, strict=True)]
+    )
+    ends = np.cumsum([len(at[0]) for at in pixels])
+    parts = [slice(end - len(at[0]), end) for end, at in zip(ends, pixels, strict=True)]
+    return [_tile_scores([stack[part] for stack in stacks], tuple(steps.values()), free[part]) for part in parts]
 
 
-def _tile_scores(
-    stacks: tuple[list[Plane], list[Plane]],
-    steps: tuple[Array, ...],
-    nuisance: list[Plane],
-    tile: tuple[slice, slice],
-    usable: Mask,
-) -> Array | None:
-    """Scores of one tile with everything projected out that is no change of the curve; robust weights per pixel."""
-    if usable.sum() < 2 * _MIN_TILE_PIXELS:
-        return None
-    tile = tuple(slice(s.start, s.stop, 2) for s in tile)  # type: ignore[assignment]
-    usable = usable[::2, ::2]
-    if usable.sum() < _MIN_TILE_PIXELS:
-        return None
-    free = np.stack([plane[tile][usable] for plane in nuisance], axis=-1).astype(float)
-    levels = [np.stack([plane[tile][usable] for plane in stack], axis=-1).astype(float) for stack in stacks]
+def _spread(numbers: list[int], count: int) -> list[int]:
+    """At most ``count`` of the numbers, evenly."""
+    return [numbers[k] for k in np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))]
+
+
+def _tells(usable: Mask) -> bool:
+    """Whether enough of a tile's pixels can be compared."""
+    return bool(usable.sum() >= 2 * _MIN_TILE_PIXELS and usable[::_EVERY, ::_EVERY].sum() >= _MIN_TILE_PIXELS)
+
+
+def _compared(usable: Mask, tile: tuple[slice, slice]) -> tuple[Indices, Indices]:
+    """Rows and columns, within a tile, of the pixels to compare."""
+    row, column = np.nonzero(usable[tile][::_EVERY, ::_EVERY])
+    return row * _EVERY, column * _EVERY
+
+
+def _tile_scores(levels: list[Array], steps: tuple[Array, ...], free: Array) -> Array:
+    """Scores of one tile with everything projected out that is no change of the curve; robust weights per pixel.
+
+    levels: of each effect, differences (n, 3) at its steps.  free: (n, k) what else may differ.
+    """
+    free = free.astype(float)
     patterns = [(level[:, 2] - level[:, 0]) / (x[2] - x[0]) for level, x in zip(levels, steps, strict=True)]
     design, target = np.column_stack([patterns[0], free]), levels[0][:, 1]
     weight, noise = np.ones(len(target)), 1.0
@@ -388,7 +431,7 @@ def _usable(sharp: Rgb, blurred: Rgb, place: Plane) -> Mask:
 
 def _kernel(path_px: Array) -> Plane:
     """Weights by which a pixel gathers light from its surroundings along a path (m, 2): at minus the displacement."""
-    fine = np.concatenate([np.linspace(a, b, 6, endpoint=False) for a, b in pairwise(path_px)])
+    fine = (path_px[:-1, None] + np.diff(path_px, axis=0)[:, None] * (np.arange(6) / 6)[:, None]).reshape(-1, 2)
     reach = int(np.abs(fine).max() + 2)
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     at = reach - fine
@@ -401,14 +444,10 @@ def _kernel(path_px: Array) -> Plane:
     return (kernel / kernel.sum()).astype(np.float32)
 
 
-def _blurred(light: Plane, kernels: list[Plane], tiles: list[tuple[slice, slice]]) -> Plane:
-    """Each tile filtered by its own kernel, with a margin of its neighbours."""
-    height, width = light.shape[:2]
-    out = np.empty_like(light)
-    for kernel, (rows, columns) in zip(kernels, tiles, strict=True):
-        top, left = max(rows.start - _MARGIN_PX, 0), max(columns.start - _MARGIN_PX, 0)
-        part = light[top : min(rows.stop + _MARGIN_PX, height), left : min(columns.stop + _MARGIN_PX, width)]
-        part = cv2.filter2D(part, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT)
-        inner = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
-        out[rows, columns] = part[inner]
-    return out
+def _filtered(light: Plane, kernel: Plane, tile: tuple[slice, slice]) -> Plane:
+    """One tile of a picture blurred by its own kernel, with as much of its neighbours as that reaches."""
+    reach, (height, width), (rows, columns) = len(kernel) // 2, light.shape[:2], tile
+    top, left = max(rows.start - reach, 0), max(columns.start - reach, 0)
+    part = light[top : min(rows.stop + reach, height), left : min(columns.stop + reach, width)]
+    part = cv2.filter2D(part, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(part[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left], np.float32)

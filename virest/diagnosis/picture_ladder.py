@@ -174,8 +174,9 @@ def climb_observations(
         verdict.observations = observations.with_memory(plain.memory)
         return
     verdict.profile, verdict.observations = plain.profile, observations.with_memory(plain.memory)
+    held = judge(observations, nominal, accepted, each)
     for effect in accepted:
-        verdict.findings.append(_finding(observations, nominal, plain, effect, accepted, effects, verdict.rungs))
+        verdict.findings.append(_finding(observations, nominal, plain, effect, held))
 
 
 def _light_spread(observations: PhotometricObservations) -> float:
@@ -205,7 +206,7 @@ def _rung(
         p_value = significance(fits[name], name, observations)[1]
         if fits[name].cost >= plain.cost or p_value > MAX_P:
             continue
-        held_out = judge(observations, nominal, [*accepted, effect])
+        held_out = judge(observations, nominal, [*accepted, effect], each)
         log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
         if held_out.gain > MIN_GAIN and held_out.after**2 < (1 - LEAST_FALL) * held_out.before**2:
             return replace(nothing, entered=name), effect, fits[name]
@@ -231,13 +232,10 @@ def _finding(
     nominal: CameraProfile,
     fitted: PhotometricFit,
     effect: PhotometricEffect,
-    accepted: Sequence[PhotometricEffect],
-    effects: Sequence[PhotometricEffect],
-    rungs: Sequence[Rung],
+    held: HeldOut,
 ) -> Finding:
     values, covariance = fitted.of(effect.name)
     std = np.sqrt(np.diag(covariance))
-    held = judge(observations, nominal, list(accepted))
     changes = _changes(effect, nominal, fitted.profile, values, std)
     p_value = significance(fitted, effect.name, observations)[1]
     gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
@@ -375,10 +373,9 @@ def climb_blur(
         verdict.notes.append("too little texture to measure local blur")
         return verdict, False
     effects: tuple[Any, ...] = (local_blur_fit.ExposureTime(), local_blur_fit.Defocus())
-    fitted = local_blur_fit.fit(observations, profile, trajectory, effects)
+    fitted, plain = each(local_blur_fit.fit, [(observations, profile, trajectory, some) for some in (effects, ())])
     log.debug("blur: %s ± %s", fitted.values, fitted.std)
     everything = np.ones(len(observations), bool)
-    plain = local_blur_fit.fit(observations, profile, trajectory, ())
     verdict.blur_rms_px = local_blur_fit.judge(observations, plain, trajectory, everything)
     is_exposure = _exposure_holds(fitted, exposure_hypothesis)
     named = []

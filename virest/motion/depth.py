@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.track_model import SMALLEST_DEPTH, Ground, TrackTable, centre, mean_orientation, seen_s, turned
+from virest.motion.track_model import SMALLEST_DEPTH, Ground, TrackTable, centre, seen_s, turned
 
 Array = NDArray[np.float64]
 PASSES = 3
@@ -156,8 +156,8 @@ def _sights(known: Ground, scene: InertialMotion, table: TrackTable, passes: int
     centre_1 = centre(known.displacement, scene, velocity, first_s, origin_s)[0]
     centre_2 = centre(known.displacement, scene, velocity, second_s, origin_s)[0]
     scale = profile.shutter.exposure_scale
-    before = mean_orientation(known.trajectory, first_s, scale * table.first_exposure_s)
-    back = np.swapaxes(mean_orientation(known.trajectory, second_s, scale * table.second_exposure_s), -1, -2)
+    before = known.trajectory.mean_orientation(first_s, scale * table.first_exposure_s)
+    back = np.swapaxes(known.trajectory.mean_orientation(second_s, scale * table.second_exposure_s), -1, -2)
     rays = known.lens.rays(table.first_px, first_s)
     way = turned(before, rays)
     clearance = np.maximum(1 - (plane * centre_1).sum(axis=-1), SMALLEST_DEPTH)

@@ -72,19 +72,32 @@ def drift_std_m(imu: ImuSamples, span_s: float) -> float:
     return noise * float(np.sqrt(np.median(np.diff(imu.time_s)) / 3)) * span_s**1.5
 
 
-def integrate_accelerometer(imu: ImuSamples, profile: CameraProfile, trajectory: Trajectory) -> Displacement | None:
-    """Integrate specific force twice along the gyroscope's orientation; None without an accelerometer.
+def force_at_samples(imu: ImuSamples) -> tuple[Array, Array] | None:
+    """Specific force and its slope at the samples, IMU axes (n, 3) each, holes bridged; None without an accelerometer.
 
-    Between samples the world-axis force is linear: v ← v + ½ (a₀ + a₁) Δt, p ← p + v Δt + (2 a₀ + a₁) Δt² / 6.
+    No profile changes them.
     """
     finite = np.isfinite(imu.accel_m_s2).all(axis=1)
     if finite.mean() < MIN_FINITE or finite.sum() < 4:
         return None
     force = CubicSpline(imu.time_s[finite], imu.accel_m_s2[finite], axis=0)
     inside = np.clip(imu.time_s, imu.time_s[finite][0], imu.time_s[finite][-1])
+    return np.asarray(force(inside)), np.asarray(force(inside, 1))
+
+
+def integrate_accelerometer(
+    imu: ImuSamples, profile: CameraProfile, trajectory: Trajectory, measured: tuple[Array, Array] | None = None
+) -> Displacement | None:
+    """Integrate specific force twice along the gyroscope's orientation; None without an accelerometer.
+
+    Between samples the world-axis force is linear: v ← v + ½ (a₀ + a₁) Δt, p ← p + v Δt + (2 a₀ + a₁) Δt² / 6.
+    measured: what :func:`force_at_samples` says, where that is known already.
+    """
+    measured = measured or force_at_samples(imu)
+    if measured is None:
+        return None
     world_imu = trajectory.rotation_world_cam @ profile.rotation_cam_imu
-    world_force = np.einsum("nij,nj->ni", world_imu, force(inside))
-    slope = np.einsum("nij,nj->ni", world_imu, force(inside, 1))
+    world_force, slope = (np.einsum("nij,nj->ni", world_imu, rows) for rows in measured)
     path, per_bias, per_delay = (
         _integrated_twice(imu.time_s, row) for row in (world_force, world_imu.reshape(-1, 9), slope)
     )

@@ -37,6 +37,8 @@ class MovingLens:
     """(m,) rising, IMU clock from stamp_0; None: no stabiliser."""
     shift: Array | None = None
     """(m, 2) at those times, units of the focal length, added before distortion; straight lines between, ends held."""
+    path: tuple[Array, Array] | None = None
+    """All times (k,) of the motion and the camera's rates (k, 3) then, from which the shift was worked out."""
 
     def rays(self, points_px: Array, time_s: Any) -> Array:
         """Rays (..., 3) with z = 1 through pixels (..., 2) seen at times (...): the inverse of :meth:`project`."""
@@ -70,7 +72,7 @@ class MovingLens:
             return self
         first = max(int(np.searchsorted(self.shift_time_s, start_s, side="right")) - 1, 0)
         last = int(np.searchsorted(self.shift_time_s, end_s)) + 1
-        return replace(self, shift_time_s=self.shift_time_s[first:last], shift=self.shift[first:last])
+        return replace(self, shift_time_s=self.shift_time_s[first:last], shift=self.shift[first:last], path=None)
 
     def _focal_scale(self, time_s: Any) -> Array:
         return 1.0 + self.focal_drift_per_s * np.asarray(time_s, float)[..., None]
@@ -80,10 +82,13 @@ class MovingLens:
         return centre + (np.asarray(points_px, float) - centre) * scale
 
 
-def moving_lens(trajectory: Trajectory, profile: CameraProfile, step_s: float = SHIFT_STEP_S) -> MovingLens:
+def moving_lens(
+    trajectory: Trajectory, profile: CameraProfile, step_s: float = SHIFT_STEP_S, like: MovingLens | None = None
+) -> MovingLens:
     """The profile's lens along a motion; the stabiliser is at rest at the trajectory's first knot.
 
-    step_s: grid of the stabiliser's path; a fit of tracked points bears a wider one than a restored picture.
+    step_s: grid of the stabiliser's path; a fit of tracked points bears a wider one than a restored picture.  like: a
+    lens along the same motion on the same grid.
     Let the trajectory begin :func:`settling_time_s` before the first time of interest, or where the log begins.
     Raises ValueError without a focal length.
     """
@@ -92,14 +97,17 @@ def moving_lens(trajectory: Trajectory, profile: CameraProfile, step_s: float = 
     extensions = profile.extensions
     if not extensions.stabilisation_fraction:
         return MovingLens(profile.intrinsics, extensions.focal_drift_per_s)
-    time_s = _shift_grid(*trajectory.span_s, step_s)
-    fraction, cutoff_hz = extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
-    shift = stabiliser_shift(time_s, trajectory.rate_rad_s(time_s), fraction, cutoff_hz)
+    path = None if like is None else like.path
+    if path is None:
+        grid_s = _shift_grid(*trajectory.span_s, step_s)
+        path = grid_s, trajectory.rate_rad_s(grid_s)
+    time_s, fraction, cutoff_hz = path[0], extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
+    shift = stabiliser_shift(*path, fraction, cutoff_hz)
     if any(extensions.stabilisation_lean_rad):
         about_x, about_y = extensions.stabilisation_lean_rad
         forgotten = np.exp(-2 * np.pi * cutoff_hz * (time_s - time_s[0]))
         shift = shift + fraction * forgotten[:, None] * np.array([about_y, -about_x])
-    return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift)
+    return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path)
 
 
 def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:
@@ -139,12 +147,16 @@ def _exponential_means(x: Array) -> tuple[Array, Array]:
 
 
 def _running_response(decay: Array, drive: Array) -> Array:
-    """θ[0] = 0, θ[k + 1] = decay[k] θ[k] + drive[k], by doubling: log2(n) vectorised passes. Returns (n + 1, 2)."""
-    value = np.concatenate([np.zeros((1, drive.shape[1])), drive])
-    kept = np.concatenate([[0.0], decay])
-    reach = 1
-    while reach < len(kept):
-        value[reach:] = value[reach:] + kept[reach:, None] * value[:-reach]
-        kept[reach:] = kept[reach:] * kept[:-reach]
-        reach *= 2
-    return value
+    """θ[0] = 0, θ[k + 1] = decay[k] θ[k] + drive[k]. Returns (n + 1, 2)."""
+    return np.concatenate([np.zeros((1, drive.shape[1])), _responses(decay[:, None], drive)])
+
+
+def _responses(decay: Array, drive: Array) -> Array:
+    """θ[1:], from every other step: two steps are one with both decays. log2(n) vectorised passes, 2 n steps in all."""
+    if len(drive) < 2:
+        return drive
+    found = np.empty_like(drive)
+    found[0] = drive[0]
+    found[1::2] = _responses(decay[:-1:2] * decay[1::2], decay[1::2] * drive[:-1:2] + drive[1::2])
+    found[2::2] = decay[2::2] * found[1:-1:2] + drive[2::2]
+    return found

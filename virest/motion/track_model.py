@@ -21,12 +21,12 @@ from scipy.interpolate import CubicHermiteSpline
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.motion.displacement import Displacement, integrate_accelerometer
-from virest.motion.integration import integrate_gyro
+from virest.motion.displacement import Displacement, force_at_samples, integrate_accelerometer
+from virest.motion.integration import gyro_polynomials, integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.tracking import TrackPair
-from virest.motion.trajectory import Trajectory, rotation_from_vector
+from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -103,6 +103,17 @@ class Ground:
     trajectory: Trajectory
     displacement: Displacement | None
     lens: MovingLens
+    measured: Measured
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the inertial samples say whatever the profile: the work that is done once."""
+
+    gyro: Array
+    """As :func:`gyro_polynomials` gives it."""
+    force: tuple[Array, Array] | None
+    """As :func:`force_at_samples` gives it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,11 +156,12 @@ class Prediction:
         return self.poses.second_s
 
 
-def ground(imu: ImuSamples, profile: CameraProfile, *, translation: bool) -> Ground:
-    """Integrate the inertial samples with a profile's bias, scale and rotation."""
-    trajectory = integrate_gyro(imu, profile)
-    displacement = integrate_accelerometer(imu, profile, trajectory) if translation else None
-    return Ground(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S))
+def ground(imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None) -> Ground:
+    """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier ground."""
+    measured = measured or Measured(gyro_polynomials(imu), force_at_samples(imu) if translation else None)
+    trajectory = integrate_gyro(imu, profile, measured.gyro)
+    displacement = integrate_accelerometer(imu, profile, trajectory, measured.force) if translation else None
+    return Ground(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S), measured)
 
 
 def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Ground:
@@ -157,11 +169,13 @@ def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Grou
     before, kept = known.profile, known
     same = ("gyro_bias_rad_s", "gyro_scale", "p_cam_imu_m")
     if any(getattr(before, name) != getattr(profile, name) for name in same):
-        return ground(imu, profile, translation=known.displacement is not None)
+        return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
     if before.r_cam_imu != profile.r_cam_imu:
         known = _turned_about(known, profile.rotation_cam_imu @ before.rotation_cam_imu.T)
-    if known.trajectory is not kept.trajectory or before.intrinsics != profile.intrinsics or _moves(before, profile):
-        known = replace(known, lens=moving_lens(known.trajectory, profile, SHIFT_STEP_S))
+    turned_along = known.trajectory is not kept.trajectory
+    if turned_along or before.intrinsics != profile.intrinsics or _moves(before, profile):
+        like = None if turned_along else kept.lens
+        known = replace(known, lens=moving_lens(known.trajectory, profile, SHIFT_STEP_S, like))
     return replace(known, profile=profile)
 
 
@@ -174,7 +188,7 @@ def _moves(before: CameraProfile, after: CameraProfile) -> bool:
 def _turned_about(known: Ground, turn: Array) -> Ground:
     """The ground with the camera's axes turned on the IMU, (3, 3): everything in camera and world axes turns along."""
     way = known.trajectory
-    trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, way.rate_polynomials @ turn.T)
+    trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, turn @ way.rate_polynomials)
     if known.displacement is None:
         return replace(known, trajectory=trajectory)
     old = known.displacement
@@ -280,8 +294,8 @@ def _poses(known: Ground, table: TrackTable, like: Prediction | None) -> Poses:
         same = old.trajectory is known.trajectory and old.exposure_scale == scale
         if same and np.array_equal(first_s, old.first_s) and np.array_equal(second_s, old.second_s):
             return old
-    before = mean_orientation(known.trajectory, first_s, scale * table.first_exposure_s)
-    after = mean_orientation(known.trajectory, second_s, scale * table.second_exposure_s)
+    before = known.trajectory.mean_orientation(first_s, scale * table.first_exposure_s)
+    after = known.trajectory.mean_orientation(second_s, scale * table.second_exposure_s)
     return Poses(known.trajectory, scale, first_s, second_s, before, np.swapaxes(after, -1, -2))
 
 
@@ -383,12 +397,6 @@ def centre(
     """Camera centre (n, 3) from its place at origin_s, world axes, and its changes per bias (n, 3, 3), delay (n, 3)."""
     path = Paths(time_s - origin_s, *displacement.at(time_s, origin_s))
     return path.centre(scene, velocity), path.per_bias, path.per_delay
-
-
-def mean_orientation(trajectory: Trajectory, middle_s: Array, exposure_s: Array) -> Array:
-    """R_world_cam averaged over exposures about the times (n,): R exp(ω' E² / 24), to second order."""
-    bend = trajectory.angular_acceleration_rad_s2(middle_s) * (exposure_s**2 / 24)[:, None]
-    return trajectory.orientation(middle_s) @ rotation_from_vector(bend)
 
 
 def turned(rotation: Array, rays: Array) -> Array:

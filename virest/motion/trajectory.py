@@ -24,7 +24,7 @@ class Trajectory:
     rotation_world_cam: Array
     """(n, 3, 3) at the knots."""
     rate_polynomials: Array
-    """(4, n - 1, 3) camera-frame rate in rad/s, highest power first, in the time since the knot."""
+    """(4, 3, n - 1) camera-frame rate in rad/s, highest power first, in the time since the knot."""
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -34,47 +34,77 @@ class Trajectory:
     def rate_rad_s(self, time_s: Any) -> Array:
         """Camera-frame angular rate (..., 3) at times (...)."""
         interval, since = self._locate(np.asarray(time_s, float))
-        a, b, c, d = self.rate_polynomials[:, interval]
-        return ((a * since + b) * since + c) * since + d
+        a, b, c, d = self.rate_polynomials.take(interval, axis=2)
+        return _vectors(((a * since + b) * since + c) * since + d)
 
     def angular_acceleration_rad_s2(self, time_s: Any) -> Array:
         """Change of the camera-frame rate (..., 3) at times (...)."""
         interval, since = self._locate(np.asarray(time_s, float))
-        a, b, c, _ = self.rate_polynomials[:, interval]
-        return (3 * a * since + 2 * b) * since + c
+        a, b, c = self.rate_polynomials[:3].take(interval, axis=2)
+        return _vectors((3 * a * since + 2 * b) * since + c)
 
     def orientation(self, time_s: Any) -> Array:
         """R_world_cam (..., 3, 3) at times (...)."""
-        time_s = np.asarray(time_s, float)
-        interval, since = self._locate(time_s)
-        a, b, c, d = self.rate_polynomials[:, interval]
-        angle = since * (d + since * (c / 2 + since * (b / 3 + since * a / 4)))
-        end_rate = ((a * since + b) * since + c) * since + d
-        return self.rotation_world_cam[interval] @ rotation_from_vector(angle + coning(d, end_rate, since))
+        interval, since = self._locate(np.asarray(time_s, float))
+        angle = turned_angle(self.rate_polynomials.take(interval, axis=2), since)
+        return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*angle))
+
+    def mean_orientation(self, middle_s: Array, exposure_s: Array) -> Array:
+        """R_world_cam averaged over exposures about the times (n,): R exp(ω' E² / 24), to second order.
+
+        The two turns since the knot are put together as exp(u) exp(v) ≈ exp(u + v + ½ u × v): v is some 1e-4 rad.
+        """
+        interval, since = self._locate(middle_s)
+        pieces = self.rate_polynomials.take(interval, axis=2)
+        angle = turned_angle(pieces, since)
+        a, b, c, _ = pieces
+        bend = ((3 * a * since + 2 * b) * since + c) * (exposure_s**2 / 24)
+        both = angle + bend + 0.5 * _cross(angle, bend)
+        return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*both))
 
     def _locate(self, time_s: Array) -> tuple[NDArray[np.intp], Array]:
-        """Interval of each time, and the seconds since its knot, (..., 1). Outside the knots the ends are held."""
+        """Interval of each time (...), and the seconds since its knot (...). Outside the knots the ends are held."""
         held = np.clip(time_s, self.time_s[0], self.time_s[-1])
         interval = np.clip(np.searchsorted(self.time_s, held, side="right") - 1, 0, len(self.time_s) - 2)
-        return interval, (held - self.time_s[interval])[..., None]
+        return interval, held - self.time_s[interval]
 
 
-def coning(rate_start: Array, rate_end: Array, duration_s: Array) -> Array:
-    """Second term of the Magnus series for a rate that changes linearly: Δt²/12 ω₀ × ω₁ (body axes)."""
-    return duration_s**2 / 12.0 * np.cross(rate_start, rate_end)
+def turned_angle(pieces: Array, since_s: Array) -> Array:
+    """Rotation vector (3, ...) after so many seconds at the rate of polynomials (4, 3, ...), highest power first.
+
+    The rate's integral and the second term of the Magnus series for a rate that changes linearly: Δt²/12 ω₀ × ω₁ (body
+    axes).
+    """
+    a, b, c, d = pieces
+    end_rate = ((a * since_s + b) * since_s + c) * since_s + d
+    angle = since_s * (d + since_s * (c / 2 + since_s * (b / 3 + since_s * (a / 4))))
+    return np.asarray(angle + since_s**2 / 12.0 * _cross(d, end_rate))
+
+
+def _cross(u: Array, v: Array) -> Array:
+    """u × v of vectors (3, ...)."""
+    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+
+
+def _vectors(parts: Array) -> Array:
+    """(3, ...) as (..., 3)."""
+    return np.ascontiguousarray(np.moveaxis(parts, 0, -1))
 
 
 def rotation_from_vector(vector: Array) -> Array:
-    """exp: rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    """exp: rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
+    return _exponential(vector[..., 0], vector[..., 1], vector[..., 2])
+
+
+def _exponential(x: Array, y: Array, z: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of the vectors with these parts (...), by Rodrigues' formula."""
     squared = x * x + y * y + z * z
     half = np.maximum(0.5 * np.sqrt(squared), 1e-150)
-    part = np.sin(half) / half
-    sine, cosine = part * np.cos(half), 0.5 * part * part
-    matrix = np.empty((*vector.shape[:-1], 3, 3))
-    matrix[..., 0, 0] = 1 - cosine * (y * y + z * z)
-    matrix[..., 1, 1] = 1 - cosine * (x * x + z * z)
-    matrix[..., 2, 2] = 1 - cosine * (x * x + y * y)
+    share = np.sin(half) / half
+    sine, cosine = share * np.cos(half), 0.5 * share * share
+    matrix = np.empty((*x.shape, 3, 3))
+    for i, part in enumerate((x, y, z)):
+        matrix[..., i, i] = 1 - cosine * (squared - part * part)
     for i, j, along, product in ((2, 1, x, y * z), (0, 2, y, x * z), (1, 0, z, x * y)):
         matrix[..., i, j] = cosine * product + sine * along
         matrix[..., j, i] = cosine * product - sine * along
