@@ -235,6 +235,22 @@ def test_lights_in_the_dark_do_not_ring(settings: RestorationSettings) -> None:
     assert np.abs(result - picture)[far].max() <= 6
 
 
+@pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
+def test_a_vivid_surface_keeps_its_colour(settings: RestorationSettings) -> None:
+    """Green tiles too bright for one channel stay as green as they were, edges included."""
+    turning = camera()
+    picture = record(turning).picture.copy()
+    tiles = np.zeros(picture.shape[:2], np.uint8)
+    for left in range(90, 240, 50):
+        cv2.rectangle(tiles, (left, 80), (left + 24, 170), 1, -1)
+    picture[tiles > 0] = (180, 255, 90)
+    result = _picture(_restore(turning, picture, settings)).astype(int)
+    assert (result != picture).any()
+    inside = cv2.erode(tiles, np.ones((9, 9), np.uint8)) > 0
+    colour = (result[..., 1] - result[..., 2])[inside]
+    assert colour.mean() > 150, "of 165"
+
+
 # ── the log ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 

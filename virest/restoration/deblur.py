@@ -273,9 +273,19 @@ def _filled_in(planes: list[Image], known: Image) -> list[Image]:
 
 
 def _holes(blurred: BlurredPicture) -> Image | None:
-    """1.0 where any channel is clipped: what is recorded there is no measurement."""
+    """1.0 where light is clipped in all channels, and in any beside such: what is recorded there is no measurement.
+
+    A lamp is far too bright for all channels, and its rim for some.  Where nothing around has more than one channel
+    clipped it is a vivid surface: the others show its colour, and nearly all of its light was measured.
+    """
     masks = [mask for mask in blurred.clipped if mask is not None]
-    return functools.reduce(cv2.max, masks) if masks else None
+    if len(masks) < len(blurred.clipped):
+        return None
+    white = functools.reduce(cv2.min, masks)
+    if not cv2.hasNonZero(white):
+        return None
+    side = 2 * int(np.ceil(blurred.longest_px / 2 + CODEC_REACH_PX)) + 1
+    return cv2.min(functools.reduce(cv2.max, masks), cv2.dilate(white, np.ones((side, side), np.uint8)))
 
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:
