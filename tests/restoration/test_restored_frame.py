@@ -13,7 +13,7 @@ from laws import TurningCamera, phone, psnr_db
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.restoration.frame import RestoredFrame, copied_frame, encode_picture, restore_frame
+from virest.restoration.frame import RestoredFrame, _most_blurred, copied_frame, encode_picture, restore_frame
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 
 BALANCED = RestorationSettings()
@@ -249,6 +249,17 @@ def test_a_vivid_surface_keeps_its_colour(settings: RestorationSettings) -> None
     inside = cv2.erode(tiles, np.ones((9, 9), np.uint8)) > 0
     colour = (result[..., 1] - result[..., 2])[inside]
     assert colour.mean() > 150, "of 165"
+
+
+def test_noise_is_measured_where_the_blur_is() -> None:
+    """Under a turn about the optical axis the tiles around it, which cancel nothing, are left out, others are not."""
+    turning = camera((0.0, 0.0, 2.0))
+    x, y = np.meshgrid(np.linspace(20, 315, 8), np.linspace(20, 220, 6))
+    centres = np.stack([x, y], -1).reshape(-1, 2)
+    kept = _most_blurred(turning.motion, centres)
+    far = np.linalg.norm(kept - (167.5, 119.5), axis=1)
+    assert 6 <= len(kept) < len(centres)
+    assert far.min() > 0.4 * far.max()
 
 
 # ── the log ──────────────────────────────────────────────────────────────────────────────────────────────────────
