@@ -251,6 +251,21 @@ def test_a_vivid_surface_keeps_its_colour(settings: RestorationSettings) -> None
     assert colour.mean() > 150, "of 165"
 
 
+@pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
+def test_thin_lines_on_clipped_paper_stay(settings: RestorationSettings) -> None:
+    """Between white that was too bright there is nothing measured to restore lines from: they stay as recorded."""
+    turning = camera()
+    picture = record(turning).picture.copy()
+    picture[60:200, 80:280] = 255
+    for left in range(88, 276, 14):
+        cv2.line(picture, (left, 66), (left + 5, 194), (60, 40, 90), 3, cv2.LINE_AA)
+    result = _picture(_restore(turning, picture, settings)).astype(int)
+    straight = _picture(_restore(turning, picture, replace(settings, deblur="none")))
+    inside = np.s_[110:150, 130:230]
+    assert (result != straight).any()
+    assert np.abs(result - straight)[inside].mean() < 3
+
+
 def test_noise_is_measured_where_the_blur_is() -> None:
     """Under a turn about the optical axis the tiles around it, which cancel nothing, are left out, others are not."""
     turning = camera((0.0, 0.0, 2.0))

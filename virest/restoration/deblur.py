@@ -32,6 +32,9 @@ COLOUR_TILE_PX = 384
 """Colour differences hold so little detail that kernels need not follow the paths as closely."""
 CODEC_REACH_PX = 2.5
 """A lamp's edge is smeared about so far by the movie's codec."""
+LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
+"""Part of what is not clipped that lies clear of clipped light, from which on restoring begins, and is all taken;
+seen over so many pixels and the path to both sides."""
 FEW_ITERATIONS, FEW_SCALE = 2, 0.6
 """Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
 COARSE_OVERLAP, FINE_OVERLAP = 6, 4
@@ -306,6 +309,20 @@ def _measured_part(holes: Image) -> Image:
     """
     wide = cv2.GaussianBlur(cv2.dilate(holes, np.ones((5, 5), np.uint8)), (0, 0), CODEC_REACH_PX)
     return (1 - holes) * (1 - wide)
+
+
+def measured_share(blurred: BlurredPicture) -> Image | None:
+    """How much of a restored picture to take where light is clipped, (height, width); None: all of it, everywhere.
+
+    Thin things on a clipped background lie within the margins of the holes: next to nothing of them was measured.
+    """
+    holes = _holes(blurred)
+    if holes is None:
+        return None
+    side = 2 * int(np.ceil(blurred.longest_px)) + MEASURED_OVER_PX
+    measured, left = (cv2.blur(part, (side, side)) for part in (_measured_part(holes), 1 - holes))
+    share = (measured / np.maximum(left, 1e-3) - LEAST_MEASURED) / (ENOUGH_MEASURED - LEAST_MEASURED)
+    return cv2.blur(np.clip(share, 0, 1), (side, side))
 
 
 def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:

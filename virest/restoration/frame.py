@@ -26,6 +26,7 @@ from virest.restoration.deblur import (
     blurred_picture,
     clipped_anywhere,
     deblur,
+    measured_share,
     near_clipped,
     unseen_masks,
 )
@@ -302,6 +303,8 @@ def _deblurred(
     sharp = deblur(blurred, settings)
     if anchor == 0.5:
         part = _blurred_part(motion, settings.min_blur_px) * _share_map(blurred, share)
+        measured = measured_share(blurred)
+        part = part if measured is None else part * measured
         if part.min() < 1.0:
             sharp = [plane + part * (s - plane) for s, plane in zip(sharp, blurred.light, strict=True)]
     restored = encode_picture(sharp if light is None else [plane * light.kept for plane in sharp], curve)
