@@ -36,8 +36,8 @@ from virest.restoration.statistics import PictureStatistics, falling_power, meas
 
 LOG_TILE_PX = 128
 """Spacing of the tiles in the log."""
-MIN_WARP_PX = 0.05
-"""Straightening that moves no point further than this is left out."""
+MIN_WARP_PX = 0.1
+"""Straightening that moves no point further than this is left out: so much a gyroscope at rest seems to turn, too."""
 SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
 MIN_SAMPLES = 6
