@@ -56,6 +56,17 @@ def test_offset_and_bias_come_back(time_offset_s: float, direction: str) -> None
     assert 0.08 < found.noise_px < 0.13
 
 
+@pytest.mark.parametrize("error_s", [0.007, -0.012])
+def test_an_offset_a_little_wrong_agrees_but_not_best(error_s: float) -> None:
+    """Pictures and gyroscope belong together, and where they agree clearly better is told, coarsely."""
+    recorded = make(Setup(hand_motion(2), time_offset_s=0.011, frames=30, points=60))
+    right, wrong = agreement(recorded, 0.011), agreement(recorded, 0.011 + error_s)
+    assert right.agrees
+    assert wrong.agrees
+    assert wrong.best_offset_s == pytest.approx(0.011, abs=3e-3)
+    assert right.best_offset_s is None or abs(right.best_offset_s - 0.011) < 3e-3
+
+
 @pytest.mark.parametrize(
     ("velocity_m_s", "depth_m"), [((0.1, -0.1, 3.0), (5.0, 60.0)), ((0.2, 0.1, 0.0), (1.5, 12.0))], ids=["car", "sway"]
 )

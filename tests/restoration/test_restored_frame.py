@@ -13,7 +13,7 @@ from laws import TurningCamera, phone, psnr_db
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.restoration.frame import RestoredFrame, copied_frame, encode_picture, restore_frame
+from virest.restoration.frame import RestoredFrame, _most_blurred, copied_frame, encode_picture, restore_frame
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 
 BALANCED = RestorationSettings()
@@ -233,6 +233,48 @@ def test_lights_in_the_dark_do_not_ring(settings: RestorationSettings) -> None:
     far = np.ones((240, 336), bool)
     far[70:150, 110:210] = False
     assert np.abs(result - picture)[far].max() <= 6
+
+
+@pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
+def test_a_vivid_surface_keeps_its_colour(settings: RestorationSettings) -> None:
+    """Green tiles too bright for one channel stay as green as they were, edges included."""
+    turning = camera()
+    picture = record(turning).picture.copy()
+    tiles = np.zeros(picture.shape[:2], np.uint8)
+    for left in range(90, 240, 50):
+        cv2.rectangle(tiles, (left, 80), (left + 24, 170), 1, -1)
+    picture[tiles > 0] = (180, 255, 90)
+    result = _picture(_restore(turning, picture, settings)).astype(int)
+    assert (result != picture).any()
+    inside = cv2.erode(tiles, np.ones((9, 9), np.uint8)) > 0
+    colour = (result[..., 1] - result[..., 2])[inside]
+    assert colour.mean() > 150, "of 165"
+
+
+@pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
+def test_thin_lines_on_clipped_paper_stay(settings: RestorationSettings) -> None:
+    """Between white that was too bright there is nothing measured to restore lines from: they stay as recorded."""
+    turning = camera()
+    picture = record(turning).picture.copy()
+    picture[60:200, 80:280] = 255
+    for left in range(88, 276, 14):
+        cv2.line(picture, (left, 66), (left + 5, 194), (60, 40, 90), 3, cv2.LINE_AA)
+    result = _picture(_restore(turning, picture, settings)).astype(int)
+    straight = _picture(_restore(turning, picture, replace(settings, deblur="none")))
+    inside = np.s_[110:150, 130:230]
+    assert (result != straight).any()
+    assert np.abs(result - straight)[inside].mean() < 3
+
+
+def test_noise_is_measured_where_the_blur_is() -> None:
+    """Under a turn about the optical axis the tiles around it, which cancel nothing, are left out, others are not."""
+    turning = camera((0.0, 0.0, 2.0))
+    x, y = np.meshgrid(np.linspace(20, 315, 8), np.linspace(20, 220, 6))
+    centres = np.stack([x, y], -1).reshape(-1, 2)
+    kept = _most_blurred(turning.motion, centres)
+    far = np.linalg.norm(kept - (167.5, 119.5), axis=1)
+    assert 6 <= len(kept) < len(centres)
+    assert far.min() > 0.4 * far.max()
 
 
 # ── the log ──────────────────────────────────────────────────────────────────────────────────────────────────────

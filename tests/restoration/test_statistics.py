@@ -205,3 +205,29 @@ def test_white_noise_is_the_median_second_difference(height: int, rng: np.random
     differences = cv2.filter2D(plane.astype(float), -1, mask)[2 : height - 2 : 4, 2:-2:4]
     expected = np.median(np.abs(differences)) / 0.6745 / 6.0
     assert statistics_room.white_noise(plane) == pytest.approx(expected, rel=1e-9)
+
+
+def _coded(picture: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Blocks' cosine transforms in whole steps, as a movie's coder stores them."""
+    coded = np.empty_like(picture)
+    for top in range(0, HEIGHT - 3, 4):
+        for left in range(0, WIDTH - 3, 4):
+            block = np.s_[top : top + 4, left : left + 4]
+            coded[block] = cv2.idct(np.rint(cv2.dct(picture[block]) / step) * step)
+    return coded
+
+
+def test_a_coders_noise_is_level_where_the_picture_stands_out_of_it() -> None:
+    """A short blur tells the noise at high frequencies only, where it falls with the picture; below it is level."""
+    field = _field(3.0)
+    blurred = cv2.filter2D(255 * (0.2 + 0.6 * texture(HEIGHT, WIDTH, seed=5)), -1, field.arrays()[0].astype(float))
+    coded = _coded(blurred, 20.0)
+    picture = np.repeat(np.clip(np.rint(coded), 0, 255).astype(np.uint8)[..., None], 3, -1)
+    luma, _ = measure_picture(picture, field, STRAIGHT)
+    low = luma.frequency < 0.15
+    lost = (coded - blurred).astype(np.float32)
+    tiles = [lost[y : y + 128, x : x + 128] for y in (10, 150, 280) for x in (20, 200, 400)]
+    error = np.mean([statistics_room._windowed_power(tile) for tile in tiles], 0)
+    rings = statistics_room._ring_index(128)
+    truth = np.array([error[rings == number].mean() for number in np.flatnonzero(low)[1:]])
+    assert (luma.noise[low][1:] < 2 * truth).all()

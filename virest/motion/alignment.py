@@ -64,6 +64,8 @@ MAX_BIAS_SIGMA = {"rotation": 4.0, "common": 2.0, "pairwise": 2.0}
 fitted.  A moving camera's steady parallax looks like bias."""
 AGREEMENT_SLACK_S = 0.03
 """An offset wrong by this is a matter for calibration, not a sign that pictures and gyroscope are strangers."""
+CLEARLY_BETTER = 30.0
+"""Chi-square of one from which on another offset is clearly better; errors of pairs go together, so more than nine."""
 GUESSED_FOCAL = 0.8
 """Of the longer side: a phone's main camera; where nothing is known."""
 
@@ -126,7 +128,7 @@ class Agreement:
     motion_px: float
     """rms of the pictures' changing rotation."""
     best_offset_s: float | None
-    """Another offset at which they would agree; None: there is none, or none is needed."""
+    """Another offset at which they would agree, or agree clearly better; None: there is none, or none is needed."""
     reason: str
 
 
@@ -556,7 +558,8 @@ def check_agreement(
     if not np.isfinite(explained):
         return Agreement(True, nan, residual_px, motion_px, None, "too little to tell: no inertial data at the frames")
     if explained >= MIN_EXPLAINED:
-        return Agreement(True, explained, residual_px, motion_px, None, "")
+        better = _clearly_better(scan, offset_s, near, 3 * len(pairs))
+        return Agreement(True, explained, residual_px, motion_px, better, "")
     best, _ = _distinct_peak(scan, search_s, _least_explained(observed))
     elsewhere = None if best is None else float(scan.offset_s[best])
     reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the pictures' rotation"
@@ -564,6 +567,26 @@ def check_agreement(
     if elsewhere is not None:
         hint = f"at an offset of {elsewhere:+.3f} s it would explain {float(np.max(scan.explained)):.0%}"
     return Agreement(False, explained, residual_px, motion_px, elsewhere, f"{reason}: {hint}")
+
+
+def _clearly_better(scan: OffsetScan, offset_s: float, near: NDArray[np.bool_], figures: int) -> float | None:
+    """Offset near the given one that leaves clearly less unexplained; None: there is none.
+
+    What is left, as a parabola over the offset, has its least there; times ``figures`` / least, the difference is a
+    chi-square of one.
+    """
+    best = int(np.flatnonzero(near)[np.argmax(scan.explained[near])])
+    if not 0 < best < len(scan.offset_s) - 1:
+        return None
+    before, here, after = 1 - scan.explained[best - 1 : best + 2]
+    bend, lean = (before + after) / 2 - here, (after - before) / 2
+    if not np.isfinite(bend) or bend <= 0:
+        return None
+    steps = float(np.clip(-lean / (2 * bend), -0.5, 0.5))
+    least = max(float(here + lean * steps + bend * steps**2), 1e-9)
+    at_given = 1 - float(np.interp(offset_s, scan.offset_s, scan.explained))
+    chi_square = figures * (at_given / least - 1)
+    return float(scan.offset_s[best]) + steps * COARSE_STEP_S if chi_square > CLEARLY_BETTER else None
 
 
 def _changes_px(observed: _Observed, offset_s: float) -> tuple[Array, Array]:

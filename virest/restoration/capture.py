@@ -174,6 +174,11 @@ def plan_restoration(
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
         if not agreement.agrees:
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
+        elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
+            estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
+            if estimate.determined:
+                offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
+                plan = _with_doubt(plan, profile.time_offset_s, offset_s, estimate.std_s)
     if alignment is None or plan.copy_reason is not None:
         return plan
     return _with_translations(plan, capture, alignment)
@@ -210,10 +215,7 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
         return plan
     offset_s, std_s = clock
     if given.time_offset_s is not None:
-        if abs(offset_s - given.time_offset_s) < max(OFFSET_DOUBT_S, 3 * std_s):
-            return plan
-        said = f"the pictures put the time offset at {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
-        return replace(plan, warnings=(*plan.warnings, said))
+        return _with_doubt(plan, given.time_offset_s, offset_s, std_s)
     source = "tracked points against gyroscope and accelerometer"
     profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
     values, spread = bias[0], np.hypot(bias[1], BIAS_FLOOR_RAD_S)
@@ -224,6 +226,14 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
     copy = None if plan.copy_reason and plan.copy_reason.startswith("time offset") else plan.copy_reason
     return replace(plan, profile=profile, warnings=(*warnings, said), copy_reason=copy)
+
+
+def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
+    """Say where the pictures put the clocks far from where the profile does."""
+    if abs(offset_s - given_s) < max(OFFSET_DOUBT_S, 3 * std_s):
+        return plan
+    said = f"the pictures put the time offset at {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
+    return replace(plan, warnings=(*plan.warnings, said))
 
 
 def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:

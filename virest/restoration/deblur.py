@@ -35,6 +35,9 @@ The coarse scale, with few iterations, costs up to 0.05 dB.
 """
 CODEC_REACH_PX = 2.5
 """A lamp's edge is smeared about so far by the movie's codec."""
+LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
+"""Part of what is not clipped that lies clear of clipped light, from which on restoring begins, and is all taken;
+seen over so many pixels and the path to both sides."""
 FEW_ITERATIONS, FEW_SCALE = 2, 0.6
 """Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
 REDUCTIONS = (1.5, 4 / 3)
@@ -321,9 +324,19 @@ def _filled_in(planes: list[Image], known: Image) -> list[Image]:
 
 
 def _holes(blurred: BlurredPicture) -> Image | None:
-    """1.0 where any channel is clipped: what is recorded there is no measurement."""
+    """1.0 where light is clipped in all channels, and in any beside such: what is recorded there is no measurement.
+
+    A lamp is far too bright for all channels, and its rim for some.  Where nothing around has more than one channel
+    clipped it is a vivid surface: the others show its colour, and nearly all of its light was measured.
+    """
     masks = [mask for mask in blurred.clipped if mask is not None]
-    return functools.reduce(cv2.max, masks) if masks else None
+    if len(masks) < len(blurred.clipped):
+        return None
+    white = functools.reduce(cv2.min, masks)
+    if not cv2.hasNonZero(white):
+        return None
+    side = 2 * int(np.ceil(blurred.longest_px / 2 + CODEC_REACH_PX)) + 1
+    return cv2.min(functools.reduce(cv2.max, masks), cv2.dilate(white, np.ones((side, side), np.uint8)))
 
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:
@@ -353,6 +366,20 @@ def _around(mask: Image, reach: int) -> tuple[slice, slice]:
     """Rows and columns of all that is not 0 in a mask (height, width), and so many pixels more on each side."""
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
     return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
+
+
+def measured_share(blurred: BlurredPicture) -> Image | None:
+    """How much of a restored picture to take where light is clipped, (height, width); None: all of it, everywhere.
+
+    Thin things on a clipped background lie within the margins of the holes: next to nothing of them was measured.
+    """
+    holes = _holes(blurred)
+    if holes is None:
+        return None
+    side = 2 * int(np.ceil(blurred.longest_px)) + MEASURED_OVER_PX
+    measured, left = (cv2.blur(part, (side, side)) for part in (_measured_part(holes), 1 - holes))
+    share = (measured / np.maximum(left, 1e-3) - LEAST_MEASURED) / (ENOUGH_MEASURED - LEAST_MEASURED)
+    return cv2.blur(np.clip(share, 0, 1), (side, side))
 
 
 def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:

@@ -27,6 +27,7 @@ from virest.restoration.deblur import (
     blurred_picture,
     clipped_anywhere,
     deblur,
+    measured_share,
     near_clipped,
     unseen_masks,
 )
@@ -36,12 +37,14 @@ from virest.restoration.statistics import FEW_TILES, MANY_TILES, PictureStatisti
 
 LOG_TILE_PX = 128
 """Spacing of the tiles in the log."""
-MIN_WARP_PX = 0.05
-"""Straightening that moves no point further than this is left out."""
+MIN_WARP_PX = 0.1
+"""Straightening that moves no point further than this is left out: so much a gyroscope at rest seems to turn, too."""
 SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
-MIN_GAIN_DB = 0.03
-"""A picture of which the measured noise promises less is left alone."""
+MIN_SAMPLES = 6
+"""So many tiles, the most blurred ones, are measured in any case."""
+MIN_GAIN_DB = 0.1
+"""A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
 FULL_TRUST_SCALE = 1.2
@@ -285,9 +288,9 @@ def _deblurred(
     """The deblurred picture and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
-    samples = kernel_field(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, anchor)
+    centres_px = _most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
-    luma, chroma = _measured(picture, samples, curve, tiles)
+    luma, chroma = _measured(picture, kernel_field(motion, centres_px, anchor), curve, tiles)
     share = 1.0 if anchor != 0.5 else _trusted_share(luma)
     why_not = _too_little_to_gain(luma)
     if why_not:
@@ -300,6 +303,8 @@ def _deblurred(
     sharp = deblur(blurred, settings)
     if anchor == 0.5:
         part = _blurred_part(motion, settings.min_blur_px) * _share_map(blurred, share)
+        measured = measured_share(blurred)
+        part = part if measured is None else part * measured
         if part.min() < 1.0:
             sharp = [plane + part * (s - plane) for s, plane in zip(sharp, blurred.light, strict=True)]
     restored = encode_picture(sharp if light is None else [plane * light.kept for plane in sharp], curve)
@@ -317,6 +322,17 @@ def _deblurred(
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
     return restored, details, ()
+
+
+def _most_blurred(motion: RowMotion, centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Centres (m, 2) of the tiles to measure on: the most blurred, and all that are blurred half as much.
+
+    A path of a pixel cancels nothing, and tells no noise from signal; a coder's noise is where the motion is.
+    """
+    length_px = np.linalg.norm(blur_chords(motion, centres_px), axis=-1)
+    ranked = np.sort(length_px)[::-1]
+    least_px = min(ranked[0] / 2, ranked[min(MIN_SAMPLES, len(ranked)) - 1])
+    return np.asarray(centres_px[length_px >= least_px])
 
 
 def _measured(

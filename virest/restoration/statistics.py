@@ -42,6 +42,8 @@ _STEEPEST_NOISE, _LEVEL_BELOW = 2.0, 0.08
 """A coded movie's error grows towards low frequencies like f⁻² at most, and below 0.08 cycles per pixel no more."""
 _SLOPE_SPAN = 3.0
 """The noise's growth is measured from the lowest determined ring to so many times its frequency."""
+_STANDS_OUT = 0.5
+"""A coder's noise is no longer cut with the picture where it has less than this part of what is seen."""
 _CLEAR_SIGNAL = 3.0
 """What comes through the blur is clear where it has so many times the noise's power."""
 _DETAIL_SLOPE = 3.0
@@ -329,7 +331,7 @@ def _settled(
     if determined.any():
         noise = np.interp(frequency, frequency[determined], noise[determined])
         noise = np.maximum.accumulate(noise[::-1])[::-1]
-        noise *= _growth_downwards(frequency, noise, determined)
+        noise *= _growth_downwards(frequency, noise, determined, observed)
     else:
         noise = np.full(RINGS, max(min(float(observed[-3:].mean()), 2 * white_levels**2), _ROUNDING_POWER))
     through = np.maximum(observed - noise, 0.05 * observed) / np.maximum(passed, 0.05)
@@ -345,10 +347,11 @@ def _standard_deviation(frequency: Array, through: Array, noise: Array) -> float
     return float(np.sqrt(np.sum(weight * noise) / np.sum(weight)))
 
 
-def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.bool_]) -> Array:
+def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.bool_], observed: Array) -> Array:
     """How many times larger the noise is below the determined rings, (RINGS,): it goes on as they rise.
 
-    A sensor's noise is white. A coder's is level where it cuts the picture's power down, and above falls with it.
+    A sensor's noise is white. A coder's falls with the picture's power where it cuts that away; where the picture
+    stands out of the noise, at lower frequencies, it is level (reverse water-filling).
     """
     first = int(np.flatnonzero(determined)[0])
     near = determined & (frequency <= _SLOPE_SPAN * frequency[first])
@@ -356,7 +359,11 @@ def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.boo
     if np.count_nonzero(near) > 2:
         slope = -float(np.polyfit(np.log(frequency[near]), np.log(noise[near]), 1)[0])
     rise = np.maximum(frequency[first] / np.maximum(frequency, _LEVEL_BELOW), 1.0)
-    return np.asarray(rise ** np.clip(slope, 0.0, _STEEPEST_NOISE))
+    growth = np.asarray(rise ** np.clip(slope, 0.0, _STEEPEST_NOISE))
+    stands_out = np.flatnonzero(growth[:first] * noise[:first] < _STANDS_OUT * observed[:first])
+    if len(stands_out):
+        growth[: stands_out[-1]] = growth[stands_out[-1]]
+    return growth
 
 
 def _as_detail_falls(frequency: Array, signal: Array, passed: Array, noise: Array) -> Array:
