@@ -41,9 +41,9 @@ def test_kernels_and_light_go_to_the_smaller_picture() -> None:
 
 
 def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
-    """A lamp of one channel is a hole of the small picture that covers all of it, and nothing far from it."""
+    """A lamp is a hole of the small picture that covers all of it, and nothing far from it."""
     picture = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
-    picture[40:47, 90:101, 0] = 255
+    picture[40:47, 90:101] = 255
     hole = deblur._reduced(_blurred(picture), 1.5).clipped[0]
     assert hole is not None
     rows, columns = np.nonzero(hole)
