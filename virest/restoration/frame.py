@@ -47,8 +47,8 @@ MIN_GAIN_DB = 0.1
 """A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
-FULL_TRUST_SCALE = 1.2
-"""Gradients of so many times the noise are not wiped out with it."""
+FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
+"""Gradients of so many times the noise are not wiped out with it; nor does it matter where so much is to be gained."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -418,7 +418,8 @@ def _trusted_share(luma: PictureStatistics) -> float:
     coded movie) the prior wipes out texture that the recorded picture has.
     """
     share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
-    return float(share * min(1.0, luma.gradient_scale / (FULL_TRUST_SCALE * luma.noise_levels)))
+    doubt = 1 - min(1.0, luma.gradient_scale / (FULL_TRUST_SCALE * luma.noise_levels))
+    return float(share * (1 - doubt * max(0.0, 1 - luma.expected_gain_db / SURE_GAIN_DB)))
 
 
 class _Clock:

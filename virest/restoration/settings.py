@@ -44,8 +44,8 @@ class RestorationSettings:
 
 PRESETS: dict[str, RestorationSettings] = {
     "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144, strength=0.8),
-    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=5, tile_px=104, strength=1.0),
+    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0),
     "best": RestorationSettings(
-        "best", "hyper-laplacian-global", iterations=8, inner_iterations=5, tile_px=104, strength=1.0
+        "best", "hyper-laplacian-global", iterations=8, inner_iterations=6, tile_px=104, strength=1.0
     ),
 }
