@@ -16,20 +16,23 @@ from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
 from virest.capture.video import probe_movie, read_frames
+from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange
+from virest.diagnosis.light_values import settle_light
 from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
 from virest.diagnosis.photometry_effects import (
     BlackLevel,
     Flicker,
     GainDrift,
+    PhotometricEffect,
     ResponseGamma,
     Vignetting,
     photometric_effects,
 )
-from virest.diagnosis.photometry_fit import RESOLUTION, fit_photometry, judge, significance, time_blocks
+from virest.diagnosis.photometry_fit import RESOLUTION, fit_photometry, judge, pulls, significance, time_blocks
 from virest.diagnosis.photometry_mixing import MixingEvidence, estimate_mixing, judge_mixing, observe_mixing
 from virest.diagnosis.photometry_noise import measured_noise
 from virest.diagnosis.photometry_patches import observe_photometry
-from virest.diagnosis.picture_ladder import PictureVerdict, climb_observations
+from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, climb_observations, name_curve, values_of
 from virest.motion.integration import integrate_gyro
 
 FRAMES, NOISE = 60, 0.5
@@ -310,3 +313,107 @@ def test_blur_shows_the_curve_at_constant_exposure(tmp_path: Path) -> None:
     assert nothing is not None
     assert hidden_gamma.value == pytest.approx(1.3, abs=min(3 * hidden_gamma.std, 0.13))
     assert hidden_gamma.p_value < 1e-3 < nothing.p_value
+
+
+# ── values under the curve as found ────────────────────────────────────────────────────────────────────────────────
+
+
+def lit(observed: PhotometricObservations, nominal: CameraProfile, effect: PhotometricEffect) -> PictureVerdict:
+    """The ladder's verdict where this one effect was named."""
+    fit = fit_photometry(observed, nominal, [effect])
+    std = np.sqrt(np.diag(fit.of(effect.name)[1]))
+    changes = changes_of(values_of(effect, nominal), values_of(effect, fit.profile), std)
+    p_value = significance(fit, effect.name, observed)[1]
+    finding = Finding(effect.name, changes, HeldOutGain(PHOTOMETRY, 2.0, 0.5, 0.5), (), p_value, "")
+    return PictureVerdict(fit.profile, [finding], observations=observed, fitted=fit)
+
+
+def settled(
+    observed: PhotometricObservations, evidence: MixingEvidence | None, given: CameraProfile = NOMINAL
+) -> tuple[PictureVerdict, PictureVerdict, CameraProfile]:
+    """(ladder's verdict, the same settled, profile) on patches and on what blur mixed."""
+    light = lit(observed, given, Vignetting())
+    curve = PictureVerdict(light.profile)
+    if evidence is not None:
+        name_curve(curve, evidence)
+    return light, *settle_light(light, curve, given, [])
+
+
+def loss_of(verdict: PictureVerdict) -> tuple[float, float]:
+    """Corner loss that was named, and its deviation."""
+    change = next(f for f in verdict.findings if f.name == "vignetting").parameters["corner_loss"]
+    return change.estimate, change.std
+
+
+def test_vignetting_is_that_under_the_curve_that_blur_shows(rng: np.random.Generator) -> None:
+    """A corner that a gamma darkens once more keeps its own light once the gamma is known, as well as that is known."""
+    observed = made_observations(hidden(1.3, vignetting_corner_loss=0.5), rng)
+    light, final, profile = settled(observed, mixing_evidence(rng, 1.5, 1.3, 0.02))
+    assert profile.response is not None
+    gamma = profile.response.extra_gamma
+    assert gamma == pytest.approx(1.3, abs=0.15)
+    (taken, _), (loss, std) = loss_of(light), loss_of(final)
+    assert taken == pytest.approx(1 - 0.5**1.3, abs=0.02)
+    assert loss == pytest.approx(0.5, abs=2 * std)
+    assert profile.extensions.vignetting_corner_loss == loss
+    assert f"{loss:.3g}" in next(f.sentence for f in final.findings if f.name == "vignetting")
+    # (1 − loss)^gamma is what the patches tell
+    mixed = PictureVerdict(NOMINAL)
+    name_curve(mixed, mixing_evidence(np.random.default_rng(1), 1.5, 1.3, 0.02))
+    gamma_std = mixed.findings[0].parameters["gamma"].std
+    assert std == pytest.approx(0.5 * np.log(2) * gamma_std / gamma, rel=0.25)
+
+
+@pytest.mark.parametrize(("strength", "true"), [(None, 1.25), (0.12, 0.8), (None, 1.0)])
+def test_a_curve_that_was_not_told_widens_what_hangs_on_it(
+    rng: np.random.Generator, strength: float | None, true: float
+) -> None:
+    """Without blur, or with blur that says little, the loss holds for the profile's curve, and its deviation for more.
+
+    Whether there is vignetting does not hang on the curve.  A curve that the profile knows well leaves it as it was.
+    """
+    observed = made_observations(hidden(true, vignetting_corner_loss=0.5), rng)
+    evidence = None if strength is None else mixing_evidence(rng, strength, true, 0.02)
+    light, final, profile = settled(observed, evidence)
+    assert profile.response == NOMINAL.response
+    (taken, narrow), (loss, std) = loss_of(light), loss_of(final)
+    assert loss == taken
+    assert abs(loss - 0.5) < 2.5 * std
+    assert std > 3 * narrow
+    assert [f.p_value for f in final.findings] == pytest.approx([f.p_value for f in light.findings])
+    assert any("nothing told the curve" in note for note in final.notes) == (strength is None)
+    known = NOMINAL.with_estimate("gamma", 1.0, 0.002, "calibrated")
+    sure = loss_of(settled(observed, evidence, known)[1])
+    assert sure == pytest.approx((taken, narrow), rel=0.05)
+
+
+def test_a_lamp_pulses_as_the_exposure_found_says(rng: np.random.Generator) -> None:
+    """What a longer exposure averages away of a pulse comes back with that exposure, its deviation counted in."""
+    true = hidden(flicker_amplitude=0.2, flicker_frequency_hz=100.0, flicker_phase_rad=1.0)
+    short = replace(NOMINAL, shutter=replace(NOMINAL.shutter, exposure_scale=0.8))
+    short = short.with_estimate("gamma", 1.0, 0.001, "calibrated")
+    light = lit(made_observations(true, rng), short, Flicker())
+    scale = ParameterChange(0.8, 1.0, 0.05)
+    cause = Finding("exposure_time", {"exposure_scale": scale}, HeldOutGain(BLUR, 1.0, 0.5, 0.5), (), 0.0, "")
+    found = replace(light.profile, shutter=NOMINAL.shutter)
+    final, profile = settle_light(light, PictureVerdict(found), short, [cause])
+    amplitude = final.findings[0].parameters["amplitude"]
+    assert light.profile.extensions.flicker_amplitude < 0.17
+    assert amplitude.estimate == profile.extensions.flicker_amplitude == pytest.approx(0.2, abs=0.01)
+    # 0.7 of a period are averaged: d log sinc(0.7 s) / d log s = x cot x − 1 with x = 0.7 π
+    x = 0.7 * np.pi
+    assert amplitude.std == pytest.approx(0.2 * 0.05 * (1 - x / np.tan(x)), rel=0.15)
+
+
+def test_a_small_gamma_that_was_not_named_is_not_excluded(rng: np.random.Generator) -> None:
+    """Where exposures change, brightness itself says how far the curve may be off, and what that does to the rest."""
+    observed = made_observations(hidden(1.05, vignetting_corner_loss=0.5), rng, 0.25)
+    light = lit(observed, NOMINAL, Vignetting())
+    final, profile = settle_light(light, PictureVerdict(light.profile), NOMINAL, [])
+    (taken, narrow), (loss, std) = loss_of(light), loss_of(final)
+    assert loss == taken
+    assert profile.response == NOMINAL.response
+    assert light.fitted is not None
+    pull = pulls(observed, light.profile, light.fitted, [(hidden(float(np.exp(0.01))), 0.01)])[0, 0]
+    assert pull == pytest.approx(-0.5 * np.log(2), rel=0.25)
+    assert std == pytest.approx(np.hypot(narrow, pull * np.log(1.05)), rel=0.2)

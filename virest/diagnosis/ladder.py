@@ -17,6 +17,7 @@ from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
+from virest.diagnosis.light_values import settle_light
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve
 from virest.diagnosis.points import (
     MIN_PAIRS,
@@ -63,6 +64,7 @@ def diagnose_capture(
     story.judge_blur(gray, lambda _part: say("points again", 0.85))
     say("curve", 0.92)
     story.judge_curve(pictures)
+    story.settle_light()
     say("what is left", 0.97)
     return story.told()
 
@@ -160,6 +162,14 @@ class _Story:
             return
         trajectory = integrate_gyro(self.capture.imu, extended)
         self.curve = judge_curve(extended, self.light.observations, self.frames, trajectory, pictures, self.each)
+
+    def settle_light(self) -> None:
+        """Brightness's values once more, now that the curve and the exposure are known as well as they will be."""
+        assert self.blur is not None
+        assert self.curve is not None
+        causes = [*self.findings, *self.blur.findings]
+        self.light, profile = settle_light(self.light, self.curve, self.points.start, causes)
+        self.curve = replace(self.curve, profile=profile)
 
     def told(self) -> Diagnosis:
         """The verdict, with everything that led to it."""

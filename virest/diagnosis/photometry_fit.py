@@ -125,10 +125,8 @@ def fit_photometry(
     use: Mask | None = None,
 ) -> PhotometricFit:
     """Fit all values of the effects together, from every start the effects name, and keep the best."""
-    chosen = observations if use is None else observations.subset(use)
     effects = tuple(effects)
-    if any(effect.per_frame for effect in effects):
-        chosen = _thinned(chosen, _PER_FRAME * len(chosen.frames))
+    chosen = _fitted_part(observations if use is None else observations.subset(use), effects)
     all_starts = product(*(effect.starts(chosen, profile) for effect in effects))
     starts = [np.concatenate([*start, [_FIRST_MEMORY]]) for start in islice(all_starts, _MAX_STARTS)]
     values, cost = _descend(chosen, profile, effects, _best_start(chosen, profile, effects, starts))
@@ -136,6 +134,39 @@ def fit_photometry(
     final, memory = _applied(profile, effects, values), _memory(values)
     rms = normalised_rms(chosen.with_memory(memory), final)[0]
     return PhotometricFit(effects, values[:-1], covariance, final, rms, cost, memory)
+
+
+def pulls(
+    observations: PhotometricObservations,
+    profile: CameraProfile,
+    fitted: PhotometricFit,
+    changed: Sequence[tuple[CameraProfile, float]],
+) -> Array:
+    """How a fit's values follow other values of the profile, to first order, (k, m).
+
+    changed: the profile that was fitted with one other value larger by a step, and the step, for each of the m.
+    What all values per frame have in common is not observable and left out.
+    """
+    chosen, effects = _fitted_part(observations, fitted.effects), fitted.effects
+    values = np.append(fitted.values, fitted.memory)
+    weight = _settled(chosen, profile, effects, values)[1]
+    jacobian = _jacobian(chosen, profile, effects, values, weight)
+    weighted = jacobian * weight[:, None]
+    seen, full = chosen.with_memory(fitted.memory), weight / chosen.noise**2
+
+    def at(base: CameraProfile) -> Array:
+        return predict(seen, _applied(base, effects, values), full).residual / chosen.noise
+
+    here = at(profile)
+    moved = np.stack([(at(base) - here) / step for base, step in changed], axis=-1)
+    normal = weighted.T @ jacobian + np.diag(_prior(effects))
+    followed, start = -np.linalg.solve(normal, weighted.T @ moved)[:-1], 0
+    for effect in effects:
+        own = slice(start, start + len(effect.parameters))
+        if effect.per_frame:
+            followed[own] -= followed[own].mean(axis=0)
+        start = own.stop
+    return np.asarray(followed)
 
 
 def judge(
@@ -197,6 +228,15 @@ def _per_frame(observations: PhotometricObservations, values: Array) -> Array:
 def _seen_twice(held: PhotometricObservations) -> PhotometricObservations:
     """Without patches that are held out once only: one observation alone has no residual."""
     return held.subset(np.bincount(held.patch)[held.patch] >= 2)
+
+
+def _fitted_part(
+    observations: PhotometricObservations, effects: Sequence[PhotometricEffect]
+) -> PhotometricObservations:
+    """What a fit looks at: all, or with values per frame enough for each."""
+    if any(effect.per_frame for effect in effects):
+        return _thinned(observations, _PER_FRAME * len(observations.frames))
+    return observations
 
 
 def _thinned(observations: PhotometricObservations, limit: int) -> PhotometricObservations:

@@ -74,6 +74,10 @@ SENTENCES = {
 }
 
 
+Mixed = tuple[MixingEstimate, HeldOut]
+"""A change of the curve that blur shows, and what it gains."""
+
+
 @dataclass(slots=True)
 class PictureVerdict:
     """Where this ladder ended."""
@@ -82,6 +86,10 @@ class PictureVerdict:
     findings: list[Finding] = field(default_factory=list)
     rungs: list[Rung] = field(default_factory=list)
     observations: PhotometricObservations | None = None
+    fitted: PhotometricFit | None = None
+    """Of brightness: all causes named, together."""
+    mixed: dict[str, Mixed] = field(default_factory=dict)
+    """What blur says of the curve, by cause, named or not."""
     photometric_rms: float | None = None
     blur_rms_px: float | None = None
     notes: list[str] = field(default_factory=list)
@@ -160,7 +168,7 @@ def climb_observations(
     nominal = verdict.profile
     verdict.photometric_rms = normalised_rms(observations, nominal)[0]
     effects = photometric_effects(observations, movie_frames)
-    if _light_spread(observations) < VARIED_LIGHT:
+    if not light_varies(observations):
         effects = tuple(e for e in effects if e.name not in ("response_curve", "black_level"))
     accepted: list[PhotometricEffect] = []
     plain = fit_photometry(observations, nominal, ())
@@ -174,14 +182,16 @@ def climb_observations(
         verdict.observations = observations.with_memory(plain.memory)
         return
     verdict.profile, verdict.observations = plain.profile, observations.with_memory(plain.memory)
+    verdict.fitted = plain
     held = judge(observations, nominal, accepted, each)
     for effect in accepted:
         verdict.findings.append(_finding(observations, nominal, plain, effect, held))
 
 
-def _light_spread(observations: PhotometricObservations) -> float:
+def light_varies(observations: PhotometricObservations) -> bool:
+    """Whether exposure × ISO changes enough for the curve to be read from brightness."""
     spread = np.quantile(observations.log_product, [0.05, 0.95])
-    return float(spread[1] - spread[0])
+    return bool(spread[1] - spread[0] >= VARIED_LIGHT)
 
 
 def _rung(
@@ -234,47 +244,43 @@ def _finding(
     effect: PhotometricEffect,
     held: HeldOut,
 ) -> Finding:
-    values, covariance = fitted.of(effect.name)
-    std = np.sqrt(np.diag(covariance))
-    changes = _changes(effect, nominal, fitted.profile, values, std)
+    std = np.sqrt(np.diag(fitted.of(effect.name)[1]))
+    changes = changes_of(values_of(effect, nominal), values_of(effect, fitted.profile), std)
     p_value = significance(fitted, effect.name, observations)[1]
     gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
-    return Finding(effect.name, changes, gain, (), p_value, _sentence(effect.name, changes))
+    return Finding(effect.name, changes, gain, (), p_value, sentence_of(effect.name, changes))
 
 
-def _changes(
-    effect: PhotometricEffect, nominal: CameraProfile, found: CameraProfile, values: Array, std: Array
-) -> dict[str, ParameterChange]:
+def values_of(effect: PhotometricEffect, profile: CameraProfile) -> dict[str, Any]:
+    """What a profile says of an effect, by the names of the contract."""
+    extensions = profile.extensions
     if effect.name == "gain_drift":
-        gain = list(found.extensions.gain)
-        spread = [float(s) for s in np.resize(std, len(gain))]
-        return {"gain": ParameterChange([1.0] * len(gain), gain, spread)}
-    now = {
-        "corner_loss": found.extensions.vignetting_corner_loss,
-        "amplitude": found.extensions.flicker_amplitude,
-        "frequency_hz": found.extensions.flicker_frequency_hz,
-        "phase_rad": found.extensions.flicker_phase_rad,
-        "gamma": _curve(found).extra_gamma,
-        "black_level": _curve(found).black_level,
+        return {"gain": list(extensions.gain)}
+    values = {
+        "corner_loss": extensions.vignetting_corner_loss,
+        "amplitude": extensions.flicker_amplitude,
+        "frequency_hz": extensions.flicker_frequency_hz,
+        "phase_rad": extensions.flicker_phase_rad,
+        "gamma": _curve(profile).extra_gamma,
+        "black_level": _curve(profile).black_level,
     }
-    before = {
-        "corner_loss": nominal.extensions.vignetting_corner_loss,
-        "amplitude": nominal.extensions.flicker_amplitude,
-        "frequency_hz": nominal.extensions.flicker_frequency_hz,
-        "phase_rad": nominal.extensions.flicker_phase_rad,
-        "gamma": _curve(nominal).extra_gamma,
-        "black_level": _curve(nominal).black_level,
-    }
-    return {
-        name: ParameterChange(before[name], now[name], float(s)) for name, s in zip(effect.parameters, std, strict=True)
-    }
+    return {name: values[name] for name in effect.parameters}
+
+
+def changes_of(before: dict[str, Any], now: dict[str, Any], std: Array) -> dict[str, ParameterChange]:
+    """Values as they were and as they are, with their deviations; a gain starts from 1 in every frame."""
+    if "gain" in now:
+        gain = now["gain"]
+        return {"gain": ParameterChange([1.0] * len(gain), gain, [float(s) for s in np.resize(std, len(gain))])}
+    return {name: ParameterChange(before[name], now[name], float(s)) for name, s in zip(now, std, strict=True)}
 
 
 def _curve(profile: CameraProfile) -> ResponseCurve:
     return profile.response or ResponseCurve("srgb")
 
 
-def _sentence(name: str, changes: dict[str, ParameterChange]) -> str:
+def sentence_of(name: str, changes: dict[str, ParameterChange]) -> str:
+    """What a cause means, for people."""
     return SENTENCES[name].format(**{key: _shown(change.estimate) for key, change in changes.items()})
 
 
@@ -292,28 +298,21 @@ def judge_curve(
 ) -> PictureVerdict:
     """Gamma or black level from how blur mixes light, where nothing else tells them; paths must be right by now."""
     verdict = PictureVerdict(profile)
-    _mixing(verdict, observations, frames, trajectory, pictures, each)
+    if observations is None or not light_varies(observations):
+        usable = [frame for frame in frames if frame.exposure_s]
+        name_curve(verdict, observe_mixing(pictures, usable, trajectory, profile, each=each))
     return verdict
 
 
-def _mixing(
-    verdict: PictureVerdict,
-    observations: PhotometricObservations | None,
-    frames: Sequence[Frame],
-    trajectory: Trajectory,
-    pictures: Reader,
-    each: Each,
-) -> None:
-    if observations is not None and _light_spread(observations) >= VARIED_LIGHT:
-        return
-    usable = [frame for frame in frames if frame.exposure_s]
-    evidence = observe_mixing(pictures, usable, trajectory, verdict.profile, each=each)
-    found = {name: _mixed(evidence, verdict.profile, name) for name in MIXING_LEAST}
-    if not any(found.values()):
+def name_curve(verdict: PictureVerdict, evidence: MixingEvidence) -> None:
+    """Enter into the verdict what blur that mixes light says of its profile's curve."""
+    tried = {name: _mixed(evidence, verdict.profile, name) for name in evidence.steps}
+    found = verdict.mixed = {name: one for name, one in tried.items() if one}
+    if not found:
         verdict.notes.append("no blurred frames beside sharp ones: the curve was not judged at constant exposure")
         return
     log.debug("mixing: %s", found)
-    sure = {name: one for name, one in found.items() if one and _is_sure(one, name, verdict.profile)}
+    sure = {name: one for name, one in found.items() if _is_sure(one, name, verdict.profile)}
     if not sure:
         return
     name = min(sure, key=lambda k: sure[k][1].after)
@@ -322,20 +321,20 @@ def _mixing(
     before = _value_of_curve(verdict.profile, name)
     changes = {MIXING_PARAMETER[name]: ParameterChange(before, estimate.value, estimate.std)}
     gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
-    verdict.findings.append(Finding(name, changes, gain, rivals, estimate.p_value, _sentence(name, changes)))
+    verdict.findings.append(Finding(name, changes, gain, rivals, estimate.p_value, sentence_of(name, changes)))
     curve = _curve(verdict.profile)
     is_black = name == "black_level"
     curve = replace(curve, black_level=estimate.value) if is_black else replace(curve, extra_gamma=estimate.value)
     verdict.profile = replace(verdict.profile, response=curve)
-    verdict.rungs.append(Rung(name, {k: one[1].after for k, one in found.items() if one}, held.before, PHOTOMETRY))
+    verdict.rungs.append(Rung(name, {k: one[1].after for k, one in found.items()}, held.before, PHOTOMETRY))
 
 
-def _mixed(evidence: MixingEvidence, profile: CameraProfile, name: str) -> tuple[MixingEstimate, HeldOut] | None:
+def _mixed(evidence: MixingEvidence, profile: CameraProfile, name: str) -> Mixed | None:
     estimate, held = estimate_mixing(evidence, profile, name), judge_mixing(evidence, name)
     return (estimate, held) if estimate is not None and held is not None else None
 
 
-def _is_sure(found: tuple[MixingEstimate, HeldOut], name: str, profile: CameraProfile) -> bool:
+def _is_sure(found: Mixed, name: str, profile: CameraProfile) -> bool:
     """Whether a change of the curve is significant, worth naming, and gains where it was not fitted."""
     estimate, held = found
     now = _value_of_curve(profile, name)
@@ -394,7 +393,7 @@ def climb_blur(
         p_value = float(np.exp(-0.5 * z**2))
         name = effects[k].name
         verdict.findings.append(
-            Finding(name, changes, HeldOutGain(BLUR, before, after, noise), (), p_value, _sentence(name, changes))
+            Finding(name, changes, HeldOutGain(BLUR, before, after, noise), (), p_value, sentence_of(name, changes))
         )
         verdict.rungs.append(Rung(name, {name: after}, before, BLUR))
         values = np.array([scale]) if k == 0 else np.array([sigma])

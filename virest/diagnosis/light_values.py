@@ -1,0 +1,204 @@
+"""What brightness says under the profile as finally found, and what is left open of the curve counted in.
+
+The ladder fits vignetting, flicker and gains before blur has told the exposure and, at constant exposure × ISO, the
+curve.  A curve with gamma g shows a factor v on the light about as one without shows v^g: at constant exposure the
+brightness of patches fits as well, and a corner that keeps 0.5 of the light is taken for one that keeps 0.41 where g is
+1.3.  So all these values are fitted again under the profile as found, and their covariance gets ``P S Pᵀ``, P their
+change with the curve and the exposure (photometry_fit.pulls), S what is not known of those (as Schmidt 1966 did for
+parameters that a filter considers but does not estimate).
+
+A change of the curve that was looked for and not named is not excluded: S is then its second moment about the
+profile's value, from what was measured and from how far a curve may be off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.diagnosis.findings import Finding
+from virest.diagnosis.photometry import Array, PhotometricObservations
+from virest.diagnosis.photometry_effects import BlackLevel, PhotometricEffect, ResponseGamma
+from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, pulls, significance
+from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, light_varies, sentence_of, values_of
+
+STATED_DOUBT = np.array([0.15, 0.02])
+"""How far a curve that a profile states may be off: logarithm of gamma, black level."""
+UNKNOWN_DOUBT = np.array([0.3, 0.04])
+"""The same of the curve that stands in for an unknown one."""
+_STEP = 1e-3
+_GAMMA, _BLACK = 0, 1
+
+
+@dataclass(frozen=True, slots=True)
+class Openness:
+    """What is not known of values that brightness is read by."""
+
+    spread: Array
+    """(3, 3) second moments of true − profile: logarithm of gamma, black level, logarithm of the exposure scale."""
+    rivals: tuple[ResponseCurve, ...] = ()
+    """Curves that explain the mixing as well."""
+
+
+def settle_light(
+    light: PictureVerdict, curve: PictureVerdict, given: CameraProfile, causes: Sequence[Finding]
+) -> tuple[PictureVerdict, CameraProfile]:
+    """Brightness's verdict, and the profile that curve ends with, with brightness's values fitted under that profile.
+
+    light: the ladder's; curve: after what blur mixes.  given: what was known of the curve before.  causes: those of
+    points and blur.
+    """
+    fitted, observations, profile = light.fitted, light.observations, curve.profile
+    if fitted is None or observations is None or not fitted.effects:
+        return light, profile
+    if not _seen_alike(observations, light.profile, profile):
+        fitted = fit_photometry(observations, profile, fitted.effects)
+    prior = _prior(given)
+    if light_varies(observations):
+        openness = Openness(_curve_by_brightness(observations, fitted, prior))
+    else:
+        openness = _curve_by_mixing(curve, prior)
+    openness.spread[2, 2] = _exposure_variance(causes)
+    doubtful = replace(fitted, covariance=fitted.covariance + _doubt(observations, fitted, openness))
+    findings = [_again(finding, fitted, doubtful, observations) for finding in light.findings]
+    notes = [*light.notes, *_notes(light, curve)]
+    found = replace(light, profile=fitted.profile, findings=findings, fitted=fitted, notes=notes)
+    return found, fitted.profile
+
+
+def _seen_alike(observations: PhotometricObservations, one: CameraProfile, other: CameraProfile) -> bool:
+    """Whether two profiles read the same brightness by the same curve, times and exposures."""
+    scales = one.shutter.exposure_scale, other.shutter.exposure_scale
+    times = observations.row_time_s(one), observations.row_time_s(other)
+    return one.response == other.response and scales[0] == scales[1] and np.allclose(*times, rtol=0, atol=1e-6)
+
+
+def _again(
+    finding: Finding, fitted: PhotometricFit, doubtful: PhotometricFit, observations: PhotometricObservations
+) -> Finding:
+    """A finding with its values now.  Whether there is an effect at all does not hang on the curve."""
+    effect = next(e for e in fitted.effects if e.name == finding.name)
+    nominal = {name: change.nominal for name, change in finding.parameters.items()}
+    std = np.sqrt(np.diag(doubtful.of(effect.name)[1]))
+    changes = changes_of(nominal, values_of(effect, fitted.profile), std)
+    p_value = significance(fitted, effect.name, observations)[1]
+    return replace(finding, parameters=changes, p_value=p_value, sentence=sentence_of(effect.name, changes))
+
+
+def _notes(light: PictureVerdict, curve: PictureVerdict) -> list[str]:
+    if curve.mixed or light.observations is None or light_varies(light.observations):
+        return []
+    names = " and ".join(finding.name for finding in light.findings)
+    return [f"nothing told the curve at constant exposure: {names} by the profile's, with its doubt in the deviations"]
+
+
+# ── what is open ───────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _prior(given: CameraProfile) -> Array:
+    """How far the given curve may be off, (2,): as its estimates say, where they do."""
+    curve = given.response
+    if curve is None:
+        return UNKNOWN_DOUBT
+    doubt = STATED_DOUBT.copy()
+    for place, name, value in ((_GAMMA, "gamma", curve.extra_gamma), (_BLACK, "black_level", curve.black_level)):
+        known = given.estimates.get(name)
+        if known is None or not isinstance(known.std, int | float) or not isinstance(known.value, int | float):
+            continue
+        if np.isclose(known.value, value, atol=1e-3):
+            doubt[place] = max(known.std / (value if place == _GAMMA else 1.0), 1e-4)
+    return doubt
+
+
+def _doubt(observations: PhotometricObservations, fitted: PhotometricFit, openness: Openness) -> Array:
+    """(k, k) to be added to the covariance; a rival is as likely as what was named."""
+    changed = [(_shifted(fitted.profile, change), _STEP) for change in _STEP * np.eye(3)]
+    pull = pulls(observations, fitted.profile, fitted, changed)
+    added = pull @ openness.spread @ pull.T
+    for curve in openness.rivals:
+        away = fit_photometry(observations, replace(fitted.profile, response=curve), fitted.effects)
+        off = away.values - fitted.values
+        added += 0.5 * np.outer(off, off)
+    return np.asarray(added)
+
+
+def _shifted(profile: CameraProfile, change: Array) -> CameraProfile:
+    """The profile with (log gamma, black level, log exposure scale) changed."""
+    curve, shutter = profile.response or ResponseCurve("srgb"), profile.shutter
+    gamma, black = curve.extra_gamma * float(np.exp(change[0])), curve.black_level + float(change[1])
+    scale = shutter.exposure_scale * float(np.exp(change[2]))
+    curve = replace(curve, extra_gamma=gamma, black_level=black)
+    return replace(profile, response=curve, shutter=replace(shutter, exposure_scale=scale))
+
+
+def _exposure_variance(causes: Sequence[Finding]) -> float:
+    """Of the logarithm of the exposure's scale, where that was found."""
+    for finding in causes:
+        if finding.name == "exposure_time":
+            change = finding.parameters["exposure_scale"]
+            return float((change.std / change.estimate) ** 2)
+    return 0.0
+
+
+def _curve_by_brightness(observations: PhotometricObservations, fitted: PhotometricFit, prior: Array) -> Array:
+    """Spread (3, 3) of what the ladder did not name of the curve, from a fit of it beside the rest."""
+    names = [effect.name for effect in fitted.effects]
+    curves: tuple[PhotometricEffect, ...] = (ResponseGamma(), BlackLevel())
+    places = [k for k, effect in enumerate(curves) if effect.name not in names]
+    spread = np.zeros((3, 3))
+    if not places:
+        return spread
+    beside = fit_photometry(observations, fitted.profile, [*fitted.effects, *(curves[k] for k in places)])
+    now = fitted.profile.response or ResponseCurve("srgb")
+    inner = slice(len(fitted.values), None)
+    estimate, covariance = beside.values[inner].copy(), beside.covariance[inner, inner].copy()
+    if _GAMMA in places:
+        slope = 1 / max(float(estimate[0]), 0.1)
+        covariance[0] *= slope
+        covariance[:, 0] *= slope
+        estimate[0] = np.log(max(float(estimate[0]), 0.1) / now.extra_gamma)
+    if _BLACK in places:
+        estimate[-1] -= now.black_level
+    spread[np.ix_(places, places)] = _second_moment(estimate, covariance, prior[places])
+    return spread
+
+
+def _curve_by_mixing(curve: PictureVerdict, prior: Array) -> Openness:
+    """What blur leaves open: the deviation of what it named, or of a gamma that it did not name."""
+    spread = np.zeros((3, 3))
+    now = curve.profile.response or ResponseCurve("srgb")
+    named = {finding.name: finding for finding in curve.findings}
+    if "response_curve" in named:
+        change = named["response_curve"].parameters["gamma"]
+        spread[_GAMMA, _GAMMA] = (change.std / change.estimate) ** 2
+    elif "black_level" in named:
+        spread[_BLACK, _BLACK] = named["black_level"].parameters["black_level"].std ** 2
+    elif "response_curve" in curve.mixed:
+        found = curve.mixed["response_curve"][0]
+        estimate, std = np.log(found.value / now.extra_gamma), found.std / found.value
+        moment = _second_moment(np.array([estimate]), np.array([[std**2]]), prior[:1])
+        spread[_GAMMA, _GAMMA] = moment[0, 0]
+    else:
+        spread[_GAMMA, _GAMMA] = prior[_GAMMA] ** 2
+    rivals = (_rival(finding, rival.name, curve) for finding in curve.findings for rival in finding.rivals)
+    return Openness(spread, tuple(rivals))
+
+
+def _rival(named: Finding, rival: str, curve: PictureVerdict) -> ResponseCurve:
+    """The curve without the change that was named and with its rival's."""
+    fields = {"response_curve": "extra_gamma", "black_level": "black_level"}
+    (change,) = named.parameters.values()
+    now = curve.profile.response or ResponseCurve("srgb")
+    return replace(now, **{fields[named.name]: change.nominal, fields[rival]: curve.mixed[rival][0].value})
+
+
+def _second_moment(estimate: Array, covariance: Array, prior: Array) -> Array:
+    """E[c cᵀ] of a change c that was measured, and that is 0 give or take prior to begin with."""
+    precision = np.linalg.inv(covariance)
+    posterior = np.linalg.inv(precision + np.diag(1 / prior**2))
+    mean = posterior @ precision @ estimate
+    return np.asarray(posterior + np.outer(mean, mean))
