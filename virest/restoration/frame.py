@@ -415,11 +415,14 @@ def _trusted_share(luma: PictureStatistics) -> float:
 
     Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
     both pictures is better than either.  Under noise about as large as the picture's own gradients (a very coarsely
-    coded movie) the prior wipes out texture that the recorded picture has.
+    coded movie) the prior wipes out texture that the recorded picture has; where much is promised that is a small price,
+    unless nothing stands out of the noise and the promise is empty.
     """
     share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
-    doubt = 1 - min(1.0, luma.gradient_scale / (FULL_TRUST_SCALE * luma.noise_levels))
-    return float(share * (1 - doubt * max(0.0, 1 - luma.expected_gain_db / SURE_GAIN_DB)))
+    stands_out = luma.gradient_scale / luma.noise_levels
+    doubt = 1 - min(1.0, stands_out / FULL_TRUST_SCALE)
+    sure = min(1.0, luma.expected_gain_db / SURE_GAIN_DB) * min(1.0, stands_out)
+    return float(share * (1 - doubt * (1 - sure)))
 
 
 class _Clock:
