@@ -415,7 +415,7 @@ def _trusted_share(luma: PictureStatistics) -> float:
 
     Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
     both pictures is better than either.  Under noise about as large as the picture's own gradients (a very coarsely
-    coded movie) the prior wipes out texture that the recorded picture has; where much is promised that is a small price,
+    coded movie) the prior wipes out texture that the recorded picture has; where much is promised that is little,
     unless nothing stands out of the noise and the promise is empty.
     """
     share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
