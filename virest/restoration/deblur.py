@@ -391,14 +391,14 @@ def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
 
 def _projected_luma(
     blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
-) -> list[Image]:
-    """Spectrum of Kᵀ g of each tile; tiles with clipped light are tamed."""
+) -> Image:
+    """Spectra of Kᵀ g, (tiles, size, size); tiles with clipped light are tamed."""
     luma, holes = _luma(blurred.light), _holes(blurred)
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
         deconvolution.tame(numbers, kernels, luma, _measured_part(holes), float(luma.max()))
-    return list(deconvolution.back_projected(luma))
+    return deconvolution.back_projected(luma)
 
 
 def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
@@ -489,7 +489,7 @@ def _border_noise(blurred: BlurredPicture) -> float:
 
 
 def _returned_residual(
-    deconvolution: tiles.TileDeconvolution, projected: list[Image], sharp: Image, statistics: PictureStatistics
+    deconvolution: tiles.TileDeconvolution, projected: Image, sharp: Image, statistics: PictureStatistics
 ) -> Image:
     """Fine texture that the prior took for noise: the residual g − K f, filtered as a picture of little power."""
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
