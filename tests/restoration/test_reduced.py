@@ -33,7 +33,7 @@ def test_kernels_and_light_go_to_the_smaller_picture() -> None:
     small = deblur._reduced(_blurred(np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8)), 1.5)
     assert small.light[0].shape == (80, 112)
     assert np.ptp(small.light[0]) < 1e-6
-    assert small.slopes(1, 40).shape == (80, 112)
+    assert small.slopes(1, 40, (112, 80)).shape == (80, 112)
     at = np.array([[20.0, 30.0]])
     np.testing.assert_allclose(small.field(at).paths_px * 1.5, _field((at + 0.5) * 1.5 - 0.5).paths_px)
     assert small.longest_px == pytest.approx(8.0)

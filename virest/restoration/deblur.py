@@ -27,7 +27,7 @@ CLIPPED_LEVELS = 2.0
 """A pixel this close to the top was clipped."""
 PULLED_DOWN_LEVELS = 8.0
 """Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
-COLOUR_SCALE, COARSE_COLOUR_SCALE = 2.0, 3.0
+COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 3
 COLOUR_TILE_PX = 384
 """Colour differences hold so little detail that kernels need not follow the paths as closely, nor pixels the movie's.
 
@@ -43,14 +43,16 @@ FEW_ITERATIONS, FEW_SCALE = 2, 0.6
 REDUCTIONS = (1.5, 4 / 3)
 """A picture so many times smaller serves few iterations as well, where noise hides all finer detail."""
 Surroundings = tuple[float, int, int]
-FULL_MARGIN, THIN_MARGIN = (1.0, 16, 16), (0.75, 9, 12)
-"""What a tile sees around it, per length of the blur path, and at least, px; and the least length of its bridge.
+FULL_MARGIN, THIN_MARGIN, THINNEST_MARGIN = (0.0, 16, 16), (0.3, 4, 16), (0.3, 3, 12)
+"""What a tile sees around it is as long as the blur path, less this part of the tiles' overlap; its least length, px;
+and the least length of the tile's bridge.
 
-The bridge is as long as the path: a steep one is an edge that the deconvolution carries into the tile.  Thin margins,
-for reduced pictures, cost 0.1 dB.
+The bridge is as long as the path: a steep one is an edge that the deconvolution carries into the tile.  Where tiles
+overlap widely, a window's ramp gives next to no weight to what a margin would keep away; the thinnest margins are for
+pictures that are reduced.
 """
-COARSE_OVERLAP, FINE_OVERLAP = 6, 4
-"""Tiles overlap by this part of their side, those of colour and those of luma."""
+COARSE_OVERLAP, FINE_OVERLAP, WIDE_OVERLAP = 6, 4, 3
+"""Tiles overlap by this part of their side: those of colour, those of luma, and those of luma in few iterations."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
 """Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
 START_ITERATIONS, SETTLED_BETA = 5, 0.3
@@ -65,7 +67,7 @@ WEIGHED_PX = 5
 """Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
 SHRUNK_PARTS = 8
 """Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more."""
-SlopeMaker = Callable[[int, int], Image]
+SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
 
 
@@ -78,7 +80,7 @@ class BlurredPicture:
     slopes: SlopeMaker
     """Grey levels per unit of light of a channel, by its number, over neighbourhoods of a side in pixels.
 
-    (height, width); see :func:`_slopes_around`.
+    As a picture of a given (width, height); see :func:`_slopes_around`.
     """
     dark: list[Image | None]
     """1.0 where a channel's light was too little to be measured; None: nowhere."""
@@ -91,6 +93,8 @@ class BlurredPicture:
     """Kernels at given tile centres."""
     longest_px: float
     """Longest blur path in the picture."""
+    holes: Image | None
+    """1.0 where light is clipped in all channels, and in any beside such; None: nowhere; see :func:`_holes`."""
 
 
 def blurred_picture(
@@ -106,14 +110,14 @@ def blurred_picture(
     dark = [_dark(channel, curve) for channel in channels]
     clipped = [_clipped(channel, curve) for channel in channels]
 
-    def slopes(channel: int, side_px: int) -> Image:
-        return _slopes_around(light[channel], curve, side_px)
+    def slopes(channel: int, side_px: int, size: tuple[int, int]) -> Image:
+        return _slopes_around(light[channel], curve, side_px, size)
 
-    return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px)
+    return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px, _holes(clipped, longest_px))
 
 
-def _slopes_around(light: Image, curve: ResponseCurve, side_px: int) -> Image:
-    """The curve's slope at a neighbourhood's mean light, (height, width).
+def _slopes_around(light: Image, curve: ResponseCurve, side_px: int, size: tuple[int, int]) -> Image:
+    """The curve's slope at a neighbourhood's mean light, as a picture of ``size`` (width, height).
 
     Grey levels have about the same noise everywhere; in light that is their noise over the curve's slope, so that
     nearly all of it is in what is bright, and so is most of the mean light.  A deconvolution that weighs all pixels of
@@ -121,10 +125,10 @@ def _slopes_around(light: Image, curve: ResponseCurve, side_px: int) -> Image:
     """
     height, width = light.shape
     shrunk = max(1, side_px // SHRUNK_PARTS)
-    size, side = (max(1, width // shrunk), max(1, height // shrunk)), max(1, side_px // shrunk)
-    around = cv2.blur(cv2.resize(light, size, interpolation=cv2.INTER_AREA), (side, side))
+    few, side = (max(1, width // shrunk), max(1, height // shrunk)), max(1, side_px // shrunk)
+    around = cv2.blur(cv2.resize(light, few, interpolation=cv2.INTER_AREA), (side, side))
     slopes = cv2.LUT(np.rint(255 * curve.encode(around)).astype(np.uint8), _measured_slopes(curve))
-    return cv2.resize(slopes, (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(slopes, size, interpolation=cv2.INTER_LINEAR)
 
 
 @functools.lru_cache(maxsize=8)
@@ -201,7 +205,8 @@ def _luma_tiles(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture."""
-    return _tile_deconvolution(blurred, settings.tile_px, FINE_OVERLAP, around=around)
+    parts = FINE_OVERLAP if around is FULL_MARGIN else WIDE_OVERLAP
+    return _tile_deconvolution(blurred, settings.tile_px, parts, around=around)
 
 
 def _tile_deconvolution(
@@ -213,13 +218,15 @@ def _tile_deconvolution(
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture, or over one that is ``scale`` times smaller, with kernels to its measure."""
     height, width = (int(np.ceil(length / scale)) for length in blurred.light[0].shape)
-    per_path, least_margin_px, least_bridge_px = around
-    margin = int(np.clip(per_path * blurred.longest_px / scale, least_margin_px / scale, 96))
+    per_overlap, least_margin_px, least_bridge_px = around
+    seen_px = blurred.longest_px - per_overlap * side / overlap_parts
+    margin = int(np.clip(seen_px / scale, least_margin_px / scale, 96))
     bridge = int(np.clip(blurred.longest_px / scale, least_bridge_px / scale, 96))
     grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts)
     field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
     kernels = field.scaled(1 / scale).arrays()
-    return tiles.TileDeconvolution(grid, kernels, margin, bridge)
+    least = kernels.shape[1] // 2 + 1 if around is FULL_MARGIN else 0
+    return tiles.TileDeconvolution(grid, kernels, max(margin, least), bridge)
 
 
 def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
@@ -280,30 +287,47 @@ def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSet
     scale = COLOUR_SCALE if settings.iterations > FEW_ITERATIONS else COARSE_COLOUR_SCALE
     deconvolution = _tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, scale)
     ratios = _noise_to_signal(deconvolution, settings, blurred.chroma, scale)
+    size = (scale * deconvolution.grid.width, scale * deconvolution.grid.height)
     red, blue = (
         cv2.resize(
             deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(plane), *ratios)),
-            (width, height),
+            size,
             interpolation=cv2.INTER_LINEAR,
-        )
-        for plane in _small_differences(blurred, deconvolution.grid)
+        )[:height, :width]
+        for plane in _small_differences(blurred, scale)
     )
     green_luma = 1 - LUMA_RED - LUMA_BLUE
     green = cv2.scaleAdd(blue, -LUMA_BLUE / green_luma, cv2.scaleAdd(red, -LUMA_RED / green_luma, sharp))
     return [cv2.add(sharp, red), green, cv2.add(sharp, blue)]
 
 
-def _small_differences(blurred: BlurredPicture, grid: TileGrid) -> list[Image]:
-    """Red and blue less luma, at the grid's size; clipped ones, which show no colour, from around them."""
-    size = (grid.width, grid.height)
-    red, green, blue = (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in blurred.light)
+def _small_differences(blurred: BlurredPicture, scale: int) -> list[Image]:
+    """Red and blue less luma, ``scale`` times smaller; clipped ones, which show no colour, from around them."""
+    red, green, blue = (_block_means(plane, scale) for plane in blurred.light)
     luma = _luma([red, green, blue])
     differences = [cv2.subtract(plane, luma) for plane in (red, blue)]
-    holes = _holes(blurred)
+    holes = blurred.holes
     if holes is None:
         return differences
-    known = 1 - cv2.resize(cv2.dilate(holes, np.ones((3, 3), np.uint8)), size, interpolation=cv2.INTER_AREA)
+    known = 1 - _block_means(cv2.dilate(holes, np.ones((3, 3), np.uint8)), scale)
     return _filled_in(differences, known)
+
+
+def _block_means(plane: Image, side: int) -> Image:
+    """Means over squares of whole pixels, the last ones smaller: an area's mean of other sides takes twice as long."""
+    height, width = plane.shape
+    means = np.empty((-(-height // side), -(-width // side)), np.float32)
+    for rows in _blocks(height, side):
+        for columns in _blocks(width, side):
+            part = means[rows.start // side : -(-rows.stop // side), columns.start // side : -(-columns.stop // side)]
+            part[:] = cv2.resize(plane[rows, columns], part.shape[::-1], interpolation=cv2.INTER_AREA)
+    return means
+
+
+def _blocks(length: int, side: int) -> list[slice]:
+    """Where the whole pieces of ``side`` are, and where the rest is."""
+    whole = length - length % side
+    return [part for part in (slice(0, whole), slice(whole, length)) if part.stop > part.start]
 
 
 def _filled_in(planes: list[Image], known: Image) -> list[Image]:
@@ -323,25 +347,25 @@ def _filled_in(planes: list[Image], known: Image) -> list[Image]:
 # ── clipped light ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _holes(blurred: BlurredPicture) -> Image | None:
+def _holes(clipped: list[Image | None], longest_px: float) -> Image | None:
     """1.0 where light is clipped in all channels, and in any beside such: what is recorded there is no measurement.
 
     A lamp is far too bright for all channels, and its rim for some.  Where nothing around has more than one channel
     clipped it is a vivid surface: the others show its colour, and nearly all of its light was measured.
     """
-    masks = [mask for mask in blurred.clipped if mask is not None]
-    if len(masks) < len(blurred.clipped):
+    masks = [mask for mask in clipped if mask is not None]
+    if len(masks) < len(clipped):
         return None
     white = functools.reduce(cv2.min, masks)
     if not cv2.hasNonZero(white):
         return None
-    side = 2 * int(np.ceil(blurred.longest_px / 2 + CODEC_REACH_PX)) + 1
+    side = 2 * int(np.ceil(longest_px / 2 + CODEC_REACH_PX)) + 1
     return cv2.min(functools.reduce(cv2.max, masks), cv2.dilate(white, np.ones((side, side), np.uint8)))
 
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:
     """1 where the blur path touches clipped light, falling to 0 over a path's length beyond; None: nothing clipped."""
-    holes = _holes(blurred)
+    holes = blurred.holes
     if holes is None:
         return None
     touched = cv2.dilate(holes.astype(np.uint8), _path_reach(blurred))
@@ -373,7 +397,7 @@ def measured_share(blurred: BlurredPicture) -> Image | None:
 
     Thin things on a clipped background lie within the margins of the holes: next to nothing of them was measured.
     """
-    holes = _holes(blurred)
+    holes = blurred.holes
     if holes is None:
         return None
     side = 2 * int(np.ceil(blurred.longest_px)) + MEASURED_OVER_PX
@@ -393,7 +417,7 @@ def _projected_luma(
     blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
 ) -> Image:
     """Spectra of Kᵀ g, (tiles, size, size); tiles with clipped light are tamed."""
-    luma, holes = _luma(blurred.light), _holes(blurred)
+    luma, holes = _luma(blurred.light), blurred.holes
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
@@ -405,10 +429,11 @@ def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSetti
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
     times = _reduction(blurred.statistics, settings)
     if times == 1.0:
-        return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
+        around = THIN_MARGIN if settings.iterations <= FEW_ITERATIONS else FULL_MARGIN
+        return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings, around), settings)
     height, width = blurred.light[0].shape
     small = replace(settings, tile_px=round(settings.tile_px / times))
-    sharp = _tile_hyper_laplacian(_reduced(blurred, times), small, THIN_MARGIN)
+    sharp = _tile_hyper_laplacian(_reduced(blurred, times), small, THINNEST_MARGIN)
     return _with_colour(blurred, cv2.resize(sharp, (width, height), interpolation=cv2.INTER_CUBIC), settings)
 
 
@@ -423,13 +448,13 @@ def _reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
     height, width = blurred.light[0].shape
     size = (max(round(width / times), 1), max(round(height / times), 1))
 
-    def slopes(channel: int, side_px: int) -> Image:
-        return cv2.resize(blurred.slopes(channel, round(side_px * times)), size, interpolation=cv2.INTER_LINEAR)
+    def slopes(channel: int, side_px: int, asked: tuple[int, int]) -> Image:
+        return blurred.slopes(channel, round(side_px * times), asked)
 
     def field(centres_px: NDArray[np.float64]) -> KernelField:
         return blurred.field((centres_px + 0.5) * times - 0.5).scaled(1 / times)
 
-    luma, holes = cv2.resize(_luma(blurred.light), size, interpolation=cv2.INTER_LINEAR), _holes(blurred)
+    luma, holes = cv2.resize(_luma(blurred.light), size, interpolation=cv2.INTER_LINEAR), blurred.holes
     if holes is not None:
         holes = (cv2.resize(holes, size, interpolation=cv2.INTER_AREA) > 0).astype(np.float32)
     return replace(
@@ -438,6 +463,7 @@ def _reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
         slopes=slopes,
         dark=[None] * 3,
         clipped=[holes] * 3,
+        holes=holes,
         statistics=blurred.statistics.scaled(1 / times),
         field=field,
         longest_px=blurred.longest_px / times,
@@ -457,7 +483,7 @@ def _tile_hyper_laplacian(
     start = statistics.between_rings_and_level if few else statistics
     ratios = _noise_to_signal(deconvolution, settings, start)
     sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
-    before, scale = sharp, blurred.slopes(1, settings.tile_px) * np.float32(1.0 / unit)
+    before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
     for step, beta in enumerate(_beta_schedule(settings.iterations)):
         ahead, before = _further_on(sharp, before, step), sharp
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
@@ -566,7 +592,8 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
     Near clipped light the tiles' solution stays: its lamps were found with light held positive.
     """
     operator, near = _whole_operator(blurred), near_clipped(blurred)
-    statistics, slope = blurred.statistics, blurred.slopes(1, WEIGHED_PX)
+    height, width = blurred.light[0].shape
+    statistics, slope = blurred.statistics, blurred.slopes(1, WEIGHED_PX, (width, height))
     start = _tile_hyper_laplacian(blurred, replace(settings, iterations=START_ITERATIONS))
     result = hyper_laplacian(
         _luma(blurred.light),
@@ -586,7 +613,7 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
 
 def _data_weight(slope: Image, blurred: BlurredPicture) -> Image:
     """Weight of each pixel's luma: none where any channel is clipped, with its neighbours, or all are too dark."""
-    holes, dark = _holes(blurred), [mask for mask in blurred.dark if mask is not None]
+    holes, dark = blurred.holes, [mask for mask in blurred.dark if mask is not None]
     if holes is not None:
         slope = slope * (1 - cv2.dilate(holes, np.ones((3, 3), np.uint8)))
     return slope * (1 - np.minimum.reduce(dark)) if len(dark) == len(blurred.dark) else slope

@@ -306,7 +306,7 @@ def _deblurred(
         measured = measured_share(blurred)
         part = part if measured is None else part * measured
         if part.min() < 1.0:
-            sharp = [plane + part * (s - plane) for s, plane in zip(sharp, blurred.light, strict=True)]
+            sharp = [_mixed(plane, s, part) for s, plane in zip(sharp, blurred.light, strict=True)]
     restored = encode_picture(sharp if light is None else [plane * light.kept for plane in sharp], curve)
     if light is None:
         restored = _beyond_the_curve_kept(restored, picture, blurred, curve)
@@ -366,8 +366,12 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
     """The picture without flicker and vignetting: both came after the blur, so they go before it is undone."""
     planes = [light.evened(plane, mask) for plane, mask in zip(blurred.light, blurred.clipped, strict=True)]
-    recorded = blurred.slopes
-    return replace(blurred, light=planes, slopes=lambda number, side_px: recorded(number, side_px) * light.recorded)
+
+    def slopes(channel: int, side_px: int, size: tuple[int, int]) -> NDArray[np.float32]:
+        lit = cv2.resize(light.recorded, size, interpolation=cv2.INTER_LINEAR)
+        return blurred.slopes(channel, side_px, size) * lit
+
+    return replace(blurred, light=planes, slopes=slopes)
 
 
 def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
@@ -375,6 +379,13 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
     clipped = cv2.LUT(picture, curve.clipped_table().astype(np.uint8))
     planes = zip(cv2.split(cv2.LUT(picture, curve.linear_table())), cv2.split(clipped), strict=True)
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
+
+
+def _mixed(plane: NDArray[np.float32], sharp: NDArray[np.float32], part: Any) -> NDArray[np.float32]:
+    """So much of the sharp plane, the rest recorded; part: (height, width), or one number for all."""
+    if np.ndim(part):
+        return plane + part * (sharp - plane)
+    return cv2.addWeighted(plane, 1.0 - float(part), sharp, float(part), 0.0)
 
 
 def _too_little_to_gain(luma: PictureStatistics) -> str:

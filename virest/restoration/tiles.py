@@ -39,7 +39,7 @@ class TileDeconvolution:
     def __init__(self, grid: TileGrid, kernels: Image, margin: int, bridge: int | None = None) -> None:
         """bridge: its least length; None: the margin's."""
         self.grid = grid
-        self.margin = margin = max(margin, kernels.shape[1] // 2 + 1)
+        self.margin = margin
         self.patch = grid.side + 2 * margin
         self.size = fast_size(self.patch + (margin if bridge is None else bridge))
         self.at_border = [
