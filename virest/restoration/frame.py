@@ -15,7 +15,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, kernel_field
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
@@ -290,14 +290,13 @@ def _deblurred(
     curve = motion.profile.response or ResponseCurve("srgb")
     centres_px = _most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
-    luma, chroma = _measured(picture, kernel_field(motion, centres_px, anchor), curve, tiles)
+    field = smooth_field(motion, anchor)
+    luma, chroma = _measured(picture, field(centres_px), curve, tiles)
     share = 1.0 if anchor != 0.5 else _trusted_share(luma)
     why_not = _too_little_to_gain(luma)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
-    blurred = blurred_picture(
-        picture, curve, (luma, chroma), lambda centres: kernel_field(motion, centres, anchor), longest_px
-    )
+    blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
     sharp = deblur(blurred, settings)
