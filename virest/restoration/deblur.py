@@ -53,6 +53,11 @@ pictures that are reduced.
 """
 COARSE_OVERLAP, FINE_OVERLAP, WIDE_OVERLAP = 6, 4, 3
 """Tiles overlap by this part of their side: those of colour, those of luma, and those of luma in few iterations."""
+MOST_WRONG, LEAST_TILE, FIELD_SAMPLES = 0.8, 0.7, (8, 6)
+"""Error in noises that a tile's kernel may make of edges half a step away; part of the preset's side to which tiles
+shrink for it; rows and columns of places at which the kernels' change is looked at."""
+OVERLAP_GIVE = 0.12
+"""Wide overlaps may be narrower by so much, where fewer tiles then reach to the picture's edge."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
 """Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
 START_ITERATIONS, SETTLED_BETA = 5, 0.3
@@ -205,8 +210,24 @@ def _luma_tiles(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture."""
-    parts = FINE_OVERLAP if around is FULL_MARGIN else WIDE_OVERLAP
-    return _tile_deconvolution(blurred, settings.tile_px, parts, around=around)
+    if around is FULL_MARGIN:
+        return _tile_deconvolution(blurred, settings.tile_px, FINE_OVERLAP, around=around)
+    side = int(np.clip(_kernel_holds_px(blurred), LEAST_TILE * settings.tile_px, settings.tile_px))
+    return _tile_deconvolution(blurred, side, WIDE_OVERLAP, around=around)
+
+
+def _kernel_holds_px(blurred: BlurredPicture) -> float:
+    """Side of a tile at whose middle's kernel half a step away, a third of its side, moves edges by a noise's worth.
+
+    Paths change over the picture as the camera rolls and as the rows go by; under noise that matters less.
+    """
+    height, width = blurred.light[0].shape
+    y, x = ((np.arange(count) + 0.5) * length / count for count, length in zip(FIELD_SAMPLES, (height, width), strict=True))
+    paths_px = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)).paths_px.reshape(len(y), len(x), -1, 2)
+    changes = [np.diff(paths_px, axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
+    per_px = np.sqrt(0.5 * sum(np.mean(np.linalg.norm(c, axis=-1).mean(-1)) ** 2 for c in changes))
+    wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
+    return float(3 * wrong_px / max(per_px, 1e-6))
 
 
 def _tile_deconvolution(
@@ -222,7 +243,8 @@ def _tile_deconvolution(
     seen_px = blurred.longest_px - per_overlap * side / overlap_parts
     margin = int(np.clip(seen_px / scale, least_margin_px / scale, 96))
     bridge = int(np.clip(blurred.longest_px / scale, least_bridge_px / scale, 96))
-    grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts)
+    give = OVERLAP_GIVE if overlap_parts == WIDE_OVERLAP else 0.0
+    grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts, give)
     field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
     kernels = field.scaled(1 / scale).arrays()
     least = kernels.shape[1] // 2 + 1 if around is FULL_MARGIN else 0

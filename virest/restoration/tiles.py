@@ -211,18 +211,23 @@ def _through(picture: Image, kernel: Image, forward: bool) -> Image:
     return cv2.idft(cv2.mulSpectrums(cv2.dft(picture), kernel, 0, conjB=forward), flags=cv2.DFT_SCALE)
 
 
-def quick_grid(height: int, width: int, side: int, around: int, overlap_parts: int) -> TileGrid:
+@lru_cache(maxsize=64)
+def quick_grid(height: int, width: int, side: int, around: int, overlap_parts: int, give: float = 0.0) -> TileGrid:
     """Tiles of about ``side``, of a size at which all their transforms together take little time.
 
-    They overlap by a part of their side, 1 / overlap_parts.  around: rows or columns that come on top of each tile's,
-    its margins and its bridge.
+    They overlap by a part of their side, 1 / overlap_parts, or by up to ``give`` of that less.  around: rows or columns
+    that come on top of each tile's, its margins and its bridge.
     """
     sides = [size - around for size in FAST_SIZES]
     fitting = [s for s in sides if LEAST_SIDE * side <= s <= LARGEST_SIDE * side] or [side]
-    grids = [tile_grid(height, width, s, s // overlap_parts) for s in fitting]
+    grids = [
+        tile_grid(height, width, s, overlap)
+        for s in fitting
+        for overlap in range(s // overlap_parts, int(np.ceil((1 - give) * (s // overlap_parts))) - 1, -1)
+    ]
     pixels = [len(grid.tops) * len(grid.lefts) * fast_size(grid.side + around) ** 2 for grid in grids]
-    quick = (grid for grid, count in zip(grids, pixels, strict=True) if count <= LITTLE_LONGER * min(pixels))
-    return min(quick, key=lambda grid: abs(grid.side - side))
+    quick = [(grid, count) for grid, count in zip(grids, pixels, strict=True) if count <= LITTLE_LONGER * min(pixels)]
+    return min(quick, key=lambda found: (abs(found[0].side - side), found[1], -found[0].overlap))[0]
 
 
 def _kernel_spectra(kernels: Image, size: int, into: Iterable[Image] | None = None) -> Iterator[Image]:
