@@ -48,15 +48,17 @@ class TileGrid:
         return _windows(self)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=24)
 def _windows(grid: TileGrid) -> list[Image]:
     """The same for every frame of a movie, and one array for all that are alike; not to be written to."""
     rows = _ramps(grid.tops, grid.side, grid.overlap)
     columns = _ramps(grid.lefts, grid.side, grid.overlap)
     windows: dict[tuple[bytes, bytes], Image] = {}
-    return [
-        windows.setdefault((r.tobytes(), c.tobytes()), np.outer(r, c).astype(np.float32)) for r in rows for c in columns
-    ]
+    for r in rows:
+        for c in columns:
+            if (r.tobytes(), c.tobytes()) not in windows:
+                windows[r.tobytes(), c.tobytes()] = np.outer(r, c).astype(np.float32)
+    return [windows[r.tobytes(), c.tobytes()] for r in rows for c in columns]
 
 
 def tile_grid(height: int, width: int, side: int, overlap: int) -> TileGrid:

@@ -70,8 +70,9 @@ RESIDUAL_SHARE = 0.05
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
 WEIGHED_PX = 5
 """Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
-SHRUNK_PARTS = 8
-"""Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more."""
+SHRUNK_PARTS, LOOKED_AT = 8, 4
+"""Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more; of the rows that fall
+on such a pixel so many are looked at, or a few more."""
 SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
 
@@ -131,7 +132,8 @@ def _slopes_around(light: Image, curve: ResponseCurve, side_px: int, size: tuple
     height, width = light.shape
     shrunk = max(1, side_px // SHRUNK_PARTS)
     few, side = (max(1, width // shrunk), max(1, height // shrunk)), max(1, side_px // shrunk)
-    around = cv2.blur(cv2.resize(light, few, interpolation=cv2.INTER_AREA), (side, side))
+    rows = light[:: max(1, shrunk // LOOKED_AT)]
+    around = cv2.blur(cv2.resize(rows, few, interpolation=cv2.INTER_AREA), (side, side))
     slopes = cv2.LUT(np.rint(255 * curve.encode(around)).astype(np.uint8), _measured_slopes(curve))
     return cv2.resize(slopes, size, interpolation=cv2.INTER_LINEAR)
 

@@ -49,6 +49,8 @@ LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
 FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
 """Gradients of so many times the noise are not wiped out with it; nor does it matter where so much is to be gained."""
+PART_STEP_PX = 80
+"""Spacing of the places at which it is looked whether the blur is worth the trouble."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -402,7 +404,7 @@ def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32] 
     (height, width), or one number for all.
     """
     width, height = motion.profile.width, motion.profile.height
-    x, y = (np.linspace(0, length - 1, max(2, length // 48)) for length in (width, height))
+    x, y = (np.linspace(0, length - 1, max(2, length // PART_STEP_PX)) for length in (width, height))
     length_px = np.linalg.norm(blur_chords(motion, np.stack(np.meshgrid(x, y), -1)), axis=-1)
     length_px = equivalent_length_px(motion.profile, length_px)
     part = np.clip(length_px / min_blur_px - 1.0, 0.0, 1.0).astype(np.float32)
