@@ -53,10 +53,10 @@ pictures that are reduced.
 """
 COARSE_OVERLAP, FINE_OVERLAP, WIDE_OVERLAP = 6, 4, 3
 """Tiles overlap by this part of their side: those of colour, those of luma, and those of luma in few iterations."""
-MOST_WRONG, LEAST_TILE, FIELD_SAMPLES = 0.8, 0.7, (8, 6)
+MOST_WRONG, LEAST_TILE, FIELD_SAMPLES = 0.7, 0.7, (6, 5)
 """Error in noises that a tile's kernel may make of edges half a step away; part of the preset's side to which tiles
 shrink for it; rows and columns of places at which the kernels' change is looked at."""
-OVERLAP_GIVE = 0.12
+OVERLAP_GIVE = 0.1
 """Wide overlaps may be narrower by so much, where fewer tiles then reach to the picture's edge."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
 """Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
@@ -225,7 +225,8 @@ def _kernel_holds_px(blurred: BlurredPicture) -> float:
     """
     height, width = blurred.light[0].shape
     y, x = ((np.arange(count) + 0.5) * length / count for count, length in zip(FIELD_SAMPLES, (height, width), strict=True))
-    paths_px = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)).paths_px.reshape(len(y), len(x), -1, 2)
+    field = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+    paths_px = field.paths_px[:, ::4].reshape(len(y), len(x), -1, 2)
     changes = [np.diff(paths_px, axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
     per_px = np.sqrt(0.5 * sum(np.mean(np.linalg.norm(c, axis=-1).mean(-1)) ** 2 for c in changes))
     wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale

@@ -224,7 +224,7 @@ def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> ND
         part = cv2.merge([plane[top : top + BAND_ROWS] for plane in light])
         if (low, high) != (0.0, 1.0):
             part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
-        root = cv2.sqrt(cv2.max(part, 0.0))
+        root = cv2.sqrt(cv2.threshold(part, 0.0, 0.0, cv2.THRESH_TOZERO)[1])
         steps = cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U)
         cv2.LUT(steps, table, picture[top : top + BAND_ROWS])
     return picture
