@@ -224,7 +224,9 @@ def _kernel_holds_px(blurred: BlurredPicture) -> float:
     Paths change over the picture as the camera rolls and as the rows go by; under noise that matters less.
     """
     height, width = blurred.light[0].shape
-    y, x = ((np.arange(count) + 0.5) * length / count for count, length in zip(FIELD_SAMPLES, (height, width), strict=True))
+    y, x = (
+        (np.arange(count) + 0.5) * length / count for count, length in zip(FIELD_SAMPLES, (height, width), strict=True)
+    )
     field = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
     paths_px = field.paths_px[:, ::4].reshape(len(y), len(x), -1, 2)
     changes = [np.diff(paths_px, axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
@@ -250,8 +252,8 @@ def _tile_deconvolution(
     grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts, give)
     field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
     kernels = field.scaled(1 / scale).arrays()
-    least = kernels.shape[1] // 2 + 1 if around is FULL_MARGIN else 0
-    return tiles.TileDeconvolution(grid, kernels, max(margin, least), bridge)
+    held = kernels.shape[1] // 2 + 1 - (0 if around is FULL_MARGIN else grid.side // 2)
+    return tiles.TileDeconvolution(grid, kernels, max(margin, held), bridge)
 
 
 def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
