@@ -75,6 +75,8 @@ SHRUNK_PARTS, LOOKED_AT = 8, 4
 on such a pixel so many are looked at, or a few more."""
 SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
+LightOfRows = Callable[[slice], list[Image]]
+"""Light of each channel over some rows of a picture, (rows, width): what is made band by band stays in the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,9 +172,9 @@ def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArra
     return (cv2.inRange(picture, (0, 0, 0), (brightest,) * 3) == 0).view(np.uint8)
 
 
-def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     """The sharp picture's light, channel by channel, at the kernels' anchor."""
-    methods: dict[str, Callable[[BlurredPicture, RestorationSettings], list[Image]]] = {
+    methods: dict[str, Callable[[BlurredPicture, RestorationSettings], LightOfRows]] = {
         "inverse": _by_tile_filter,
         "wiener": _by_tile_filter,
         "gradient-wiener": _by_tile_filter,
@@ -185,12 +187,20 @@ def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image
     return _with_unseen_kept(methods[settings.deblur](blurred, settings), blurred)
 
 
-def _with_unseen_kept(sharp: list[Image], blurred: BlurredPicture) -> list[Image]:
+def _with_unseen_kept(sharp: LightOfRows, blurred: BlurredPicture) -> LightOfRows:
     """The recorded light where nothing says more."""
-    for plane, light, unseen in zip(sharp, blurred.light, unseen_masks(blurred), strict=True):
-        if unseen is not None:
-            cv2.copyTo(light, unseen, plane)
-    return sharp
+    masks = unseen_masks(blurred)
+    if all(mask is None for mask in masks):
+        return sharp
+
+    def kept(rows: slice) -> list[Image]:
+        planes = sharp(rows)
+        for plane, light, unseen in zip(planes, blurred.light, masks, strict=True):
+            if unseen is not None:
+                cv2.copyTo(light[rows], unseen[rows], plane)
+        return planes
+
+    return kept
 
 
 def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
@@ -256,7 +266,7 @@ def _tile_deconvolution(
     return tiles.TileDeconvolution(grid, kernels, max(margin, held), bridge)
 
 
-def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     deconvolution = _luma_tiles(blurred, settings)
     projected = _projected_luma(blurred, deconvolution, settings)
     factors = _tile_factors(deconvolution, settings, blurred.statistics)
@@ -305,7 +315,7 @@ def _luma(light: list[Image]) -> Image:
     return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, 1 - LUMA_RED - LUMA_BLUE, 0.0))
 
 
-def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> list[Image]:
+def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> LightOfRows:
     """Red, green and blue of a sharp luma and the colour differences, which hold little detail.
 
     These are filtered at half size or less, since a movie stores no more of them, by the measured Wiener filter.
@@ -324,8 +334,14 @@ def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSet
         for plane in _small_differences(blurred, scale)
     )
     green_luma = 1 - LUMA_RED - LUMA_BLUE
-    green = cv2.scaleAdd(blue, -LUMA_BLUE / green_luma, cv2.scaleAdd(red, -LUMA_RED / green_luma, sharp))
-    return [cv2.add(sharp, red), green, cv2.add(sharp, blue)]
+
+    def light(rows: slice) -> list[Image]:
+        luma, more_red, more_blue = sharp[rows], red[rows], blue[rows]
+        green = cv2.scaleAdd(more_red, -LUMA_RED / green_luma, luma)
+        cv2.scaleAdd(more_blue, -LUMA_BLUE / green_luma, green, green)
+        return [cv2.add(luma, more_red), green, cv2.add(luma, more_blue)]
+
+    return light
 
 
 def _small_differences(blurred: BlurredPicture, scale: int) -> list[Image]:
@@ -452,7 +468,7 @@ def _projected_luma(
     return deconvolution.back_projected(luma)
 
 
-def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
     times = _reduction(blurred.statistics, settings)
     if times == 1.0:
@@ -602,7 +618,7 @@ def _extended(channel: Image, border: int) -> Image:
     return cv2.copyMakeBorder(channel, border, border, border, border, cv2.BORDER_REPLICATE)
 
 
-def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     operator = _whole_operator(blurred, positive=True)
     sharp = []
     for light, dark, clipped in zip(blurred.light, blurred.dark, blurred.clipped, strict=True):
@@ -610,10 +626,10 @@ def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) 
         start = _extended(light, operator.border)
         result = richardson_lucy(light, operator.apply, operator.adjoint, start, weight, settings.iterations)
         sharp.append(_inner(result, operator.border))
-    return sharp
+    return lambda rows: [plane[rows].copy() for plane in sharp]
 
 
-def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     """Luma over the whole operator, where censored pixels have no weight; colour as in tiles, all that a movie stores.
 
     Near clipped light the tiles' solution stays: its lamps were found with light held positive.

@@ -24,6 +24,7 @@ from virest.restoration.deblur import (
     BAND_ROWS,
     FEW_ITERATIONS,
     BlurredPicture,
+    LightOfRows,
     blurred_picture,
     clipped_anywhere,
     deblur,
@@ -213,21 +214,23 @@ def unknown_parameters(profile: CameraProfile) -> dict[str, Any]:
 
 
 def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> NDArray[np.uint8]:
-    """Linear light of the channels to a stored picture (height, width, 3), through a table over the root of light.
+    """Linear light of the channels to a stored picture (height, width, 3)."""
+    return _encoded(lambda rows: [plane[rows] for plane in light], len(light[0]), curve)
 
-    Band by band: what is worked on stays in the cache.
-    """
+
+def _encoded(light: LightOfRows, height: int, curve: ResponseCurve) -> NDArray[np.uint8]:
+    """The stored picture (height, width, 3), through a table over the root of light, band by band."""
     low, high = curve.light_range
     table = _encoding_table(curve)
-    picture = np.empty((*light[0].shape, len(light)), np.uint8)
-    for top in range(0, len(picture), BAND_ROWS):
-        part = cv2.merge([plane[top : top + BAND_ROWS] for plane in light])
+    bands = []
+    for top in range(0, height, BAND_ROWS):
+        part = cv2.merge(light(slice(top, top + BAND_ROWS)))
         if (low, high) != (0.0, 1.0):
             part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
         root = cv2.sqrt(cv2.threshold(part, 0.0, 0.0, cv2.THRESH_TOZERO)[1])
         steps = cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U)
-        cv2.LUT(steps, table, picture[top : top + BAND_ROWS])
-    return picture
+        bands.append(cv2.LUT(steps, table))
+    return np.concatenate(bands)
 
 
 def _beyond_the_curve_kept(
@@ -307,8 +310,10 @@ def _deblurred(
         measured = measured_share(blurred)
         part = part if measured is None else part * measured
         if part.min() < 1.0:
-            sharp = [_mixed(plane, s, part) for s, plane in zip(sharp, blurred.light, strict=True)]
-    restored = encode_picture(sharp if light is None else [plane * light.kept for plane in sharp], curve)
+            sharp = _mixed(sharp, blurred.light, part)
+    if light is not None:
+        sharp = _lit(sharp, light.kept)
+    restored = _encoded(sharp, height, curve)
     if light is None:
         restored = _beyond_the_curve_kept(restored, picture, blurred, curve)
     details = {
@@ -382,11 +387,21 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
 
 
-def _mixed(plane: NDArray[np.float32], sharp: NDArray[np.float32], part: Any) -> NDArray[np.float32]:
-    """So much of the sharp plane, the rest recorded; part: (height, width), or one number for all."""
-    if np.ndim(part):
-        return plane + part * (sharp - plane)
-    return cv2.addWeighted(plane, 1.0 - float(part), sharp, float(part), 0.0)
+def _mixed(sharp: LightOfRows, recorded: list[NDArray[np.float32]], part: Any) -> LightOfRows:
+    """So much of the sharp light, the rest recorded; part: (height, width), or one number for all."""
+
+    def mixed(rows: slice) -> list[NDArray[np.float32]]:
+        pairs = zip(sharp(rows), (plane[rows] for plane in recorded), strict=True)
+        if np.ndim(part):
+            return [plane + part[rows] * (s - plane) for s, plane in pairs]
+        return [cv2.addWeighted(plane, 1.0 - float(part), s, float(part), 0.0) for s, plane in pairs]
+
+    return mixed
+
+
+def _lit(sharp: LightOfRows, factor: NDArray[np.float32]) -> LightOfRows:
+    """Light times a factor (height, width)."""
+    return lambda rows: [plane * factor[rows] for plane in sharp(rows)]
 
 
 def _too_little_to_gain(luma: PictureStatistics) -> str:
