@@ -55,7 +55,7 @@ FEEBLE_GAIN, ASTRAY_SCALE = 0.1, 1.25
 """A cause that takes less than this part away, while points are so many times their noise from where the model puts
 them, is not what is wrong: two that gain little alone are then tried together."""
 PAIR_FIRSTS, PAIRS_JUDGED = 3, 3
-"""The best few alone, each beside all others, which may hide each other; so many pairs are judged on held-out blocks."""
+"""The best few alone, each beside all others, which it may hide; so many pairs are judged on held-out blocks."""
 PAIR_MIN_T = 2.3
 """One-sided 5 % for the best of three."""
 RIVAL_T = 2.0
