@@ -1,7 +1,7 @@
 # Everything here works from a fresh clone with Python 3.11 and make.
 #   make demo     process a sample capture and say where to look
 #   make test     all tests: the fast ones first, then the scenarios
-#   make bench    quality and speed tables
+#   make bench    quality and speed tables; ARGS="--only speed --quick" for a part of them
 #   make lint     ruff and mypy
 #   make sample   write sample_data/ and the README's pictures anew
 
@@ -28,7 +28,7 @@ test: $(READY)
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS)
 
 bench: $(READY)
-	$(BIN)/python -m virest.app.bench
+	$(BIN)/python -m virest.app.bench $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -123,7 +123,7 @@ def test_a_capture_whose_exposure_stays_is_refused(tmp_path: Path) -> None:
     simulate_command(tmp_path / "trip", width=160, height=120, frames=6, rate_rad_s=0.0)
     done = virest("calibrate-curve", "trip", cwd=tmp_path)
     assert done.returncode == 6
-    assert "1 picture" in done.stderr
+    assert "its 6 frames have one exposure" in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from virest.capture.files import label, read_small_text, require_regular_file
 from virest.capture.records import NO_STAMP, STARTUP, Capture, Frame
 from virest.capture.video import probe_movie, read_frames
-from virest.errors import CaptureError
+from virest.errors import CalibrationError, CaptureError
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 COLUMNS = ("file", "exposure_s")
@@ -297,7 +297,7 @@ def capture_bracket(capture: Capture) -> tuple[list[Still], list[str]]:
 
     At most MAX_GROUPS exposures, spread over those that occur, each the mean of up to FRAMES_PER_GROUP frames.  Frames
     of the start-up (their picture is later than their stamp) are left out.  Raises CaptureError where no exposures
-    are logged.
+    are logged, CalibrationError where all are alike.
     """
     usable = [f for f in capture.frames if f.exposure_s and not {STARTUP, NO_STAMP} & set(f.skip_codes)]
     if not usable:
@@ -306,6 +306,9 @@ def capture_bracket(capture: Capture) -> tuple[list[Still], list[str]]:
     iso_known = all(f.iso for f in usable)
     notes = [] if iso_known else ["ISO is not logged for every frame: light counted as exposure alone"]
     groups = _groups(usable, iso_known)
+    if len(groups) < 2:
+        text = f"{capture.name}: its {len(usable)} frames have one exposure × ISO: a curve needs the scene at several"
+        raise CalibrationError(text, hint="film the still scene at exposures from dark to bright, 1 EV apart")
     wanted = {f.index: n for n, group in enumerate(groups) for f in group}
     sums, counts = _mean_frames(capture, wanted, len(groups))
     first_iso = groups[0][0].iso or 1.0

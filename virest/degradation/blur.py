@@ -102,6 +102,7 @@ class SpaceVariantBlur:
         self._size = fast_size(self._patch)
         self._windows = grid.windows()
         self._spectra = [self._spectrum(kernel) for kernel in kernels]
+        self._transformed, self._moved = np.empty((2, self._size, self._size), np.float32)
 
     def apply(self, sharp: Image) -> Image:
         """The blurred picture of a sharp one."""
@@ -112,7 +113,7 @@ class SpaceVariantBlur:
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, self._spectra, strict=True):
             buffer[:patch, :patch] = padded[top : top + patch, left : left + patch]
             moved = self._correlate(buffer, spectrum, conjugate=True)
-            blurred[top : top + side, left : left + side] += window * moved[:side, :side]
+            cv2.accumulateProduct(moved[:side, :side], window, blurred[top : top + side, left : left + side])
         return blurred[: grid.height, : grid.width]
 
     def adjoint(self, blurred: Image) -> Image:
@@ -124,9 +125,9 @@ class SpaceVariantBlur:
         spread = np.zeros((reach[0] + 2 * self.border, reach[1] + 2 * self.border), np.float32)
         buffer = np.zeros((size, size), np.float32)
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, self._spectra, strict=True):
-            buffer[:side, :side] = window * padded[top : top + side, left : left + side]
+            np.multiply(window, padded[top : top + side, left : left + side], out=buffer[:side, :side])
             moved = self._correlate(buffer, spectrum, conjugate=False)
-            spread[top : top + patch, left : left + patch] += moved[:patch, :patch]
+            cv2.accumulate(moved[:patch, :patch], spread[top : top + patch, left : left + patch])
         return spread[: self.latent_shape[0], : self.latent_shape[1]]
 
     def _padded(self, sharp: Image, patch: int) -> Image:
@@ -139,7 +140,8 @@ class SpaceVariantBlur:
         buffer[: kernel.shape[0], : kernel.shape[1]] = kernel
         return cv2.dft(buffer)
 
-    @staticmethod
-    def _correlate(buffer: Image, spectrum: Image, conjugate: bool) -> Image:
-        product = cv2.mulSpectrums(cv2.dft(buffer), spectrum, 0, conjB=conjugate)
-        return cv2.idft(product, flags=cv2.DFT_SCALE)
+    def _correlate(self, buffer: Image, spectrum: Image, conjugate: bool) -> Image:
+        """Good until the next."""
+        transformed = cv2.dft(buffer, self._transformed)
+        product = cv2.mulSpectrums(transformed, spectrum, 0, transformed, conjB=conjugate)
+        return cv2.idft(product, self._moved, flags=cv2.DFT_SCALE)

@@ -407,7 +407,7 @@ def _lit(sharp: LightOfRows, factor: NDArray[np.float32]) -> LightOfRows:
 def _too_little_to_gain(luma: PictureStatistics) -> str:
     """Why the picture is better left as it was recorded; empty: it is not."""
     if not luma.measured:
-        return "picture too small for its blur to be measured, left alone"
+        return "picture too small, or its blur too long, for its noise to be measured: left alone"
     if luma.expected_gain_db < MIN_GAIN_DB:
         return f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
     return ""
