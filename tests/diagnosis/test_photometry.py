@@ -424,7 +424,11 @@ def test_a_small_gamma_that_was_not_named_is_not_excluded(rng: np.random.Generat
 
 def followed_late(observed: PhotometricObservations, rng: np.random.Generator) -> PhotometricObservations:
     """The same as an encoder passes it on: each patch keeps a part of its last picture, some much and some nothing."""
-    keeps = rng.uniform(0.0, 0.7, int(observed.patch.max()) + 1)[observed.patch]
+    return kept_in_part(observed, rng.uniform(0.0, 0.7, int(observed.patch.max()) + 1)[observed.patch])
+
+
+def kept_in_part(observed: PhotometricObservations, keeps: NDArray[np.float64]) -> PhotometricObservations:
+    """The same where each observation's patch keeps a part (n,) of its last picture."""
     grey = observed.grey.copy()
     for k in range(1, FRAMES):
         now, before = observed.frame == k, observed.frame == k - 1
@@ -457,3 +461,21 @@ def test_gains_of_frames_without_a_common_patch_cannot_be_compared(rng: np.rando
     step[:2] = 1, -1
     assert np.sqrt(half @ fit.covariance @ half) > 0.3
     assert np.sqrt(step @ fit.covariance @ step) < 0.03
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_starved_encoder_that_keeps_the_dark_is_no_cause(seed: int) -> None:
+    """Dark patches that hardly change with the exposure, in a movie that keeps most of all: nothing is named."""
+    rng = np.random.default_rng(seed)
+    made = made_observations(hidden(), rng, 0.8, 0.2)
+    verdict = PictureVerdict(NOMINAL)
+    climb_observations(verdict, kept_in_part(made, np.clip(0.95 - made.grey / 400, 0.45, 0.97)), FRAMES)
+    assert verdict.findings == []
+
+
+def test_a_black_level_beside_an_encoder_s_memory_is_named(rng: np.random.Generator) -> None:
+    """An encoder that keeps a fifth of each picture hides no black level."""
+    made = made_observations(hidden(black=0.04), rng, 0.8, 0.2)
+    verdict = PictureVerdict(NOMINAL)
+    climb_observations(verdict, kept_in_part(made, np.full(len(made), 0.2)), FRAMES)
+    assert [finding.name for finding in verdict.findings] == ["black_level"]
