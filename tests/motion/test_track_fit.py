@@ -15,6 +15,7 @@ from virest.motion import profile_terms as terms_of
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.motion.track_model import ground
+from virest.motion.tracking_bias import bias_std
 
 Array = np.ndarray
 BASIC = (terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS)
@@ -207,6 +208,15 @@ def test_points_off_the_wall_widen_the_depths_and_not_the_errors() -> None:
     assert 0.05 < fitted.depth_spread_per_m < 0.25
     assert flat.depth_spread_per_m < 0.03
     assert abs(errors(fitted)[0]) < 4 * deviations(fitted)[0]
+
+
+def test_a_gyroscope_s_wander_does_not_shrink_with_tracking() -> None:
+    """Sharper tracks tell a readout's or a lens's values better, but a gyroscope drifts all the same."""
+    fitted = fitted_from(recorded(PORTRAIT), BASIC)
+    blurred, sharp = (bias_std(fitted, "gyro_bias", noise_px) for noise_px in (0.3, 0.05))
+    assert np.all(blurred > sharp)
+    assert np.all(sharp >= 1.5e-4)
+    assert np.all(bias_std(fitted, "focal_length", 0.05) < 0.5 * bias_std(fitted, "focal_length", 0.15))
 
 
 def test_a_wall_needs_an_accelerometer() -> None:

@@ -32,6 +32,9 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "scene_depth": (0.004,),
 }
 """At the typical noise, in the units of the terms of profile_terms; a depth's relative."""
+WANDER_STD = {"gyro_bias": 1.5e-4}
+"""What a value does of its own accord however well points are tracked: a phone's gyroscope drifts by so much within
+seconds, and its noise of 3e-4 rad/s/√Hz has that mean over two of them."""
 
 
 def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
@@ -42,4 +45,5 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
     """
     if name == "readout_time":
         return np.asarray(SHARED * np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[fit.slices[name]]))
-    return max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX * np.array(BIAS_STD[name])
+    scaled = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX * np.array(BIAS_STD[name])
+    return np.maximum(scaled, WANDER_STD.get(name, 0.0))
