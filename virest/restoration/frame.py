@@ -360,7 +360,8 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
     if len(drowned):
         last = drowned[0] - 1
         signal[last + 1 :] = falling_power(frequency, signal, last)[last + 1 :]
-    return replace(defocused, signal=signal, passed=defocused.passed * left)
+    places = defocused.places and defocused.places.after(left)
+    return replace(defocused, signal=signal, passed=defocused.passed * left, places=places)
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
