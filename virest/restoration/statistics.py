@@ -61,8 +61,10 @@ _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 _EDGES_BEYOND = 2.0
 """A picture's edges stand out of its spectrum by so much: rings of tiles have the mean of edge and plain surface."""
-_LITTLE_MISFIT, LARGE_MISFIT = 0.9, 1.2
-"""RMS of ln |G|² about the fit's, over its cells, up to which rings are believed, and from which on they are not."""
+_LITTLE_MISFIT, _LARGE_MISFIT = 0.85, 1.15
+"""RMS of ln |G|² about the fit's, over its cells, up to which rings are believed, and from which on they are not.
+
+Of MANY_TILES; what fewer of them hold differs more from one to the next."""
 _PLACES_IN_CELL = 4
 """The mean of fewer tells little."""
 _INDEPENDENT = 4.0
@@ -212,13 +214,19 @@ def measure_picture(
     grey = observed(luma, 1)
     of_luma = replace(_fit_rings(grey, cells, white_levels), noise_levels=noise_levels)
     of_chroma = _fit_rings(colour, _RingCells(passed[::2]), white_noise(red))
-    weight = min(1.0, (of_luma.misfit - _LITTLE_MISFIT) / (LARGE_MISFIT - _LITTLE_MISFIT))
-    if weight <= 0:
+    weight = _unevenness(of_luma.misfit, len(chosen))
+    if not weight:
         return of_luma, of_chroma
     return (
         replace(of_luma, places=_place_statistics(of_luma, grey, passed, weight)),
         replace(of_chroma, places=_place_statistics(of_chroma, colour, passed[::2], weight)),
     )
+
+
+def _unevenness(misfit: float, tiles: int) -> float:
+    """0 where a misfit on so many tiles is an ordinary picture's, to 1 where its power lies at few places."""
+    misfit *= min(1.0, float(np.sqrt(tiles / MANY_TILES)))
+    return float(np.clip((misfit - _LITTLE_MISFIT) / (_LARGE_MISFIT - _LITTLE_MISFIT), 0.0, 1.0))
 
 
 def _place_statistics(
