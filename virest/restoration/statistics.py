@@ -61,16 +61,20 @@ _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 _EDGES_BEYOND = 2.0
 """A picture's edges stand out of its spectrum by so much: rings of tiles have the mean of edge and plain surface."""
-_LITTLE_MISFIT, _LARGE_MISFIT = 0.85, 1.15
+_LITTLE_MISFIT, _LARGE_MISFIT = 0.8, 1.1
 """RMS of ln |G|² about the fit's, over its cells, up to which rings are believed, and from which on they are not.
 
 Of MANY_TILES; what fewer of them hold differs more from one to the next."""
+_SINGLE_PLACES = 2.0
+"""Along the axes, which the fit leaves out, single places scatter so many times as much as cells."""
 _PLACES_IN_CELL = 4
 """The mean of fewer tells little."""
 _INDEPENDENT = 4.0
 """Of a place's nine neighbours under the window, itself one of them, so many are independent."""
 _STEEPEST_PLACE = 4.0
-"""S of a place is at most so many times its ring's: what exceeds it where kernels cancel is the coder's pattern."""
+"""S of a place is at most so many times its ring's, or what came through the blur, whichever is more.
+
+What exceeds both where kernels cancel is the coder's pattern."""
 _FEW_PLACES = 20.0
 """A ring with so many reliable places is half way from its fit to what these have."""
 
@@ -214,7 +218,7 @@ def measure_picture(
     grey = observed(luma, 1)
     of_luma = replace(_fit_rings(grey, cells, white_levels), noise_levels=noise_levels)
     of_chroma = _fit_rings(colour, _RingCells(passed[::2]), white_noise(red))
-    weight = _unevenness(of_luma.misfit, len(chosen))
+    weight = _unevenness(max(of_luma.misfit, _scatter(of_luma, grey, passed) / _SINGLE_PLACES), len(chosen))
     if not weight:
         return of_luma, of_chroma
     return (
@@ -229,10 +233,31 @@ def _unevenness(misfit: float, tiles: int) -> float:
     return float(np.clip((misfit - _LITTLE_MISFIT) / (_LARGE_MISFIT - _LITTLE_MISFIT), 0.0, 1.0))
 
 
+def _scatter(rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32]) -> float:
+    """Standard deviation of ln |G|² about the fit's along the axes, where upright things have their power.
+
+    Boards, print and the coder's blocks have more of it there than elsewhere, but about as much everywhere; upright
+    bars and lying blinds have theirs at few places.  observed, passed: as in :func:`_place_statistics`.
+    """
+    rows, columns = _axes()
+    ring = _place_ring()[rows, columns]
+    seen, k = (spectra[:, rows, columns].mean(axis=0) for spectra in (observed, passed))
+    return float(np.std(np.log(np.maximum(seen, _ROUNDING_POWER) / (k * rings.signal[ring] + rings.noise[ring]))))
+
+
+@lru_cache(maxsize=1)
+def _axes() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the places of :func:`_power` that :func:`_ring_index` leaves out near the axes."""
+    fy, fx = np.fft.fftfreq(_SIDE)[:, None], np.arange(1, _SIDE // 2)[None, :] / _SIDE
+    radius = np.hypot(fx, fy)
+    rows, columns = np.nonzero((_ring_index(_SIDE) == RINGS) & (radius > 2.5 / _SIDE) & (radius < 0.5))
+    return rows, columns
+
+
 def _place_statistics(
     rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32], weight: float
 ) -> PlaceStatistics:
-    """S of each place, (|G|² − N) / |K|² over its neighbours, as far as that is known; else what is typical of its ring.
+    """S of each place, (|G|² − N) / |K|² around it, as far as that is known; else what is typical of its ring.
 
     Typical is the mean of the logarithm, which a few strong places do not raise, over those that come through the blur.
     observed, passed: |G|² and |K|² of the tiles, (n, _SIDE, _SIDE / 2 - 1).
@@ -241,7 +266,8 @@ def _place_statistics(
     signal, noise = rings.signal[ring], rings.noise[ring]
     seen, k = (_around(np.asarray(spectra.mean(axis=0))) for spectra in (observed, passed))
     k = np.maximum(k, 1e-6)
-    own, doubt, most = (seen - noise) / k, noise / (k * np.sqrt(count)), _STEEPEST_PLACE * signal
+    own, doubt = (seen - noise) / k, noise / (k * np.sqrt(count))
+    most = np.maximum(_STEEPEST_PLACE * signal, seen - noise)
     logarithms = np.log(np.clip(own, np.minimum(doubt, signal), most) / signal)
     reliable = k * signal / (k * signal + noise)
     sums, counts = (np.bincount(ring.ravel(), w.ravel(), RINGS) for w in (reliable * logarithms, reliable))
