@@ -52,7 +52,7 @@ def _statistics(turning: TurningCamera, picture: NDArray[np.uint8]) -> PictureSt
 # ── what the picture says of itself ──────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("angle_rad", [ALONG_RAD, ALONG_RAD + np.pi / 2, 0.1])
+@pytest.mark.parametrize("angle_rad", [ALONG_RAD, ALONG_RAD + np.pi / 2, 1.2])
 def test_a_grating_is_told_from_texture(angle_rad: float) -> None:
     """Rings hold for texture, and no place is looked at; a grating does not fit them, in whatever direction it lies."""
     turning = camera(RATE_RAD_S, width=WIDTH, height=HEIGHT)
@@ -60,19 +60,26 @@ def test_a_grating_is_told_from_texture(angle_rad: float) -> None:
     assert _statistics(turning, record_canvas(turning, natural, noise_levels=2.0).picture).places is None
     grating = _canvas(_sine(13.0, angle_rad))
     found = _statistics(turning, record_canvas(turning, grating, noise_levels=2.0).picture)
-    assert found.unevenness == 1.0
+    assert found.unevenness > 0.3
+
+
+def test_upright_bars_are_told_by_their_few_places_along_the_axes() -> None:
+    """Places near the axes are no part of the fit, so upright bars do not harm it; there they are seen."""
+    turning = camera(tuple(0.5 * r for r in RATE_RAD_S), 0.02, width=WIDTH, height=HEIGHT)  # type: ignore[arg-type]
+    found = _statistics(turning, record_canvas(turning, _canvas(_bars(21.0, 0.02)), noise_levels=3.0).picture)
+    assert found.misfit < 0.6
+    assert found.unevenness > 0.3
 
 
 def test_bars_along_the_motion_promise_little() -> None:
-    """Bars that the motion does not blur show their power where nothing is lost, and so there is nothing to gain.
+    """Bars that the motion does not blur show their power where nothing is lost, and so there is little to gain.
 
     By rings alone it would be taken to stand in all directions, most of them cancelled.
     """
     turning = camera(RATE_RAD_S, width=WIDTH, height=HEIGHT)
     bars = record_canvas(turning, _canvas(_sine(13.0, ALONG_RAD + np.pi / 2)), noise_levels=2.0).picture
     found = _statistics(turning, bars)
-    assert replace(found, places=None).expected_gain_db > 3.0
-    assert found.expected_gain_db < 1.0
+    assert found.expected_gain_db < 0.5 * replace(found, places=None).expected_gain_db
 
 
 def test_a_share_of_each_place_lands_on_its_own_frequency() -> None:
@@ -124,10 +131,13 @@ def test_no_grating_gets_worse(scene: Scene, settings: RestorationSettings, rate
 def test_where_paths_change_within_a_tile_its_kernel_is_not_used() -> None:
     """Under a turn about the optical axis large tiles leave more of the middle alone; kernels without tiles do not."""
     motion = camera((0.0, 0.0, 6.0), width=WIDTH, height=HEIGHT).motion
-    parts = [np.asarray(_blurred_part(motion, 1.0, tile_px)) for tile_px in (0, 100, 200)]
-    left_alone = [float(np.mean(part == 0)) for part in parts]
-    assert 0 < left_alone[0] < left_alone[1] < left_alone[2] < 0.5
-    assert all(part[0, 0] == 1.0 for part in parts[:2])
+    left_alone = []
+    for tile_px in (0, 60, 120, 180):
+        part = np.asarray(_blurred_part(motion, 1.0, tile_px))
+        left_alone.append(float(np.mean(1 - part)))
+        assert part[0, 0] == 1.0
+    assert (np.diff(left_alone) > 0).all()
+    assert left_alone[-1] < 0.5
 
 
 def test_a_pan_is_restored_everywhere() -> None:

@@ -65,7 +65,7 @@ UNEVEN_NOISE_TO_SIGNAL = 0.03
 """Least N / S of a picture whose power lies at few places: an error of the kernel there, or of what a tile sees around
 itself, is by so much in proportion to the power, and stands out of the noise."""
 LINEAR_SHARE = 0.5
-"""Part of such a picture that is the linear filter's: its gradients are not sparse, and the prior makes steps of them."""
+"""Part of such a picture that is the linear filter's: its gradients are not sparse, the prior makes them steps."""
 WEIGHED_PX = 5
 """Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
 SHRUNK_PARTS = 8
