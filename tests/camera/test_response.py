@@ -206,3 +206,12 @@ def test_any_five_segment_curve_inverts(
     light = np.linspace(*curve.light_range, 101)
     assert (np.diff(curve.encode(light)) >= 0).all()
     assert_round_trip(curve.encode, curve.linearise, light, atol=2e-3)
+
+
+def test_a_table_may_be_written_to() -> None:
+    """Tables are kept between calls, but what a caller does to one is not."""
+    curve = ResponseCurve("srgb")
+    for table in (curve.linear_table, curve.slope_table, curve.censored_table, curve.clipped_table):
+        before = table().copy()
+        table()[:] = 1
+        np.testing.assert_array_equal(table(), before)

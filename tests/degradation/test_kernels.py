@@ -11,7 +11,11 @@ from laws import FISHEYE, RADTAN, UNDISTORTED, TurningCamera, phone
 from numpy.typing import NDArray
 
 from virest.camera.shutter import READOUT_DIRECTIONS
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, kernel_field
+from virest.capture.imu import ImuSamples
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, kernel_field, smooth_field
+from virest.degradation.row_motion import FrameTranslation, RowMotion, row_motion
+from virest.motion.integration import integrate_gyro
+from virest.motion.relief_surface import Relief
 
 CENTRES = np.array([[12.0, 20.0], [104.0, 63.92], [171.0, 41.0], [66.0, 118.0]])
 YAW_RIGHT = TurningCamera(phone(readout_time_s=0.0), rate_rad_s=(0, 3.0, 0))
@@ -124,6 +128,40 @@ def test_kernel_fields_are_explicit_projections(
             at_anchor_s = camera.row_start_s(seen, motion.start_s) + anchor * 0.012
             seen = camera.seen(pixel, gathered_s, at_anchor_s, motion.reference_s)
         np.testing.assert_allclose(path, seen - pixel, atol=1e-4)
+
+
+def _shaken(direction: str, lens: tuple[str, tuple[float, ...]], relief: Relief | None = None) -> RowMotion:
+    """A phone in a hand that trembles at 9 Hz about all axes, moving over a slanted plane."""
+    profile = phone(360, 480, 420.0, lens, 0.025, direction)
+    time_s = np.arange(-0.2, 0.6, 0.004)
+    phase = 2 * np.pi * 9.0 * time_s[:, None] + np.array([0.3, 1.7, 4.0])
+    rates = np.array([0.9, -1.3, 0.7]) + np.array([0.8, 0.6, 0.9]) * np.sin(phase)
+    samples = ImuSamples(time_s, rates, np.full((len(time_s), 3), np.nan))
+    sway = FrameTranslation(np.array([0.2, -0.1, 0.05]), np.zeros(3), np.array([0.1, -0.2, 0.5]), relief=relief)
+    return row_motion(integrate_gyro(samples, profile), profile, 0.1, 0.012, translation=sway)
+
+
+@pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
+@pytest.mark.parametrize("lens", [pytest.param(lens, id=lens[0]) for lens in (UNDISTORTED, RADTAN)])
+def test_smooth_fields_are_the_fields_between_their_knots(
+    direction: str, lens: tuple[str, tuple[float, ...]], rng: np.random.Generator
+) -> None:
+    """Anywhere in the picture, its corners included, splines give the paths to a hundredth of a pixel."""
+    motion = _shaken(direction, lens)
+    centres = np.concatenate([rng.uniform((0, 0), (359, 479), (60, 2)), [[0, 0], [359, 0], [0, 479], [359, 479]]])
+    smooth, exact = smooth_field(motion, 0.5)(centres), kernel_field(motion, centres, 0.5)
+    assert exact.length_px.max() > max(2.0, 1.25 * exact.length_px.min()), "a field that changes"
+    np.testing.assert_allclose(smooth.paths_px, exact.paths_px, atol=0.01)
+    np.testing.assert_array_equal(smooth.centres_px, centres)
+
+
+def test_before_relief_each_path_is_worked_out() -> None:
+    """Paths bend at depth edges, where a spline would swing."""
+    values = np.where(np.arange(40) > 20, 0.8, 0.0) * np.ones((30, 1))
+    motion = _shaken("top_to_bottom", UNDISTORTED, Relief(np.array([-0.5, -0.6]), np.array([1.0, 1.2]), values, values))
+    centres = np.stack([np.linspace(20, 340, 30), np.full(30, 240.0)], -1)
+    paths_px = smooth_field(motion, 0.5)(centres).paths_px
+    np.testing.assert_array_equal(paths_px, kernel_field(motion, centres, 0.5).paths_px)
 
 
 def test_paths_with_depth_carry_the_shift() -> None:

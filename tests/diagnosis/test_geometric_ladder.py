@@ -10,7 +10,7 @@ import pytest
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.camera.profile import CameraProfile
-from virest.diagnosis import geometric_ladder
+from virest.diagnosis import candidates
 from virest.diagnosis.findings import Finding, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import (
@@ -80,7 +80,7 @@ def test_a_true_profile_is_left_alone() -> None:
 def test_an_offset_and_a_bias_are_named_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """9 ms and 0.02 rad/s hidden at once, among the causes most like them: two rungs, two findings, both right."""
     alike = ("time_offset", "timestamp_reference", "readout_time", "gyro_bias", "imu_rotation", "focal_length")
-    monkeypatch.setattr(geometric_ladder, "GEOMETRIC_EFFECTS", tuple(EFFECT[name] for name in alike))
+    monkeypatch.setattr(candidates, "GEOMETRIC_EFFECTS", tuple(EFFECT[name] for name in alike))
     truth = recorded(HAND).profile
     wrong_bias = (-0.011, 0.012, -0.009)
     nominal = replace(truth, time_offset_s=0.022, gyro_bias_rad_s=wrong_bias)
@@ -106,6 +106,25 @@ def test_a_readout_of_the_wrong_sense_is_named() -> None:
     assert (change.nominal, change.estimate, change.std) == ("bottom_to_top", "top_to_bottom", None)
     assert_explained(verdict, HAND.noise_px)
     assert verdict.model.profile.shutter == truth.shutter
+
+
+@pytest.mark.parametrize(("seed", "scale"), [(81, 1.12), (82, 0.9), (84, 1.08)])
+def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: float) -> None:
+    """A gyroscope that tells too much, and a focal length given too short for it: right but for roll, alone worse."""
+    setup = replace(HAND, seed=seed, frames=61, about=(0.8, 1.0, 1.0), gyro_scale=scale)
+    truth = recorded(setup).profile
+    lens = truth.intrinsics
+    assert lens is not None
+    shorter = replace(lens, fx_px=lens.fx_px / scale, fy_px=lens.fy_px / scale)
+    nominal = replace(truth, gyro_scale=(1.0, 1.0, 1.0), intrinsics=shorter)
+    verdict, found = climbed(setup, nominal)
+    named = {finding.name: finding for finding in found}
+    assert set(named) == {"gyro_scale", "focal_length"}
+    assert verdict.final_rms_px == pytest.approx(setup.noise_px, rel=0.1)
+    assert any(rung.has("gyro_scale") and rung.has("focal_length") for rung in verdict.rungs)
+    assert_holds(named["gyro_scale"].parameters["gyro_scale"], 1.0, scale)
+    assert_holds(named["focal_length"].parameters["focal_scale"], 1.0, scale)
+    assert all(finding.held_out.gain > 0.9 for finding in found)
 
 
 def wall_m(recording: Recording) -> float:

@@ -10,6 +10,7 @@ from laws import assert_adjoint, assert_linear
 from numpy.typing import NDArray
 
 from virest.restoration.deconvolution import (
+    add_roughness,
     conjugate_gradients,
     difference,
     difference_adjoint,
@@ -69,6 +70,17 @@ def test_differences_and_their_adjoint(axis: int, rng: np.random.Generator) -> N
     inner = slope[:-1] if axis == 0 else slope[:, :-1]
     np.testing.assert_allclose(inner, -3 if axis == 0 else 2)
     assert not (slope[-1] if axis == 0 else slope[:, -1]).any()
+
+
+def test_roughness_is_the_adjoint_of_weighted_differences(rng: np.random.Generator) -> None:
+    """Dᵀ w D along both axes, on top of what is there; the picture stays."""
+    picture, weight, there = rng.random((3, 7, 11)).astype(np.float32)
+    expected, before = there.copy(), picture.copy()
+    for axis in (0, 1):
+        expected += difference_adjoint(weight * difference(picture, axis), axis)
+    add_roughness(there, picture, weight)
+    np.testing.assert_allclose(there, expected, atol=1e-5)
+    np.testing.assert_array_equal(picture, before)
 
 
 # ── conjugate gradients ──────────────────────────────────────────────────────────────────────────────────────────

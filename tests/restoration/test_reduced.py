@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import KernelField
 from virest.restoration import deblur
+from virest.restoration.settings import PRESETS
 from virest.restoration.statistics import PictureStatistics
 
 HEIGHT, WIDTH = 120, 168
@@ -33,7 +36,7 @@ def test_kernels_and_light_go_to_the_smaller_picture() -> None:
     small = deblur._reduced(_blurred(np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8)), 1.5)
     assert small.light[0].shape == (80, 112)
     assert np.ptp(small.light[0]) < 1e-6
-    assert small.slopes(1, 40).shape == (80, 112)
+    assert small.slopes(1, 40, (112, 80)).shape == (80, 112)
     at = np.array([[20.0, 30.0]])
     np.testing.assert_allclose(small.field(at).paths_px * 1.5, _field((at + 0.5) * 1.5 - 0.5).paths_px)
     assert small.longest_px == pytest.approx(8.0)
@@ -49,6 +52,49 @@ def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
     rows, columns = np.nonzero(hole)
     assert (rows.min(), rows.max()) == (26, 31)
     assert (columns.min(), columns.max()) == (60, 67)
+
+
+def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator) -> None:
+    """Whole squares, and the narrower rest at the right and below, each have the mean of their own pixels."""
+    plane = rng.random((11, 16)).astype(np.float32)
+    means = deblur._block_means(plane, 3)
+    assert means.shape == (4, 6)
+    expected = [[plane[r : r + 3, c : c + 3].mean() for c in range(0, 16, 3)] for r in range(0, 11, 3)]
+    np.testing.assert_allclose(means, expected, rtol=1e-5)
+
+
+def test_tiles_are_as_large_as_their_kernels_hold() -> None:
+    """Paths that grow twice as fast over the picture, or half the noise, halve the side; even paths know no bound."""
+
+    def side(growth: float, noise_levels: float) -> float:
+        def field(centres_px: NDArray[np.float64]) -> KernelField:
+            along = (10 + growth * centres_px[:, 0, None]) * np.linspace(-0.5, 0.5, 31)
+            return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5)
+
+        blurred = _blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+        statistics = replace(blurred.statistics, noise_levels=noise_levels)
+        return deblur._kernel_holds_px(replace(blurred, field=field, statistics=statistics))
+
+    assert side(0.02, 1.0) == pytest.approx(side(0.01, 1.0) / 2, rel=1e-6)
+    assert side(0.01, 0.5) == pytest.approx(side(0.01, 1.0) / 2, rel=1e-6)
+    assert side(0.0, 1.0) > 1e4
+
+
+def test_a_path_longer_than_its_tiles_still_fits_them() -> None:
+    """Thin margins grow where a kernel would not fit the transform."""
+    blurred = _blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+
+    def field(centres_px: NDArray[np.float64]) -> KernelField:
+        along = np.linspace(-230.0, 230.0, 900) * np.ones((len(centres_px), 1))
+        return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5)
+
+    long = replace(blurred, field=field, longest_px=460.0)
+    deconvolution = deblur._luma_tiles(long, PRESETS["fast"], deblur.THINNEST_MARGIN)
+    assert deconvolution.size >= 465
+    ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
+    projected = deconvolution.back_projected(blurred.light[0])
+    flat = deconvolution.blend(deconvolution.solutions(projected, ratio, ratio))
+    assert np.isfinite(flat).all()
 
 
 def test_the_measured_part_is_looked_for_around_holes_only() -> None:

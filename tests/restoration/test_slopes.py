@@ -31,7 +31,7 @@ def test_noise_over_slopes_is_the_noise_in_light(dark: int, bright: int, rng: np
     """Grey levels with a known noise, taken to light, have the noise that their slopes foretell."""
     curve, clean = ResponseCurve("srgb"), _squares(dark, bright)
     grey = np.clip(np.rint(clean + rng.normal(0, NOISE_LEVELS, clean.shape)), 0, 255).astype(np.uint8)
-    slopes = _blurred(curve, grey).slopes(1, SIDE_PX)
+    slopes = _blurred(curve, grey).slopes(1, SIDE_PX, (311, 203))
     in_light = (curve.linear_table()[grey] - curve.linearise(clean / 255.0)).std()
     assert slopes.shape == grey.shape
     assert NOISE_LEVELS / slopes[60:-60, 60:-60] == pytest.approx(in_light, rel=0.12)
@@ -40,7 +40,7 @@ def test_noise_over_slopes_is_the_noise_in_light(dark: int, bright: int, rng: np
 def test_a_pixels_own_slope_is_that_of_its_level() -> None:
     """In the middle of a square the neighbourhood is all of one level."""
     curve, grey = ResponseCurve("srgb"), _squares(30, 200).astype(np.uint8)
-    slopes = _blurred(curve, grey).slopes(1, 5)
+    slopes = _blurred(curve, grey).slopes(1, 5, (311, 203))
     for row, column in ((104, 104), (104, 114)):
         assert slopes[row, column] == pytest.approx(curve.slope_table()[grey[row, column]], rel=1e-3)
 
@@ -49,7 +49,7 @@ def test_a_pixels_own_slope_is_that_of_its_level() -> None:
 def test_levels_that_tell_no_light_have_their_neighbours_slope(level: int) -> None:
     """Below A and above D the curve is level, and 1 / s² would be next to infinite."""
     curve = ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.80), y_max=0.93)
-    slopes = _blurred(curve, np.full((203, 311), level, np.uint8)).slopes(1, SIDE_PX)
+    slopes = _blurred(curve, np.full((203, 311), level, np.uint8)).slopes(1, SIDE_PX, (311, 203))
     assert np.isfinite(slopes).all()
     assert curve.slope_table()[~curve.censored_table()].min() <= slopes.min() <= slopes.max()
     assert slopes.max() <= curve.slope_table().max()
@@ -58,5 +58,5 @@ def test_levels_that_tell_no_light_have_their_neighbours_slope(level: int) -> No
 def test_dark_squares_beside_bright_ones_get_no_noise_from_them(rng: np.random.Generator) -> None:
     """The noise of what is bright is not taken for detail of what is dark: a tile has one slope."""
     grey = np.clip(_squares(20, 230) + rng.normal(0, NOISE_LEVELS, (203, 311)), 0, 255).astype(np.uint8)
-    even = _blurred(ResponseCurve("srgb"), grey).slopes(1, 104)
+    even = _blurred(ResponseCurve("srgb"), grey).slopes(1, 104, (311, 203))
     assert even.max() < 1.1 * even.min()

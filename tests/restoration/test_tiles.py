@@ -10,7 +10,7 @@ import pytest
 from laws import psnr_db, random_picture, texture
 from numpy.typing import NDArray
 
-from virest.degradation.blur import tile_grid
+from virest.degradation.blur import fast_size, tile_grid
 from virest.restoration.statistics import packed_frequency
 from virest.restoration.tiles import (
     TileDeconvolution,
@@ -159,6 +159,27 @@ def test_quick_tiles_cover_the_picture_and_fill_their_transforms(height: int, wi
         total[top : top + grid.side, left : left + grid.side] += window
     np.testing.assert_allclose(total[:height, :width], 1, atol=1e-6)
     assert 0.8 * 120 <= grid.side <= 1.15 * 120
+
+
+@pytest.mark.parametrize(("height", "width"), [(853, 480), (480, 853), (640, 360)])
+def test_overlaps_that_give_a_little_spare_tiles(height: int, width: int) -> None:
+    """Tiles still cover the picture and overlap by nearly what was asked for, and there are never more of them."""
+    strict, loose = (quick_grid(height, width, 117, 18, 3, give) for give in (0.0, 0.1))
+    pixels = [len(g.tops) * len(g.lefts) * fast_size(g.side + 18) ** 2 for g in (strict, loose)]
+    assert pixels[1] <= 1.05 * pixels[0]
+    assert loose.overlap >= 0.9 * (loose.side // 3) - 1
+    assert loose.tops[-1] + loose.side >= height
+    assert loose.lefts[-1] + loose.side >= width
+
+
+def test_stacked_spectra_are_multiplied_one_by_one(rng: np.random.Generator) -> None:
+    """Products and powers of several packed spectra at once are those of each, the columns at the ends included."""
+    first, second = (np.stack([cv2.dft(random_picture((16, 16), rng)) for _ in range(3)]) for _ in range(2))
+    for stacked, single in (
+        (packed_product(first, second), [packed_product(a, b) for a, b in zip(first, second, strict=True)]),
+        (packed_power(first), [packed_power(a) for a in first]),
+    ):
+        np.testing.assert_allclose(stacked, single, rtol=1e-5, atol=1e-4)
 
 
 def test_a_bridge_may_be_longer_than_the_margins() -> None:

@@ -253,7 +253,7 @@ def draw_figures(
     common = list(drawings)
     drawn = []
     for number, cause in enumerate(found.causes, start=1):
-        rung = next((rung for rung in found.ladder if rung.entered == cause.name), None)
+        rung = next((rung for rung in found.ladder if rung.has(cause.name)), None)
         own = f"{FIGURES}/{number:02d}_{cause.name}.png"
         if rung is not None:
             drawings[own] = (ladder_figure, [_bars(rung)], f"{capture.name}: {cause.name}")

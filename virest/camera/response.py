@@ -14,6 +14,7 @@ Below A and above D nothing can be inverted: those pixels are *censored* (:meth:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -83,29 +84,25 @@ class ResponseCurve:
 
     def linear_table(self) -> NDArray[np.float32]:
         """Exposure of each of the 256 grey levels, (256,)."""
-        return self.linearise(_LEVELS).astype(np.float32)
+        return _linear_table(self).copy()
 
     def slope_table(self) -> NDArray[np.float32]:
         """dE/dx in grey levels (of 255) per unit of exposure, at each of the 256 grey levels, (256,).
 
         Taken over one grey level on both sides, so it stays finite at kinks and ends.
         """
-        light = self.linearise(np.clip(np.stack([_LEVELS - 1 / 255, _LEVELS + 1 / 255]), 0.0, 1.0))
-        grey = self.encode(light)
-        rise = np.maximum(grey[1] - grey[0], 1e-6)
-        return (255.0 * rise / np.maximum(light[1] - light[0], 1e-6)).astype(np.float32)
+        return _slope_table(self).copy()
 
     def censored_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
         """Which of the 256 grey levels carry no measured light: at or beyond A and D, (256,)."""
-        low = float(self.encode(np.array(self.light_range[0]))) * 255.0
-        dead_zone = self.light_range[0] > 1e-3
         clipped = self.clipped_table(margin_levels)
-        return (np.arange(256) <= low + margin_levels) | clipped if dead_zone else clipped
+        if self.light_range[0] <= 1e-3:
+            return clipped
+        return (np.arange(256) <= _end_levels(self)[0] + margin_levels) | clipped
 
     def clipped_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
         """Which of the 256 grey levels are at or beyond D: light of any strength, (256,)."""
-        high = float(self.encode(np.array(self.light_range[1]))) * 255.0
-        return np.arange(256) >= min(high, 255.0) - margin_levels
+        return np.arange(256) >= min(_end_levels(self)[1], 255.0) - margin_levels
 
     def describe(self) -> str:
         """A short name for tables and logs."""
@@ -113,6 +110,26 @@ class ResponseCurve:
         if self.extra_gamma != 1.0:
             name += f" ^{self.extra_gamma:g}"
         return name + (f" black {self.black_level:g}" if self.black_level else "")
+
+
+@lru_cache(maxsize=32)
+def _linear_table(curve: ResponseCurve) -> NDArray[np.float32]:
+    return curve.linearise(_LEVELS).astype(np.float32)
+
+
+@lru_cache(maxsize=32)
+def _slope_table(curve: ResponseCurve) -> NDArray[np.float32]:
+    light = curve.linearise(np.clip(np.stack([_LEVELS - 1 / 255, _LEVELS + 1 / 255]), 0.0, 1.0))
+    grey = curve.encode(light)
+    rise = np.maximum(grey[1] - grey[0], 1e-6)
+    return (255.0 * rise / np.maximum(light[1] - light[0], 1e-6)).astype(np.float32)
+
+
+@lru_cache(maxsize=32)
+def _end_levels(curve: ResponseCurve) -> tuple[float, float]:
+    """Grey levels at both ends of the light that can be told."""
+    low, high = (255.0 * float(curve.encode(np.array(end))) for end in curve.light_range)
+    return low, high
 
 
 def _curve(curve: ResponseCurve, light: NDArray[Any]) -> NDArray[Any]:

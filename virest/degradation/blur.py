@@ -48,15 +48,17 @@ class TileGrid:
         return _windows(self)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=24)
 def _windows(grid: TileGrid) -> list[Image]:
     """The same for every frame of a movie, and one array for all that are alike; not to be written to."""
     rows = _ramps(grid.tops, grid.side, grid.overlap)
     columns = _ramps(grid.lefts, grid.side, grid.overlap)
     windows: dict[tuple[bytes, bytes], Image] = {}
-    return [
-        windows.setdefault((r.tobytes(), c.tobytes()), np.outer(r, c).astype(np.float32)) for r in rows for c in columns
-    ]
+    for r in rows:
+        for c in columns:
+            if (r.tobytes(), c.tobytes()) not in windows:
+                windows[r.tobytes(), c.tobytes()] = np.outer(r, c).astype(np.float32)
+    return [windows[r.tobytes(), c.tobytes()] for r in rows for c in columns]
 
 
 def tile_grid(height: int, width: int, side: int, overlap: int) -> TileGrid:
@@ -100,6 +102,7 @@ class SpaceVariantBlur:
         self._size = fast_size(self._patch)
         self._windows = grid.windows()
         self._spectra = [self._spectrum(kernel) for kernel in kernels]
+        self._transformed, self._moved = np.empty((2, self._size, self._size), np.float32)
 
     def apply(self, sharp: Image) -> Image:
         """The blurred picture of a sharp one."""
@@ -110,7 +113,7 @@ class SpaceVariantBlur:
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, self._spectra, strict=True):
             buffer[:patch, :patch] = padded[top : top + patch, left : left + patch]
             moved = self._correlate(buffer, spectrum, conjugate=True)
-            blurred[top : top + side, left : left + side] += window * moved[:side, :side]
+            cv2.accumulateProduct(moved[:side, :side], window, blurred[top : top + side, left : left + side])
         return blurred[: grid.height, : grid.width]
 
     def adjoint(self, blurred: Image) -> Image:
@@ -122,9 +125,9 @@ class SpaceVariantBlur:
         spread = np.zeros((reach[0] + 2 * self.border, reach[1] + 2 * self.border), np.float32)
         buffer = np.zeros((size, size), np.float32)
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, self._spectra, strict=True):
-            buffer[:side, :side] = window * padded[top : top + side, left : left + side]
+            np.multiply(window, padded[top : top + side, left : left + side], out=buffer[:side, :side])
             moved = self._correlate(buffer, spectrum, conjugate=False)
-            spread[top : top + patch, left : left + patch] += moved[:patch, :patch]
+            cv2.accumulate(moved[:patch, :patch], spread[top : top + patch, left : left + patch])
         return spread[: self.latent_shape[0], : self.latent_shape[1]]
 
     def _padded(self, sharp: Image, patch: int) -> Image:
@@ -137,7 +140,8 @@ class SpaceVariantBlur:
         buffer[: kernel.shape[0], : kernel.shape[1]] = kernel
         return cv2.dft(buffer)
 
-    @staticmethod
-    def _correlate(buffer: Image, spectrum: Image, conjugate: bool) -> Image:
-        product = cv2.mulSpectrums(cv2.dft(buffer), spectrum, 0, conjB=conjugate)
-        return cv2.idft(product, flags=cv2.DFT_SCALE)
+    def _correlate(self, buffer: Image, spectrum: Image, conjugate: bool) -> Image:
+        """Good until the next."""
+        transformed = cv2.dft(buffer, self._transformed)
+        product = cv2.mulSpectrums(transformed, spectrum, 0, transformed, conjB=conjugate)
+        return cv2.idft(product, self._moved, flags=cv2.DFT_SCALE)

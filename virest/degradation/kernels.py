@@ -7,6 +7,7 @@ A kernel is that path splatted onto the pixel grid; g is the *correlation* of f 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -26,6 +27,8 @@ MIN_SAMPLES = 16
 NODE_STEP_S = 2e-3
 """Instants at which a path is worked out, with a cubic spline between: at 100 Hz off by 0.7 % of the vibration."""
 MIN_NODES = 8
+ACROSS_PX, MIN_KNOTS = 160, 5
+"""Knots of splines over the picture: at most so far apart, and at least so many each way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,18 +81,56 @@ def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inve
 
     inverse_depth: (n,) of each tile, 1/m; None: that of the frame's plane.  Flicker and defocus are the profile's.
     """
+    return _field(motion, centres_px, _path_nodes(motion, centres_px, anchor, inverse_depth), anchor)
+
+
+def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], KernelField]:
+    """:func:`kernel_field` of any centres inside the picture, from paths worked out once at the knots of splines.
+
+    A knot for every ACROSS_PX pixels, and for every NODE_STEP_S of the readout.  Before relief paths bend at depth
+    edges, where splines would swing: each is worked out.
+    """
+    if motion.translation is not None and motion.translation.relief is not None:
+        return lambda centres_px: kernel_field(motion, centres_px, anchor)
+    profile = motion.profile
+    least = [-(-length // ACROSS_PX) + 1 for length in (profile.width, profile.height)]
+    along = 0 if profile.shutter.reads_columns else 1
+    least[along] = max(least[along], int(np.ceil(motion.readout_time_s / NODE_STEP_S)) + 1)
+    across, down = (_spline(n, max(k, MIN_KNOTS)) for n, k in zip((profile.width, profile.height), least, strict=True))
+    at_knots = _path_nodes(motion, np.stack(np.meshgrid(across.x, down.x), -1).reshape(-1, 2), anchor)
+    nodes = at_knots.reshape(len(at_knots), -1)
+
+    def field(centres_px: Array) -> KernelField:
+        x, y = across(centres_px[:, 0]), down(centres_px[:, 1])
+        weights = (y[:, :, None] * x[:, None, :]).reshape(len(centres_px), -1)
+        return _field(motion, centres_px, (weights @ nodes).reshape(len(centres_px), *at_knots.shape[1:]), anchor)
+
+    return field
+
+
+def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float, inverse_depth: Any = None) -> Array:
+    """Displacements (n, k, 2) at evenly spaced instants of the exposure, ends included: a spline's nodes."""
     count = max(MIN_NODES, int(np.ceil(motion.exposure_s / NODE_STEP_S)) + 1)
     part = np.linspace(0.0, 1.0, count)
     gathered_s = motion.row_start_s(centres_px)[:, None] + part * motion.exposure_s
     points = np.broadcast_to(centres_px[:, None], (len(centres_px), count, 2))
     if inverse_depth is not None:
         inverse_depth = np.broadcast_to(np.asarray(inverse_depth, float)[..., None], gathered_s.shape)
-    nodes_px = seen_by_rows(motion, points, gathered_s, anchor, inverse_depth, PIXELS_WITHIN_PX) - points
+    return seen_by_rows(motion, points, gathered_s, anchor, inverse_depth, PIXELS_WITHIN_PX) - points
+
+
+def _field(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: float) -> KernelField:
     length = np.linalg.norm(np.diff(nodes_px, axis=1), axis=-1).sum(axis=1).max(initial=0.0)
     samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_PX * 1.3 * length)))
-    paths_px = _between(count, samples) @ nodes_px
+    paths_px = _between(nodes_px.shape[1], samples) @ nodes_px
     light, sigma_px = _light(motion, centres_px, samples), motion.profile.extensions.defocus_sigma_px
     return KernelField(centres_px, paths_px, anchor, light, sigma_px)
+
+
+@lru_cache(maxsize=8)
+def _spline(length: int, knots: int) -> CubicSpline:
+    """Weights of so many evenly spaced knots from the first pixel to the last, as functions of the place."""
+    return CubicSpline(np.linspace(0.0, length - 1.0, knots), np.eye(knots))
 
 
 def _light(motion: RowMotion, centres_px: Array, samples: int) -> Array | None:

@@ -9,6 +9,8 @@ from virest.camera.profile import CameraProfile
 
 CONSISTENT, EXPLAINED, UNEXPLAINED = "consistent", "explained", "unexplained"
 GEOMETRY, PHOTOMETRY, BLUR = "geometry_rms_px", "photometric_rms", "blur_rms_px"
+JOINED = " + "
+"""Between the names of two causes that enter together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +96,15 @@ class Rung:
     """One step of the ladder: what was tried and what entered."""
 
     entered: str | None
-    """None: nothing gained enough."""
+    """A cause, or two that gain together only; None: nothing gained enough."""
     tried: dict[str, float]
     """Held-out rms with each candidate added."""
     before: float
     quantity: str
+
+    def has(self, name: str) -> bool:
+        """Whether a cause entered on this rung."""
+        return self.entered is not None and name in self.entered.split(JOINED)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,9 +19,9 @@ from scipy import stats
 
 from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
-from virest.capture.imu import ImuSamples
-from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
-from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
+from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
+from virest.diagnosis.findings import GEOMETRY, JOINED, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.geometric_effects import GeometricEffect
 from virest.diagnosis.geometric_evidence import (
     KNOWN_DEPTH_STD,
     Evidence,
@@ -29,23 +29,18 @@ from virest.diagnosis.geometric_evidence import (
     base_scene,
     capped_rms,
     depth_of,
-    distances,
-    fit_model,
-    free_scene,
-    loss,
-    relief_loss,
 )
-from virest.motion.scene_motion import InertialMotion
+from virest.diagnosis.trials import JUDGE_POINTS, Judged, Screened, best_of_each, judge, lagging_gain, screen, t_ratio
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term, TrackFit
-from virest.motion.track_model import TrackTable, ground, predict
+from virest.motion.track_model import TrackTable
 from virest.motion.tracking_bias import bias_std
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-SCREEN_POINTS, JUDGE_POINTS, FINAL_POINTS = 1500, 3500, 7000
+FINAL_POINTS = 7000
 PROMISING = 4
 MIN_T = 3.0
 """Least ratio of the blocks' mean gain to its standard error."""
@@ -56,10 +51,16 @@ MIN_GAIN = 0.004
 """Least part of the loss that a cause must take away on held-out blocks."""
 LARGE_GAIN, LARGE_MIN_T = 0.05, 1.7
 """So large a gain need not be so even (one-sided 5 %): stretches of time tell more or less of a cause."""
+FEEBLE_GAIN, ASTRAY_SCALE = 0.1, 1.25
+"""A cause that takes less than this part away, while points are so many times their noise from where the model puts
+them, is not what is wrong: two that gain little alone are then tried together."""
+PAIR_FIRSTS, PAIRS_JUDGED = 3, 3
+"""The best few alone, each beside all others, which it may hide; so many pairs are judged on held-out blocks."""
+PAIR_MIN_T = 2.3
+"""One-sided 5 % for the best of three."""
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 MAX_RUNGS = 5
-CLOCKS = ("time_offset", "clock_skew")
 PLAUSIBLE = {
     "time_offset": 2.0,
     "clock_skew": 0.03,
@@ -74,42 +75,7 @@ PLAUSIBLE = {
     "exposure_time": 1.5,
 }
 """Largest believable changes, in the units of the terms."""
-CONSTANT_EXPOSURE = 0.03
-"""Exposures within this part of their median are one."""
 STABILISER_CUTOFF_HZ = (0.03, 15.0)
-
-
-@dataclass(frozen=True, slots=True)
-class FarClock:
-    """Changes of a profile's clocks, beyond a fit's reach, at which the turns of pictures and gyroscope agree."""
-
-    offset_s: float = 0.0
-    """At the profile's own clock rate; 0: none."""
-    skewed_offset_s: float = 0.0
-    """At the rate changed by ``skew``."""
-    skew: float = 0.0
-
-    def start(self, name: str, profile: CameraProfile, offset_free: bool) -> CameraProfile | None:
-        """Where a fit of this effect might begin; a skew moves the offset along if that is fitted too."""
-        offset_s = profile.time_offset_s or 0.0
-        if name == "time_offset" and self.offset_s:
-            return replace(profile, time_offset_s=offset_s + self.offset_s)
-        if name == "clock_skew" and self.skew:
-            skewed_s = offset_s + self.skewed_offset_s if offset_free else offset_s
-            return replace(profile, time_offset_s=skewed_s, clock_skew=profile.clock_skew + self.skew)
-        return None
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """One cause at one starting point: the model to begin from and the terms it adds."""
-
-    name: str
-    model: Model
-    added: tuple[Term, ...]
-    effect: GeometricEffect | None
-    word: str = ""
-    terms_with: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,17 +135,17 @@ def climb(
     nominal_model = model
     accepted: list[Accepted] = []
     rungs: list[Rung] = []
+    course = _Course(evidence, nominal, lags, far or FarClock(), each)
     say(0.1)
     for number in range(max_rungs):
-        best, rung = _rung(evidence, nominal, model, accepted, lags, far or FarClock(), each)
+        step, rung = _rung(course, model, accepted)
         rungs.append(rung)
         say(0.1 + 0.8 * (number + 1) / MAX_RUNGS)
-        if best is None:
+        if step is None:
             break
-        model, entered = best
-        accepted.append(entered)
-        model, _ = _refitted(evidence, model, JUDGE_POINTS)
-        log.debug("rung %d: %s", number + 1, entered.name)
+        accepted += step.accepted
+        model, _ = _refitted(evidence, step.model, JUDGE_POINTS)
+        log.debug("rung %d: %s", number + 1, rung.entered)
     return _conclude(evidence, nominal_model, model, accepted, rungs, nominal)
 
 
@@ -193,243 +159,147 @@ def _refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, Tra
 
 
 @dataclass(frozen=True, slots=True)
-class _Judged:
-    candidate: Candidate
-    block_loss: Array
-    """(blocks,) mean held-out loss a point."""
-    pair_loss: Array
-    """(pairs,) the same."""
-    rms: float
-    """Held-out, in units of the typical noise."""
+class _Course:
+    """What is the same on all rungs."""
+
+    evidence: Evidence
+    nominal: CameraProfile
+    lags: Sequence[Schedule]
+    far: FarClock
+    each: Each
+
+    def candidates(self, model: Model, tried: set[str]) -> list[Candidate]:
+        """All causes not yet in a model."""
+        found = candidates_of(self.evidence, self.nominal, model, tried, self.lags, self.far)
+        return worth_beginning(self.evidence, model, found)
+
+    def judged(self, base: Screened, better: Sequence[Screened]) -> list[Judged]:
+        """The model without and with each cause, best first; losses by the smallest scale, that all can be compared."""
+        scale = min(entry.scale for entry in (base, *better))
+        spread = (better[0] if better else base).depth_spread_per_m
+        return judge(self.evidence, [entry.candidate for entry in (base, *better)], scale, spread, self.each)
 
 
-def _rung(
-    evidence: Evidence,
-    nominal: CameraProfile,
-    model: Model,
-    accepted: list[Accepted],
-    lags: Sequence[Schedule],
-    far: FarClock,
-    each: Each,
-) -> tuple[tuple[Model, Accepted] | None, Rung]:
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """What enters on a rung."""
+
+    model: Model
+    accepted: tuple[Accepted, ...]
+    part: float
+    """Of the held-out loss that it takes away."""
+
+
+def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, Rung]:
     tried = {entry.name for entry in accepted}
-    candidates = _candidates(evidence, nominal, model, tried, lags, far)
-    candidates = _worth_beginning(evidence, model, candidates)
-    base, *others = _screened(evidence, [Candidate("", model, (), None), *candidates], each)
-    screened = _best_of_each(others)
-    promising = sorted(screened, key=lambda s: s.loss)[:PROMISING]
-    promising = [entry for entry in promising if entry.loss < base.loss]
-    scale = min([base.scale, *(entry.scale for entry in promising)])
-    spread = (promising[0] if promising else base).depth_spread_per_m
-    before, *judged = _judge(evidence, [base.candidate, *(p.candidate for p in promising)], scale, spread, each)
-    table = {j.candidate.name: j.rms * evidence.typical_px for j in judged}
-    nothing = Rung(None, table, before.rms * evidence.typical_px, GEOMETRY)
+    nothing = Candidate("", model, (), None)
+    base, *others = screen(course.evidence, [nothing, *course.candidates(model, tried)], course.each)
+    better = [entry for entry in best_of_each(others) if entry.loss < base.loss]
+    before, *judged = course.judged(base, better[:PROMISING])
+    typical = course.evidence.typical_px
+    rung = Rung(None, {j.candidate.name: j.rms * typical for j in judged}, before.rms * typical, GEOMETRY)
+    step = _best_single(course.evidence, model, before, judged)
+    feeble = step is None or step.part < FEEBLE_GAIN
+    if feeble and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
+        pair = _best_pair(course, model, tried, base, better)
+        if pair is not None:
+            step, rung = pair, replace(rung, tried={**rung.tried, _names(pair): pair.accepted[0].after})
+    return step, rung if step is None else replace(rung, entered=_names(step))
+
+
+def _names(step: _Step) -> str:
+    return JOINED.join(entry.name for entry in step.accepted)
+
+
+def _best_single(evidence: Evidence, model: Model, before: Judged, judged: list[Judged]) -> _Step | None:
+    """The cause that takes most away where it was not fitted, if that holds."""
+    typical = evidence.typical_px
     for best in sorted(judged, key=lambda j: float(j.block_loss.mean())):
         gain = before.block_loss - best.block_loss
         if best.candidate.name == "frame_lag":
-            gain = _lagging_gain(evidence, before, best)
+            gain = lagging_gain(evidence, before, best)
         part = float(gain.mean() / before.block_loss.mean())
-        if part < MIN_GAIN or _t(gain) < (MIN_T if part < LARGE_GAIN else LARGE_MIN_T):
+        if part < MIN_GAIN or t_ratio(gain) < (MIN_T if part < LARGE_GAIN else LARGE_MIN_T):
             continue
         entered, p_value = _significant(evidence, best.candidate, model.profile)
         if entered is None:
             continue
         rivals = tuple(
-            Rival(other.candidate.name, other.rms * evidence.typical_px)
+            Rival(other.candidate.name, other.rms * typical)
             for other in judged
-            if other is not best and _t(other.block_loss - best.block_loss) < RIVAL_T
+            if other is not best and t_ratio(other.block_loss - best.block_loss) < RIVAL_T
             and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
         )  # fmt: skip
-        done = Accepted(
+        cause = Accepted(
             best.candidate.name, best.candidate.effect, best.candidate.word,
-            before.rms * evidence.typical_px, best.rms * evidence.typical_px, p_value, rivals,
+            before.rms * typical, best.rms * typical, p_value, rivals,
         )  # fmt: skip
-        return (entered, done), replace(nothing, entered=best.candidate.name)
-    return None, nothing
+        return _Step(entered, (cause,), part)
+    return None
 
 
-def _worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate]) -> list[Candidate]:
-    """Without far starts of the clocks that are further off than where the model stands: a fit would only come back."""
-    table = evidence.table(model, SCREEN_POINTS)
-    here = _off_px(evidence, model, table)
-    return [
-        candidate
-        for candidate in candidates
-        if candidate.name not in CLOCKS
-        or candidate.model.profile == model.profile
-        or _off_px(evidence, candidate.model, table) < here
-    ]
+def _best_pair(
+    course: _Course, model: Model, tried: set[str], base: Screened, better: Sequence[Screened]
+) -> _Step | None:
+    """Two causes that gain together what neither does alone, while points are far from where the model puts them.
 
-
-def _off_px(evidence: Evidence, model: Model, table: TrackTable) -> float:
-    """Median distance of the points from where a model puts them."""
-    known = ground(evidence.imu, model.profile, translation=isinstance(model.scene, InertialMotion))
-    off = table.second_px - predict(known, table, model.scene).second_px
-    return float(np.median(np.linalg.norm(off, axis=-1)))
-
-
-def _candidates(
-    evidence: Evidence,
-    nominal: CameraProfile,
-    model: Model,
-    tried: set[str],
-    lags: Sequence[Schedule],
-    far: FarClock,
-) -> list[Candidate]:
-    in_terms = {term.name for term in model.terms}
-    found: list[Candidate] = []
-    for effect in GEOMETRIC_EFFECTS:
-        if effect.name in tried or effect.name in in_terms or not _tells(evidence, effect):
+    A stabiliser hides the clocks' drift, and the drift blurs what the stabiliser does.
+    """
+    evidence, typical = course.evidence, course.evidence.typical_px
+    firsts = [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]
+    found: list[tuple[Candidate, Screened]] = []
+    for first in firsts:
+        with_it = replace(first.model, terms=(*first.model.terms, *first.added))
+        begun = course.candidates(with_it, {*tried, first.name})
+        seconds = [candidate for candidate in begun if candidate.added]
+        found += [(first, second) for second in best_of_each(screen(evidence, seconds, course.each))]
+    found = sorted(found, key=lambda pair: pair[1].loss)[:PAIRS_JUDGED]
+    if not found:
+        return None
+    before, *judged = course.judged(base, [second for _, second in found])
+    for (first, _), pair in sorted(
+        zip(found, judged, strict=True), key=lambda known: float(known[1].block_loss.mean())
+    ):
+        gain = before.block_loss - pair.block_loss
+        part = float(gain.mean() / before.block_loss.mean())
+        if part < FEEBLE_GAIN or t_ratio(gain) < PAIR_MIN_T:
             continue
-        if effect.term is None:
-            found += _words(effect, model)
-            continue
-        for values in (None, *effect.starts):
-            profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
-            found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
-        if (far_off := far.start(effect.name, nominal, "time_offset" in in_terms)) is not None:
-            clocks = replace(model.profile, time_offset_s=far_off.time_offset_s, clock_skew=far_off.clock_skew)
-            found.append(Candidate(effect.name, replace(model, profile=clocks), (effect.term,), effect))
-    found += _depths(evidence, model, tried)
-    if "frame_lag" not in tried:
-        found += [_lagging(model, *lag) for lag in lags]
-    return found
+        entered, fitted = _with(evidence, pair.candidate)
+        members = (first, pair.candidate)
+        p_values = [_p_value(evidence, fitted, member, entered.profile, model.profile) for member in members]
+        if max(p_values) < MAX_P:
+            causes = (
+                Accepted(member.name, member.effect, "", before.rms * typical, pair.rms * typical, p_value, ())
+                for member, p_value in zip(members, p_values, strict=True)
+            )
+            return _Step(entered, tuple(causes), part)
+    return None
 
 
-def _tells(evidence: Evidence, effect: GeometricEffect) -> bool:
-    """Whether points can tell this cause: an exposure's length only by its changes, otherwise it is an offset."""
-    return effect.name != "exposure_time" or varies(evidence.observed.exposure_s)
-
-
-def varies(exposure_s: Array) -> bool:
-    """Whether logged exposures (n,) differ enough to move rows by different times."""
-    middle = float(np.median(exposure_s))
-    return middle > 0 and float(np.ptp(exposure_s)) >= CONSTANT_EXPOSURE * middle
-
-
-def _words(effect: GeometricEffect, model: Model) -> list[Candidate]:
-    assert effect.with_word is not None
-    now = next(iter(effect.read(model.profile).values()))
-    return [
-        Candidate(effect.name, replace(model, profile=effect.with_word(model.profile, word)), (), effect, word)
-        for word in effect.words
-        if word != now
-    ]
-
-
-def _depths(evidence: Evidence, model: Model, tried: set[str]) -> list[Candidate]:
-    depth_m = model.profile.depth_m
-    if "scene_depth" in tried or depth_m is None:
-        return []
-    scene = free_scene(evidence, model.profile, evidence.table(model, SCREEN_POINTS))
-    if scene is None:
-        return []
-    return [Candidate("scene_depth", replace(model, scene=scene), (), None)]
-
-
-def _lagging(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...]) -> Candidate:
-    extensions = replace(model.profile.extensions, frame_lag_s=lag_s, frame_lag_frames=frames)
-    return Candidate(
-        "frame_lag", replace(model, profile=replace(model.profile, extensions=extensions), lag=by_frame), (), None
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Screened:
-    """A candidate with its model fitted to all blocks, with few points."""
-
-    loss: float
-    candidate: Candidate
-    scale: float
-    depth_spread_per_m: float
-
-
-def _screened(evidence: Evidence, candidates: Sequence[Candidate], each: Each) -> list[_Screened]:
-    tables = {
-        lag: evidence.table(model, SCREEN_POINTS) for lag, model in {c.model.lag: c.model for c in candidates}.items()
-    }
-    calls = [(evidence.imu, tables[c.model.lag], c.model, (*c.model.terms, *c.added)) for c in candidates]
-    found = each(_screen, calls)
-    return [_Screened(s[0], replace(c, model=s[1]), s[2], s[3]) for c, s in zip(candidates, found, strict=True)]
-
-
-def _screen(
-    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term]
-) -> tuple[float, Model, float, float]:
-    """Loss, fitted model, scale and spread of depths of one candidate."""
-    fitted = fit_model(imu, model, terms, table)
-    found = replace(model, profile=fitted.profile, scene=fitted.scene)
-    return relief_loss(fitted), found, fitted.scale, fitted.depth_spread_per_m
-
-
-def _best_of_each(screened: list[_Screened]) -> list[_Screened]:
-    best: dict[str, _Screened] = {}
-    for entry in screened:
-        name = entry.candidate.name
-        if name not in best or entry.loss < best[name].loss:
-            best[name] = entry
-    return list(best.values())
-
-
-def _judge(
-    evidence: Evidence, candidates: Sequence[Candidate], scale: float, depth_spread_per_m: float, each: Each
-) -> list[_Judged]:
-    """Fit on every other block, judge on those between, and the other way round."""
-    tables = [evidence.table(candidate.model, JUDGE_POINTS) for candidate in candidates]
-    calls = [
-        (evidence.imu, table, c.model, (*c.model.terms, *c.added), evidence.block % 2 == fold, depth_spread_per_m)
-        for c, table in zip(candidates, tables, strict=True)
-        for fold in (0, 1)
-    ]
-    halves = each(_held_out, calls)
-    judged = []
-    for candidate, table, first, second in zip(candidates, tables, halves[::2], halves[1::2], strict=True):
-        distance = np.where(evidence.block[table.pair] % 2 == 0, second, first)
-        block = evidence.block[table.pair]
-        mean = loss(distance, scale)
-        by_pair = np.bincount(table.pair, mean) / np.maximum(np.bincount(table.pair), 1)
-        by_block = np.bincount(block, mean) / np.maximum(np.bincount(block), 1)
-        judged.append(_Judged(candidate, by_block, by_pair, capped_rms(distance)))
-    return judged
-
-
-def _held_out(
-    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, depth_spread_per_m: float
-) -> Array:
-    """Distances (n,) of all points from a fit on the pairs in ``use`` (pairs,)."""
-    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]))
-    return distances(imu, fitted, table, depth_spread_per_m)
-
-
-def _lagging_gain(evidence: Evidence, before: _Judged, after: _Judged) -> Array:
-    """Gain of the pairs that a start-up schedule moves; nothing of it was fitted, so each pair is a judge."""
-    last = after.candidate.model.profile.extensions.frame_lag_frames
-    moved = np.array([pair.first <= last for pair in evidence.observed.pairs])
-    both = min(len(before.pair_loss), len(after.pair_loss), len(moved))
-    gain: Array = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
-    return gain
-
-
-def _t(values: Array) -> float:
-    """Mean over its standard error."""
-    if len(values) < 3:
-        return 0.0
-    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))
+def _with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
+    """The model with the candidate in it, fitted anew."""
+    return _refitted(evidence, replace(candidate.model, terms=(*candidate.model.terms, *candidate.added)), JUDGE_POINTS)
 
 
 def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile) -> tuple[Model | None, float]:
     """The model with the candidate in it, if its value is, and the probability that it is nought."""
-    model = replace(candidate.model, terms=(*candidate.model.terms, *candidate.added))
-    model, fitted = _refitted(evidence, model, JUDGE_POINTS)
+    model, fitted = _with(evidence, candidate)
     if candidate.name == "scene_depth":
         p_value = depth_p(fitted, evidence.table(model, JUDGE_POINTS), before.depth_m)
-    elif candidate.effect is None or candidate.effect.term is None:
-        p_value = SURE
-    elif not is_plausible(candidate.effect, model.profile, total_change(candidate.effect, before, model.profile)):
-        return None, 1.0
     else:
-        p_value = p_of(fitted, candidate.effect, model.profile, before, evidence.typical_px)
+        p_value = _p_value(evidence, fitted, candidate, model.profile, before)
     return (model if p_value < MAX_P else None), p_value
+
+
+def _p_value(
+    evidence: Evidence, fitted: TrackFit, candidate: Candidate, found: CameraProfile, before: CameraProfile
+) -> float:
+    """Probability that a candidate's value is nought; 1 where no phone is like that."""
+    if candidate.effect is None or candidate.effect.term is None:
+        return SURE
+    if not is_plausible(candidate.effect, found, total_change(candidate.effect, before, found)):
+        return 1.0
+    return p_of(fitted, candidate.effect, found, before, evidence.typical_px)
 
 
 def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float:
@@ -489,7 +359,7 @@ def _conclude(
         log.debug("no longer significant: %s", [entry.name for entry in weak])
         accepted = [entry for entry in accepted if entry is not weak[0]]
         model = _without(model, nominal_model, weak[0])
-    if len(accepted) < entered:
+    if len(accepted) < entered or any(JOINED in (rung.entered or "") for rung in rungs):
         accepted = [_rejudged(evidence, model, nominal_model, entry, fitted) for entry in accepted]
     nominal_table = evidence.table(nominal_model, FINAL_POINTS)
     nominal_fit = evidence.fit(nominal_model, nominal_model.terms, nominal_table)
@@ -502,12 +372,15 @@ def _conclude(
 
 
 def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted, fitted: TrackFit) -> Accepted:
-    """The cause with what it gains held out beside those that stayed: rungs with a departed one told otherwise."""
+    """The cause with what it gains held out beside those that stayed.
+
+    With one that left, or as one of a pair, it gained something else on its rung.
+    """
     if entry.effect is None or entry.effect.term is None:
         return entry
     less, _ = _refitted(evidence, _without(model, nominal, entry), SCREEN_POINTS)
     without_and_with = [Candidate("", m, (), None) for m in (less, model)]
-    before, after = _judge(evidence, without_and_with, fitted.scale, fitted.depth_spread_per_m, one_by_one)
+    before, after = judge(evidence, without_and_with, fitted.scale, fitted.depth_spread_per_m, one_by_one)
     return replace(entry, before=before.rms * evidence.typical_px, after=after.rms * evidence.typical_px, rivals=())
 
 

@@ -52,6 +52,9 @@ MAX_GAIN_FRAMES = 3000
 SAME_SPREAD = 0.05
 """Stretches whose log exposure × ISO spreads alike to this tell the curve alike."""
 MIN_OBSERVATIONS = 300
+CURVE, MOST_KEPT = ("response_curve", "black_level"), 0.45
+"""An encoder that keeps so much of the last picture keeps more of dark patches than of bright ones, whatever the curve:
+a black level then only stands in for that."""
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
 MIXING_P = 1.5e-3
@@ -169,7 +172,7 @@ def climb_observations(
     verdict.photometric_rms = normalised_rms(observations, nominal)[0]
     effects = photometric_effects(observations, movie_frames)
     if not light_varies(observations):
-        effects = tuple(e for e in effects if e.name not in ("response_curve", "black_level"))
+        effects = tuple(e for e in effects if e.name not in CURVE)
     accepted: list[PhotometricEffect] = []
     plain = fit_photometry(observations, nominal, ())
     for _ in range(MAX_RUNGS):
@@ -214,7 +217,7 @@ def _rung(
     for name in order[:2]:
         effect = next(e for e in effects if e.name == name)
         p_value = significance(fits[name], name, observations)[1]
-        if fits[name].cost >= plain.cost or p_value > MAX_P:
+        if fits[name].cost >= plain.cost or p_value > MAX_P or (name in CURVE and fits[name].memory > MOST_KEPT):
             continue
         held_out = judge(observations, nominal, [*accepted, effect], each)
         log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)

@@ -13,9 +13,10 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.degradation.light import flicker
+from virest.diagnosis.candidates import FarClock
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
-from virest.diagnosis.geometric_ladder import FarClock, GeometricVerdict, climb
+from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
 from virest.diagnosis.picture_ladder import Reader
 from virest.motion import profile_terms as terms_of
 from virest.motion.coarse_alignment import align_coarsely, align_with_skew

@@ -23,7 +23,7 @@ STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
 STRUCTURE_P = 1e-4
 TRACKING_BIAS_PX = 0.02
 SCALE_EXCESS = 1.25
-"""Differences this many times their noise, measured without the model, are not all noise."""
+"""Differences this many times their noise, measured without the model, and STRUCTURE_PX beyond it are not all noise."""
 LEAST_IN_PAIR = 8
 STRAY_DISTANCE = 6.0
 CALM = 40.0
@@ -42,7 +42,11 @@ def remaining_structure(geometric: GeometricVerdict, photometric: picture_ladder
 
 
 def points_left(geometric: GeometricVerdict) -> Remaining:
-    """Structure and noise beyond tracking's in the points of the final model."""
+    """Structure and noise beyond tracking's in the points of the final model.
+
+    What stands before or behind the scene's plane moves points along the parallax: as far as their spread of depths
+    explains that, it is the scene's and no fault of the model.
+    """
     fitted, table = geometric.fit, geometric.table
     profile, lens = fitted.profile, fitted.profile.intrinsics
     assert lens is not None
@@ -50,8 +54,9 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     from_centre = table.second_px - np.array([lens.cx_px, lens.cy_px])
     radius = np.linalg.norm(from_centre, axis=-1)
     outwards = from_centre / np.maximum(radius, 1.0)[:, None]
-    radial = (fitted.difference_px * outwards).sum(axis=-1)
-    difference = np.concatenate([fitted.difference_px, radial[:, None]], axis=-1)
+    left_px = fitted.across_relief_px()
+    radial = (left_px * outwards).sum(axis=-1)
+    difference = np.concatenate([left_px, radial[:, None]], axis=-1)
     second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
     covariates = {
         "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
@@ -61,18 +66,19 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
         "rate": np.linalg.norm(fitted.ground.trajectory.rate_rad_s(second_s), axis=-1),
     }
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
-    found.append(_along_time(fitted.difference_px, fitted.weight, table.pair))
+    found.append(_along_time(left_px, fitted.weight, table.pair))
     strongest = max(found, key=lambda s: s.size)
     stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.astray)
     limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
-    excess = geometric.final_rms_px / max(noise, 1e-9)
-    log.debug("left: %s, limit %.3f, excess %.3f, stray %.3f", found, limit, excess, stray)
+    beyond = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
+    noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * noise
+    log.debug("left: %s, limit %.3f, beyond noise %.3f, stray %.3f", found, limit, beyond, stray)
     structured = strongest.size > limit and strongest.p_value < STRUCTURE_P
-    significant = structured or excess > SCALE_EXCESS or stray > STRAY_PART
+    significant = structured or noisier or stray > STRAY_PART
     along = strongest.along
     size = strongest.size
-    if not structured and excess > SCALE_EXCESS:
-        size = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
+    if not structured and noisier:
+        size = beyond
     if not structured and stray > STRAY_PART:
         along = "place"
     p_value = strongest.p_value

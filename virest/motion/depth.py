@@ -135,11 +135,13 @@ def triangulate_relief(known: Ground, scene: InertialMotion, table: TrackTable) 
     sights = _sights(known, scene, table, RELIEF_PASSES, RELIEF_REACH)
     expected = sights.points.inverse_depth_per_m - sights.above_per_m
     std = sights.points.std_per_m
-    far = np.maximum(sights.points.inverse_depth_per_m, FARTHEST * expected)
     good = (std < MAX_RELATIVE_STD * expected) & (sights.points.inverse_depth_per_m > -2 * std)
-    place = sights.from_m + (sights.points.place_m - sights.from_m) * (sights.points.inverse_depth_per_m / far)[:, None]
-    sights = replace(sights, points=replace(sights.points, place_m=place, inverse_depth_per_m=far))
-    return sights.chosen(good & (sights.across < MAX_ACROSS))
+    good &= sights.across < MAX_ACROSS
+    sights, expected = sights.chosen(good), expected[good]
+    depth = sights.points.inverse_depth_per_m
+    far = np.maximum(depth, FARTHEST * expected)
+    place = sights.from_m + (sights.points.place_m - sights.from_m) * (depth / far)[:, None]
+    return replace(sights, points=replace(sights.points, place_m=place, inverse_depth_per_m=far))
 
 
 def _sights(known: Ground, scene: InertialMotion, table: TrackTable, passes: int, reach: float) -> Sights:

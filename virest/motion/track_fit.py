@@ -112,6 +112,15 @@ class TrackFit:
         along = (left * way).sum(axis=-1)
         return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
 
+    def across_relief_px(self) -> Array:
+        """Differences (n, 2) in px, along the parallax only what the points' spread of depths does not explain."""
+        if self.along_px is None:
+            return self.difference_px
+        length = np.linalg.norm(self.along_px, axis=-1)
+        way = self.along_px / np.maximum(length, 1e-12)[:, None]
+        shrink = 1 - 1 / np.sqrt(1 + (self.depth_spread_per_m * length / self.noise_px) ** 2)
+        return self.difference_px - (shrink * (self.difference_px * way).sum(axis=-1))[:, None] * way
+
     def relief_cost(self) -> Array:
         """What the points' spread of depths costs in the likelihood (n,): the logarithm of their standard deviation."""
         if self.along_px is None:

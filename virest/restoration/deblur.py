@@ -27,7 +27,7 @@ CLIPPED_LEVELS = 2.0
 """A pixel this close to the top was clipped."""
 PULLED_DOWN_LEVELS = 8.0
 """Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
-COLOUR_SCALE, COARSE_COLOUR_SCALE = 2.0, 3.0
+COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 3
 COLOUR_TILE_PX = 384
 """Colour differences hold so little detail that kernels need not follow the paths as closely, nor pixels the movie's.
 
@@ -43,14 +43,21 @@ FEW_ITERATIONS, FEW_SCALE = 2, 0.6
 REDUCTIONS = (1.5, 4 / 3)
 """A picture so many times smaller serves few iterations as well, where noise hides all finer detail."""
 Surroundings = tuple[float, int, int]
-FULL_MARGIN, THIN_MARGIN = (1.0, 16, 16), (0.75, 9, 12)
-"""What a tile sees around it, per length of the blur path, and at least, px; and the least length of its bridge.
+FULL_MARGIN, THIN_MARGIN, THINNEST_MARGIN = (0.0, 16, 16), (0.3, 4, 16), (0.3, 3, 12)
+"""What a tile sees around it is as long as the blur path, less this part of the tiles' overlap; its least length, px;
+and the least length of the tile's bridge.
 
-The bridge is as long as the path: a steep one is an edge that the deconvolution carries into the tile.  Thin margins,
-for reduced pictures, cost 0.1 dB.
+The bridge is as long as the path: a steep one is an edge that the deconvolution carries into the tile.  Where tiles
+overlap widely, a window's ramp gives next to no weight to what a margin would keep away; the thinnest margins are for
+pictures that are reduced.
 """
-COARSE_OVERLAP, FINE_OVERLAP = 6, 4
-"""Tiles overlap by this part of their side, those of colour and those of luma."""
+COARSE_OVERLAP, FINE_OVERLAP, WIDE_OVERLAP = 6, 4, 3
+"""Tiles overlap by this part of their side: those of colour, those of luma, and those of luma in few iterations."""
+MOST_WRONG, LEAST_TILE, FIELD_SAMPLES = 0.7, 0.7, (6, 5)
+"""Error in noises that a tile's kernel may make of edges half a step away; part of the preset's side to which tiles
+shrink for it; rows and columns of places at which the kernels' change is looked at."""
+OVERLAP_GIVE = 0.1
+"""Wide overlaps may be narrower by so much, where fewer tiles then reach to the picture's edge."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
 """Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
 START_ITERATIONS, SETTLED_BETA = 5, 0.3
@@ -68,10 +75,13 @@ LINEAR_SHARE = 0.5
 """Part of such a picture that is the linear filter's: its gradients are not sparse, the prior makes them steps."""
 WEIGHED_PX = 5
 """Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
-SHRUNK_PARTS = 8
-"""Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more."""
-SlopeMaker = Callable[[int, int], Image]
+SHRUNK_PARTS, LOOKED_AT = 8, 4
+"""Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more; of the rows that fall
+on such a pixel so many are looked at, or a few more."""
+SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
+LightOfRows = Callable[[slice], list[Image]]
+"""Light of each channel over some rows of a picture, (rows, width): what is made band by band stays in the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +93,7 @@ class BlurredPicture:
     slopes: SlopeMaker
     """Grey levels per unit of light of a channel, by its number, over neighbourhoods of a side in pixels.
 
-    (height, width); see :func:`_slopes_around`.
+    As a picture of a given (width, height); see :func:`_slopes_around`.
     """
     dark: list[Image | None]
     """1.0 where a channel's light was too little to be measured; None: nowhere."""
@@ -96,6 +106,8 @@ class BlurredPicture:
     """Kernels at given tile centres."""
     longest_px: float
     """Longest blur path in the picture."""
+    holes: Image | None
+    """1.0 where light is clipped in all channels, and in any beside such; None: nowhere; see :func:`_holes`."""
 
 
 def blurred_picture(
@@ -111,14 +123,14 @@ def blurred_picture(
     dark = [_dark(channel, curve) for channel in channels]
     clipped = [_clipped(channel, curve) for channel in channels]
 
-    def slopes(channel: int, side_px: int) -> Image:
-        return _slopes_around(light[channel], curve, side_px)
+    def slopes(channel: int, side_px: int, size: tuple[int, int]) -> Image:
+        return _slopes_around(light[channel], curve, side_px, size)
 
-    return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px)
+    return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px, _holes(clipped, longest_px))
 
 
-def _slopes_around(light: Image, curve: ResponseCurve, side_px: int) -> Image:
-    """The curve's slope at a neighbourhood's mean light, (height, width).
+def _slopes_around(light: Image, curve: ResponseCurve, side_px: int, size: tuple[int, int]) -> Image:
+    """The curve's slope at a neighbourhood's mean light, as a picture of ``size`` (width, height).
 
     Grey levels have about the same noise everywhere; in light that is their noise over the curve's slope, so that
     nearly all of it is in what is bright, and so is most of the mean light.  A deconvolution that weighs all pixels of
@@ -126,10 +138,11 @@ def _slopes_around(light: Image, curve: ResponseCurve, side_px: int) -> Image:
     """
     height, width = light.shape
     shrunk = max(1, side_px // SHRUNK_PARTS)
-    size, side = (max(1, width // shrunk), max(1, height // shrunk)), max(1, side_px // shrunk)
-    around = cv2.blur(cv2.resize(light, size, interpolation=cv2.INTER_AREA), (side, side))
+    few, side = (max(1, width // shrunk), max(1, height // shrunk)), max(1, side_px // shrunk)
+    rows = light[:: max(1, shrunk // LOOKED_AT)]
+    around = cv2.blur(cv2.resize(rows, few, interpolation=cv2.INTER_AREA), (side, side))
     slopes = cv2.LUT(np.rint(255 * curve.encode(around)).astype(np.uint8), _measured_slopes(curve))
-    return cv2.resize(slopes, (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(slopes, size, interpolation=cv2.INTER_LINEAR)
 
 
 @functools.lru_cache(maxsize=8)
@@ -164,9 +177,9 @@ def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArra
     return (cv2.inRange(picture, (0, 0, 0), (brightest,) * 3) == 0).view(np.uint8)
 
 
-def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     """The sharp picture's light, channel by channel, at the kernels' anchor."""
-    methods: dict[str, Callable[[BlurredPicture, RestorationSettings], list[Image]]] = {
+    methods: dict[str, Callable[[BlurredPicture, RestorationSettings], LightOfRows]] = {
         "inverse": _by_tile_filter,
         "wiener": _by_tile_filter,
         "gradient-wiener": _by_tile_filter,
@@ -179,12 +192,20 @@ def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image
     return _with_unseen_kept(methods[settings.deblur](blurred, settings), blurred)
 
 
-def _with_unseen_kept(sharp: list[Image], blurred: BlurredPicture) -> list[Image]:
+def _with_unseen_kept(sharp: LightOfRows, blurred: BlurredPicture) -> LightOfRows:
     """The recorded light where nothing says more."""
-    for plane, light, unseen in zip(sharp, blurred.light, unseen_masks(blurred), strict=True):
-        if unseen is not None:
-            cv2.copyTo(light, unseen, plane)
-    return sharp
+    masks = unseen_masks(blurred)
+    if all(mask is None for mask in masks):
+        return sharp
+
+    def kept(rows: slice) -> list[Image]:
+        planes = sharp(rows)
+        for plane, light, unseen in zip(planes, blurred.light, masks, strict=True):
+            if unseen is not None:
+                cv2.copyTo(light[rows], unseen[rows], plane)
+        return planes
+
+    return kept
 
 
 def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
@@ -206,7 +227,27 @@ def _luma_tiles(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture."""
-    return _tile_deconvolution(blurred, settings.tile_px, FINE_OVERLAP, around=around)
+    if around is FULL_MARGIN:
+        return _tile_deconvolution(blurred, settings.tile_px, FINE_OVERLAP, around=around)
+    side = int(np.clip(_kernel_holds_px(blurred), LEAST_TILE * settings.tile_px, settings.tile_px))
+    return _tile_deconvolution(blurred, side, WIDE_OVERLAP, around=around)
+
+
+def _kernel_holds_px(blurred: BlurredPicture) -> float:
+    """Side of a tile at whose middle's kernel half a step away, a third of its side, moves edges by a noise's worth.
+
+    Paths change over the picture as the camera rolls and as the rows go by; under noise that matters less.
+    """
+    height, width = blurred.light[0].shape
+    y, x = (
+        (np.arange(count) + 0.5) * length / count for count, length in zip(FIELD_SAMPLES, (height, width), strict=True)
+    )
+    field = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+    paths_px = field.paths_px[:, ::4].reshape(len(y), len(x), -1, 2)
+    changes = [np.diff(paths_px, axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
+    per_px = np.sqrt(0.5 * sum(np.mean(np.linalg.norm(c, axis=-1).mean(-1)) ** 2 for c in changes))
+    wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
+    return float(3 * wrong_px / max(per_px, 1e-6))
 
 
 def _tile_deconvolution(
@@ -218,16 +259,19 @@ def _tile_deconvolution(
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture, or over one that is ``scale`` times smaller, with kernels to its measure."""
     height, width = (int(np.ceil(length / scale)) for length in blurred.light[0].shape)
-    per_path, least_margin_px, least_bridge_px = around
-    margin = int(np.clip(per_path * blurred.longest_px / scale, least_margin_px / scale, 96))
+    per_overlap, least_margin_px, least_bridge_px = around
+    seen_px = blurred.longest_px - per_overlap * side / overlap_parts
+    margin = int(np.clip(seen_px / scale, least_margin_px / scale, 96))
     bridge = int(np.clip(blurred.longest_px / scale, least_bridge_px / scale, 96))
-    grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts)
+    give = OVERLAP_GIVE if overlap_parts == WIDE_OVERLAP else 0.0
+    grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts, give)
     field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
     kernels = field.scaled(1 / scale).arrays()
-    return tiles.TileDeconvolution(grid, kernels, margin, bridge)
+    held = kernels.shape[1] // 2 + 1 - (0 if around is FULL_MARGIN else grid.side // 2)
+    return tiles.TileDeconvolution(grid, kernels, max(margin, held), bridge)
 
 
-def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     deconvolution = _luma_tiles(blurred, settings)
     projected = _projected_luma(blurred, deconvolution, settings)
     factors = _tile_factors(deconvolution, settings, blurred.statistics)
@@ -280,7 +324,7 @@ def _luma(light: list[Image]) -> Image:
     return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, 1 - LUMA_RED - LUMA_BLUE, 0.0))
 
 
-def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> list[Image]:
+def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> LightOfRows:
     """Red, green and blue of a sharp luma and the colour differences, which hold little detail.
 
     These are filtered at half size or less, since a movie stores no more of them, by the measured Wiener filter.
@@ -289,30 +333,53 @@ def _with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSet
     scale = COLOUR_SCALE if settings.iterations > FEW_ITERATIONS else COARSE_COLOUR_SCALE
     deconvolution = _tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, scale)
     ratios = _noise_to_signal(deconvolution, settings, blurred.chroma, scale)
+    size = (scale * deconvolution.grid.width, scale * deconvolution.grid.height)
     red, blue = (
         cv2.resize(
             deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(plane), *ratios)),
-            (width, height),
+            size,
             interpolation=cv2.INTER_LINEAR,
-        )
-        for plane in _small_differences(blurred, deconvolution.grid)
+        )[:height, :width]
+        for plane in _small_differences(blurred, scale)
     )
     green_luma = 1 - LUMA_RED - LUMA_BLUE
-    green = cv2.scaleAdd(blue, -LUMA_BLUE / green_luma, cv2.scaleAdd(red, -LUMA_RED / green_luma, sharp))
-    return [cv2.add(sharp, red), green, cv2.add(sharp, blue)]
+
+    def light(rows: slice) -> list[Image]:
+        luma, more_red, more_blue = sharp[rows], red[rows], blue[rows]
+        green = cv2.scaleAdd(more_red, -LUMA_RED / green_luma, luma)
+        cv2.scaleAdd(more_blue, -LUMA_BLUE / green_luma, green, green)
+        return [cv2.add(luma, more_red), green, cv2.add(luma, more_blue)]
+
+    return light
 
 
-def _small_differences(blurred: BlurredPicture, grid: TileGrid) -> list[Image]:
-    """Red and blue less luma, at the grid's size; clipped ones, which show no colour, from around them."""
-    size = (grid.width, grid.height)
-    red, green, blue = (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in blurred.light)
+def _small_differences(blurred: BlurredPicture, scale: int) -> list[Image]:
+    """Red and blue less luma, ``scale`` times smaller; clipped ones, which show no colour, from around them."""
+    red, green, blue = (_block_means(plane, scale) for plane in blurred.light)
     luma = _luma([red, green, blue])
     differences = [cv2.subtract(plane, luma) for plane in (red, blue)]
-    holes = _holes(blurred)
+    holes = blurred.holes
     if holes is None:
         return differences
-    known = 1 - cv2.resize(cv2.dilate(holes, np.ones((3, 3), np.uint8)), size, interpolation=cv2.INTER_AREA)
+    known = 1 - _block_means(cv2.dilate(holes, np.ones((3, 3), np.uint8)), scale)
     return _filled_in(differences, known)
+
+
+def _block_means(plane: Image, side: int) -> Image:
+    """Means over squares of whole pixels, the last ones smaller: an area's mean of other sides takes twice as long."""
+    height, width = plane.shape
+    means = np.empty((-(-height // side), -(-width // side)), np.float32)
+    for rows in _blocks(height, side):
+        for columns in _blocks(width, side):
+            part = means[rows.start // side : -(-rows.stop // side), columns.start // side : -(-columns.stop // side)]
+            part[:] = cv2.resize(plane[rows, columns], part.shape[::-1], interpolation=cv2.INTER_AREA)
+    return means
+
+
+def _blocks(length: int, side: int) -> list[slice]:
+    """Where the whole pieces of ``side`` are, and where the rest is."""
+    whole = length - length % side
+    return [part for part in (slice(0, whole), slice(whole, length)) if part.stop > part.start]
 
 
 def _filled_in(planes: list[Image], known: Image) -> list[Image]:
@@ -332,25 +399,25 @@ def _filled_in(planes: list[Image], known: Image) -> list[Image]:
 # ── clipped light ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _holes(blurred: BlurredPicture) -> Image | None:
+def _holes(clipped: list[Image | None], longest_px: float) -> Image | None:
     """1.0 where light is clipped in all channels, and in any beside such: what is recorded there is no measurement.
 
     A lamp is far too bright for all channels, and its rim for some.  Where nothing around has more than one channel
     clipped it is a vivid surface: the others show its colour, and nearly all of its light was measured.
     """
-    masks = [mask for mask in blurred.clipped if mask is not None]
-    if len(masks) < len(blurred.clipped):
+    masks = [mask for mask in clipped if mask is not None]
+    if len(masks) < len(clipped):
         return None
     white = functools.reduce(cv2.min, masks)
     if not cv2.hasNonZero(white):
         return None
-    side = 2 * int(np.ceil(blurred.longest_px / 2 + CODEC_REACH_PX)) + 1
+    side = 2 * int(np.ceil(longest_px / 2 + CODEC_REACH_PX)) + 1
     return cv2.min(functools.reduce(cv2.max, masks), cv2.dilate(white, np.ones((side, side), np.uint8)))
 
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:
     """1 where the blur path touches clipped light, falling to 0 over a path's length beyond; None: nothing clipped."""
-    holes = _holes(blurred)
+    holes = blurred.holes
     if holes is None:
         return None
     touched = cv2.dilate(holes.astype(np.uint8), _path_reach(blurred))
@@ -382,7 +449,7 @@ def measured_share(blurred: BlurredPicture) -> Image | None:
 
     Thin things on a clipped background lie within the margins of the holes: next to nothing of them was measured.
     """
-    holes = _holes(blurred)
+    holes = blurred.holes
     if holes is None:
         return None
     side = 2 * int(np.ceil(blurred.longest_px)) + MEASURED_OVER_PX
@@ -400,24 +467,25 @@ def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
 
 def _projected_luma(
     blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
-) -> list[Image]:
-    """Spectrum of Kᵀ g of each tile; tiles with clipped light are tamed."""
-    luma, holes = _luma(blurred.light), _holes(blurred)
+) -> Image:
+    """Spectra of Kᵀ g, (tiles, size, size); tiles with clipped light are tamed."""
+    luma, holes = _luma(blurred.light), blurred.holes
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
         deconvolution.tame(numbers, kernels, luma, _measured_part(holes), float(luma.max()))
-    return list(deconvolution.back_projected(luma))
+    return deconvolution.back_projected(luma)
 
 
-def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
     times = _reduction(blurred.statistics, settings)
     if times == 1.0:
-        return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings), settings)
+        around = THIN_MARGIN if settings.iterations <= FEW_ITERATIONS else FULL_MARGIN
+        return _with_colour(blurred, _tile_hyper_laplacian(blurred, settings, around), settings)
     height, width = blurred.light[0].shape
     small = replace(settings, tile_px=round(settings.tile_px / times))
-    sharp = _tile_hyper_laplacian(_reduced(blurred, times), small, THIN_MARGIN)
+    sharp = _tile_hyper_laplacian(_reduced(blurred, times), small, THINNEST_MARGIN)
     return _with_colour(blurred, cv2.resize(sharp, (width, height), interpolation=cv2.INTER_CUBIC), settings)
 
 
@@ -432,13 +500,13 @@ def _reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
     height, width = blurred.light[0].shape
     size = (max(round(width / times), 1), max(round(height / times), 1))
 
-    def slopes(channel: int, side_px: int) -> Image:
-        return cv2.resize(blurred.slopes(channel, round(side_px * times)), size, interpolation=cv2.INTER_LINEAR)
+    def slopes(channel: int, side_px: int, asked: tuple[int, int]) -> Image:
+        return blurred.slopes(channel, round(side_px * times), asked)
 
     def field(centres_px: NDArray[np.float64]) -> KernelField:
         return blurred.field((centres_px + 0.5) * times - 0.5).scaled(1 / times)
 
-    luma, holes = cv2.resize(_luma(blurred.light), size, interpolation=cv2.INTER_LINEAR), _holes(blurred)
+    luma, holes = cv2.resize(_luma(blurred.light), size, interpolation=cv2.INTER_LINEAR), blurred.holes
     if holes is not None:
         holes = (cv2.resize(holes, size, interpolation=cv2.INTER_AREA) > 0).astype(np.float32)
     return replace(
@@ -447,6 +515,7 @@ def _reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
         slopes=slopes,
         dark=[None] * 3,
         clipped=[holes] * 3,
+        holes=holes,
         statistics=blurred.statistics.scaled(1 / times),
         field=field,
         longest_px=blurred.longest_px / times,
@@ -467,7 +536,7 @@ def _tile_hyper_laplacian(
     ratios = _noise_to_signal(deconvolution, settings, start)
     linear = sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
     emptier = _emptier(statistics, deconvolution.size)
-    before, scale = sharp, blurred.slopes(1, settings.tile_px) * np.float32(1.0 / unit)
+    before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
     for step, beta in enumerate(_beta_schedule(settings.iterations)):
         ahead, before = _further_on(sharp, before, step), sharp
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
@@ -514,7 +583,7 @@ def _border_noise(blurred: BlurredPicture) -> float:
 
 
 def _returned_residual(
-    deconvolution: tiles.TileDeconvolution, projected: list[Image], sharp: Image, statistics: PictureStatistics
+    deconvolution: tiles.TileDeconvolution, projected: Image, sharp: Image, statistics: PictureStatistics
 ) -> Image:
     """Fine texture that the prior took for noise: the residual g − K f, filtered as a picture of little power."""
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
@@ -574,7 +643,7 @@ def _extended(channel: Image, border: int) -> Image:
     return cv2.copyMakeBorder(channel, border, border, border, border, cv2.BORDER_REPLICATE)
 
 
-def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     operator = _whole_operator(blurred, positive=True)
     sharp = []
     for light, dark, clipped in zip(blurred.light, blurred.dark, blurred.clipped, strict=True):
@@ -582,21 +651,22 @@ def _by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) 
         start = _extended(light, operator.border)
         result = richardson_lucy(light, operator.apply, operator.adjoint, start, weight, settings.iterations)
         sharp.append(_inner(result, operator.border))
-    return sharp
+    return lambda rows: [plane[rows].copy() for plane in sharp]
 
 
-def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> list[Image]:
+def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
     """Luma over the whole operator, where censored pixels have no weight; colour as in tiles, all that a movie stores.
 
     Near clipped light the tiles' solution stays: its lamps were found with light held positive.
     """
     operator, near = _whole_operator(blurred), near_clipped(blurred)
-    statistics, slope = blurred.statistics, blurred.slopes(1, WEIGHED_PX)
+    height, width = blurred.light[0].shape
+    statistics, slope = blurred.statistics, blurred.slopes(1, WEIGHED_PX, (width, height))
     uneven = statistics.unevenness
     if uneven:
-        in_tiles = _by_tile_hyper_laplacian(blurred, settings)
+        in_tiles = _tile_hyper_laplacian(blurred, settings)
         if uneven == 1.0:
-            return in_tiles
+            return _with_colour(blurred, in_tiles, settings)
     start = _tile_hyper_laplacian(blurred, replace(settings, iterations=START_ITERATIONS))
     result = hyper_laplacian(
         _luma(blurred.light),
@@ -611,15 +681,15 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
         settings.inner_iterations,
     )
     sharp = _inner(result, operator.border)
-    whole = _with_colour(blurred, sharp if near is None else sharp + near * (start - sharp), settings)
-    if not uneven:
-        return whole
-    return [cv2.addWeighted(t, uneven, w, 1 - uneven, 0.0) for t, w in zip(in_tiles, whole, strict=True)]
+    whole = sharp if near is None else sharp + near * (start - sharp)
+    return _with_colour(
+        blurred, cv2.addWeighted(in_tiles, uneven, whole, 1 - uneven, 0.0) if uneven else whole, settings
+    )
 
 
 def _data_weight(slope: Image, blurred: BlurredPicture) -> Image:
     """Weight of each pixel's luma: none where any channel is clipped, with its neighbours, or all are too dark."""
-    holes, dark = _holes(blurred), [mask for mask in blurred.dark if mask is not None]
+    holes, dark = blurred.holes, [mask for mask in blurred.dark if mask is not None]
     if holes is not None:
         slope = slope * (1 - cv2.dilate(holes, np.ones((3, 3), np.uint8)))
     return slope * (1 - np.minimum.reduce(dark)) if len(dark) == len(blurred.dark) else slope

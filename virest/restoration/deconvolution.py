@@ -101,6 +101,15 @@ def difference_adjoint(gradient: Image, axis: int) -> Image:
     return result
 
 
+def add_roughness(result: Image, picture: Image, weight: Image) -> None:
+    """Add Dᵀ w D of a picture to the result, with the forward differences D along both axes."""
+    for turned in (False, True):
+        x, w, total = (plane.T if turned else plane for plane in (picture, weight, result))
+        steps = (x[1:] - x[:-1]) * w[:-1]
+        total[:-1] -= steps
+        total[1:] += steps
+
+
 def conjugate_gradients(normal: Operator, right: Image, start: Image, precondition: Image, iterations: int) -> Image:
     """Solve normal(x) = right for a symmetric positive operator; precondition: about its inverse diagonal."""
     x = start.copy()
@@ -143,6 +152,7 @@ def hyper_laplacian(
     unit_slope = slope / np.float32(gradient_unit)
     squared = unit_slope * unit_slope
     sharp = start
+    typical = float(np.median(weight)) ** 2 / max(float(np.median(slope)) ** 2, 1e-12)
     for beta in betas:
         table = shrinkage_table(beta)
         data = np.float32(data_weight / beta) * weight * weight
@@ -153,11 +163,9 @@ def hyper_laplacian(
 
         def normal(x: Image, data: Image = data) -> Image:
             result = adjoint(data * apply(x))
-            for axis in (0, 1):
-                result += difference_adjoint(squared * difference(x, axis), axis)
+            add_roughness(result, x, squared)
             return result
 
-        typical = float(np.median(weight)) ** 2 / max(float(np.median(slope)) ** 2, 1e-12)
         precondition = 1.0 / (slope * slope * np.float32(data_weight / beta * typical) + 4 * squared)
         sharp = conjugate_gradients(normal, right, sharp, precondition, inner)
     return sharp

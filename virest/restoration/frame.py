@@ -15,7 +15,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, kernel_field
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
@@ -24,6 +24,7 @@ from virest.restoration.deblur import (
     BAND_ROWS,
     FEW_ITERATIONS,
     BlurredPicture,
+    LightOfRows,
     blurred_picture,
     clipped_anywhere,
     deblur,
@@ -49,8 +50,8 @@ LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
 FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
 """Gradients of so many times the noise are not wiped out with it; nor does it matter where so much is to be gained."""
-PART_STEP_PX = 48
-"""Spacing at which the length of the blur paths, and how they change, is looked at."""
+PART_STEP_PX = 80
+"""Spacing of the places at which it is looked whether the blur is worth the trouble."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 MIN_RELIGHT = 0.002
@@ -215,21 +216,23 @@ def unknown_parameters(profile: CameraProfile) -> dict[str, Any]:
 
 
 def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> NDArray[np.uint8]:
-    """Linear light of the channels to a stored picture (height, width, 3), through a table over the root of light.
+    """Linear light of the channels to a stored picture (height, width, 3)."""
+    return _encoded(lambda rows: [plane[rows] for plane in light], len(light[0]), curve)
 
-    Band by band: what is worked on stays in the cache.
-    """
+
+def _encoded(light: LightOfRows, height: int, curve: ResponseCurve) -> NDArray[np.uint8]:
+    """The stored picture (height, width, 3), through a table over the root of light, band by band."""
     low, high = curve.light_range
     table = _encoding_table(curve)
-    picture = np.empty((*light[0].shape, len(light)), np.uint8)
-    for top in range(0, len(picture), BAND_ROWS):
-        part = cv2.merge([plane[top : top + BAND_ROWS] for plane in light])
+    bands = []
+    for top in range(0, height, BAND_ROWS):
+        part = cv2.merge(light(slice(top, top + BAND_ROWS)))
         if (low, high) != (0.0, 1.0):
             part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
-        root = cv2.sqrt(cv2.max(part, 0.0))
+        root = cv2.sqrt(cv2.threshold(part, 0.0, 0.0, cv2.THRESH_TOZERO)[1])
         steps = cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U)
-        cv2.LUT(steps, table, picture[top : top + BAND_ROWS])
-    return picture
+        bands.append(cv2.LUT(steps, table))
+    return np.concatenate(bands)
 
 
 def _beyond_the_curve_kept(
@@ -294,14 +297,13 @@ def _deblurred(
     curve = motion.profile.response or ResponseCurve("srgb")
     centres_px = _most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
-    luma, chroma = _measured(picture, kernel_field(motion, centres_px, anchor), curve, tiles)
+    field = smooth_field(motion, anchor)
+    luma, chroma = _measured(picture, field(centres_px), curve, tiles)
     share = 1.0 if anchor != 0.5 else _trusted_share(luma)
     why_not = _too_little_to_gain(luma)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
-    blurred = blurred_picture(
-        picture, curve, (luma, chroma), lambda centres: kernel_field(motion, centres, anchor), longest_px
-    )
+    blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
     sharp = deblur(blurred, settings)
@@ -312,8 +314,10 @@ def _deblurred(
         measured = measured_share(blurred)
         part = part if measured is None else part * measured
         if part.min() < 1.0:
-            sharp = [plane + part * (s - plane) for s, plane in zip(sharp, blurred.light, strict=True)]
-    restored = encode_picture(sharp if light is None else [plane * light.kept for plane in sharp], curve)
+            sharp = _mixed(sharp, blurred.light, part)
+    if light is not None:
+        sharp = _lit(sharp, light.kept)
+    restored = _encoded(sharp, height, curve)
     if light is None:
         restored = _beyond_the_curve_kept(restored, picture, blurred, curve)
     details = {
@@ -373,8 +377,12 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
     """The picture without flicker and vignetting: both came after the blur, so they go before it is undone."""
     planes = [light.evened(plane, mask) for plane, mask in zip(blurred.light, blurred.clipped, strict=True)]
-    recorded = blurred.slopes
-    return replace(blurred, light=planes, slopes=lambda number, side_px: recorded(number, side_px) * light.recorded)
+
+    def slopes(channel: int, side_px: int, size: tuple[int, int]) -> NDArray[np.float32]:
+        lit = cv2.resize(light.recorded, size, interpolation=cv2.INTER_LINEAR)
+        return blurred.slopes(channel, side_px, size) * lit
+
+    return replace(blurred, light=planes, slopes=slopes)
 
 
 def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
@@ -382,6 +390,23 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
     clipped = cv2.LUT(picture, curve.clipped_table().astype(np.uint8))
     planes = zip(cv2.split(cv2.LUT(picture, curve.linear_table())), cv2.split(clipped), strict=True)
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
+
+
+def _mixed(sharp: LightOfRows, recorded: list[NDArray[np.float32]], part: Any) -> LightOfRows:
+    """So much of the sharp light, the rest recorded; part: (height, width), or one number for all."""
+
+    def mixed(rows: slice) -> list[NDArray[np.float32]]:
+        pairs = zip(sharp(rows), (plane[rows] for plane in recorded), strict=True)
+        if np.ndim(part):
+            return [plane + part[rows] * (s - plane) for s, plane in pairs]
+        return [cv2.addWeighted(plane, 1.0 - float(part), s, float(part), 0.0) for s, plane in pairs]
+
+    return mixed
+
+
+def _lit(sharp: LightOfRows, factor: NDArray[np.float32]) -> LightOfRows:
+    """Light times a factor (height, width)."""
+    return lambda rows: [plane * factor[rows] for plane in sharp(rows)]
 
 
 def _too_little_to_gain(luma: PictureStatistics) -> str:

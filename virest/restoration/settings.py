@@ -43,7 +43,7 @@ class RestorationSettings:
 
 
 PRESETS: dict[str, RestorationSettings] = {
-    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=144, strength=0.8),
+    "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=176, strength=0.8),
     "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0),
     "best": RestorationSettings(
         "best", "hyper-laplacian-global", iterations=8, inner_iterations=6, tile_px=104, strength=1.0

@@ -197,8 +197,7 @@ def measure_picture(
     picture: (height, width, 3) RGB.  clipped: (height, width), 1 where light was too much to be measured; it and what a
     path reaches from it are left out.  Returns the statistics of luma and of chroma, both colour differences together.
     """
-    luma, red, blue = cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb))
-    corners = _corners(field, luma.shape)
+    corners = _corners(field, picture.shape[:2])
     if not corners or field.radius_px >= _SIDE // 2:
         return _unknown_picture(), _unknown_picture()
     chosen = _least_clipped(clipped, corners, most_tiles)
@@ -206,16 +205,19 @@ def measure_picture(
     passed = np.stack([_passed(kernel) for kernel in kernels])
     known = [None if clipped is None else _known(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)]
 
-    def observed(plane: NDArray[np.uint8], every: int) -> NDArray[np.float32]:
-        tiles = zip(chosen[::every], known[::every], strict=True)
-        return np.stack([_windowed_power(_cut(plane, corners[i]), seen) for i, seen in tiles])
+    parts = [cv2.split(cv2.cvtColor(_cut(picture, corners[i]), cv2.COLOR_RGB2YCrCb)) for i in chosen]
+
+    def observed(plane: int, every: int) -> NDArray[np.float32]:
+        tiles = zip(parts[::every], known[::every], strict=True)
+        return np.stack([_windowed_power(part[plane], seen) for part, seen in tiles])
 
     tiles = zip(chosen, known, strict=True)
     light = np.stack([_windowed_power(_evenly_steep(_cut(picture, corners[i]), curve), seen) for i, seen in tiles])
-    colour = (observed(red, 2) + observed(blue, 2)) * np.float32(0.5)
+    colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
+    luma, red, _ = cv2.split(cv2.cvtColor(_some_rows(picture), cv2.COLOR_RGB2YCrCb))
     cells, white_levels = _RingCells(passed), white_noise(luma)
     noise_levels = _fit_rings(light, cells, white_levels).noise_levels
-    grey = observed(luma, 1)
+    grey = observed(0, 1)
     of_luma = replace(_fit_rings(grey, cells, white_levels), noise_levels=noise_levels)
     of_chroma = _fit_rings(colour, _RingCells(passed[::2]), white_noise(red))
     weight = _unevenness(max(of_luma.misfit, _scatter(of_luma, grey, passed) / _SINGLE_PLACES), len(chosen))
@@ -225,6 +227,12 @@ def measure_picture(
         replace(of_luma, places=_place_statistics(of_luma, grey, passed, weight)),
         replace(of_chroma, places=_place_statistics(of_chroma, colour, passed[::2], weight)),
     )
+
+
+def _some_rows(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Every other four rows of a picture (height, width, 3): enough for :func:`white_noise`, which looks at such."""
+    height, width, channels = picture.shape
+    return picture[: height - height % 8].reshape(-1, 8, width, channels)[:, :4].reshape(-1, width, channels)
 
 
 def _unevenness(misfit: float, tiles: int) -> float:
@@ -492,7 +500,8 @@ def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.boo
     near = determined & (frequency <= _SLOPE_SPAN * frequency[first])
     slope = 0.0
     if np.count_nonzero(near) > 2:
-        slope = -float(np.polyfit(np.log(frequency[near]), np.log(noise[near]), 1)[0])
+        over = np.log(frequency[near]) - np.log(frequency[near]).mean()
+        slope = -float(over @ np.log(noise[near]) / (over @ over))
     rise = np.maximum(frequency[first] / np.maximum(frequency, _LEVEL_BELOW), 1.0)
     growth = np.asarray(rise ** np.clip(slope, 0.0, _STEEPEST_NOISE))
     stands_out = np.flatnonzero(growth[:first] * noise[:first] < _STANDS_OUT * observed[:first])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
+from itertools import repeat
 
 import cv2
 import numpy as np
@@ -38,7 +39,7 @@ class TileDeconvolution:
     def __init__(self, grid: TileGrid, kernels: Image, margin: int, bridge: int | None = None) -> None:
         """bridge: its least length; None: the margin's."""
         self.grid = grid
-        self.margin = margin = max(margin, kernels.shape[1] // 2 + 1)
+        self.margin = margin
         self.patch = grid.side + 2 * margin
         self.size = fast_size(self.patch + (margin if bridge is None else bridge))
         self.at_border = [
@@ -50,12 +51,14 @@ class TileDeconvolution:
         ]
         self._windows = grid.windows()
         self._bridge = _bridge(self.size - self.patch)
-        self._tile = np.empty((self.size, self.size), np.float32)
-        self.kernels: list[Image] = []
-        self.powers: list[Image] = []
-        for kernel in _kernel_spectra(kernels, self.size):
-            self.kernels.append(kernel)
-            self.powers.append(packed_power(kernel))
+        self._tile, self._spectrum, self._divisor = np.empty((3, self.size, self.size), np.float32)
+        self.kernels = np.empty((len(kernels), self.size, self.size), np.float32)
+        """Packed spectra, (tiles, size, size): of the flipped kernels, see :func:`_kernel_spectra`."""
+        self.powers = np.empty_like(self.kernels)
+        """Their |K|², as real factors."""
+        for _ in map(_power_inside, _kernel_spectra(kernels, self.size, self.kernels), self.powers):
+            pass
+        _power_at_ends(self.kernels, self.powers)
         self._tamed: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
         self._lamps: dict[int, tuple[Image, Image]] = {}
@@ -66,16 +69,22 @@ class TileDeconvolution:
         for power, border in zip(self.powers, self.at_border, strict=True):
             yield (at_border or make)(power) if border else make(power)
 
-    def back_projected(self, channel: Image) -> Iterator[Image]:
-        """Spectrum of Kᵀ g for each tile; channel (height, width) is extended, never wrapped.
+    def back_projected(self, channel: Image) -> Image:
+        """Spectra of Kᵀ g, (tiles, size, size); channel (height, width) is extended, never wrapped.
 
         Of tamed tiles, g is what they would have recorded without their lamps.
         """
-        padded = self.padded(channel)
-        for number, ((top, left), kernel) in enumerate(zip(self.grid.corners(), self.kernels, strict=True)):
-            tamed = self._tamed.get(number)
-            spectrum = cv2.dft(self.periodic(padded, top, left)) if tamed is None else tamed
-            yield packed_product(spectrum, kernel)
+        padded, projected = self.padded(channel), np.empty_like(self.kernels)
+        ends = np.empty((*self.kernels.shape[:2], 2), np.float32)
+        for number, (top, left) in enumerate(self.grid.corners()):
+            spectrum = self._tamed.get(number)
+            if spectrum is None:
+                spectrum = cv2.dft(self.periodic(padded, top, left), self._spectrum)
+            inner = _inner_numbers(projected[number])
+            np.multiply(_inner_numbers(spectrum), _inner_numbers(self.kernels[number]), out=inner)
+            ends[number] = _ends(spectrum)
+        _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
+        return projected
 
     def touched(self, mask: Image) -> list[int]:
         """Numbers of the tiles that see anything of a mask (height, width)."""
@@ -138,22 +147,25 @@ class TileDeconvolution:
             yield cv2.dft(self.periodic(padded, top, left))
 
     def solutions(self, projected: Iterable[Image], inner: Image, at_border: Image) -> Iterator[Image]:
-        """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border."""
+        """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border.
+
+        Good until the next, as those of :meth:`pulled` are.
+        """
+        divisor = self._divisor
         for spectrum, power, border in zip(projected, self.powers, self.at_border, strict=True):
-            yield cv2.divide(spectrum, cv2.add(power, at_border if border else inner))
+            yield cv2.divide(spectrum, cv2.add(power, at_border if border else inner, divisor), divisor)
 
     def pulled(self, projected: Iterable[Image], pull: Image, inner: float, at_border: float) -> Iterator[Image]:
         """Each tile's spectrum plus that of a picture (height, width) times a factor, of tiles inside or at the border.
 
         Beyond its edges the picture is 0, and so it is on a tile's bridge: there the solution is a guess anyway.
         """
-        margin, patch, (height, width) = self.margin, self.patch, pull.shape
+        padded, patch = self.padded(pull, cv2.BORDER_CONSTANT), self.patch
+        tile, spectrum = np.zeros_like(self._tile), self._spectrum
         for (top, left), back, border in zip(self.grid.corners(), projected, self.at_border, strict=True):
-            top, left = top - margin, left - margin
-            inside = pull[max(top, 0) : min(top + patch, height), max(left, 0) : min(left + patch, width)]
-            tile = np.zeros((self.size, self.size), np.float32)
-            tile[max(-top, 0) :, max(-left, 0) :][: inside.shape[0], : inside.shape[1]] = inside
-            yield cv2.scaleAdd(cv2.dft(tile), at_border if border else inner, back)
+            tile[:patch, :patch] = padded[top : top + patch, left : left + patch]
+            cv2.dft(tile, spectrum)
+            yield cv2.scaleAdd(spectrum, at_border if border else inner, back, spectrum)
 
     def blend(self, spectra: Iterable[Image]) -> Image:
         """Tiles back into one picture (height, width), through the windows."""
@@ -166,19 +178,19 @@ class TileDeconvolution:
             cv2.accumulateProduct(inner, window, result[top : top + side, left : left + side])
         return result[: grid.height, : grid.width]
 
-    def padded(self, channel: Image) -> Image:
-        """The channel with the margin that the outermost tiles need."""
+    def padded(self, channel: Image, border: int = cv2.BORDER_REPLICATE) -> Image:
+        """The channel with the margin that the outermost tiles need; border: what OpenCV fills it with."""
         grid, margin = self.grid, self.margin
         below = grid.tops[-1] + grid.side + margin - grid.height
         right = grid.lefts[-1] + grid.side + margin - grid.width
-        return cv2.copyMakeBorder(channel, margin, below, margin, right, cv2.BORDER_REPLICATE)
+        return cv2.copyMakeBorder(channel, margin, below, margin, right, border)
 
     def periodic(self, padded: Image, top: int, left: int) -> Image:
         """One tile with its margin, bridged from each edge to the opposite one, (size, size); good until the next."""
         patch, tile, bridge = self.patch, self._tile, self._bridge
         tile[:patch, :patch] = padded[top : top + patch, left : left + patch]
-        np.matmul(tile[:patch, [patch - 1, 0]], bridge, out=tile[:patch, patch:])
-        np.matmul(bridge.T, tile[[patch - 1, 0]], out=tile[patch:])
+        np.matmul(tile[:patch, patch - 1 :: 1 - patch], bridge, out=tile[:patch, patch:])
+        np.matmul(bridge.T, tile[patch - 1 :: 1 - patch], out=tile[patch:])
         return tile
 
 
@@ -199,29 +211,38 @@ def _through(picture: Image, kernel: Image, forward: bool) -> Image:
     return cv2.idft(cv2.mulSpectrums(cv2.dft(picture), kernel, 0, conjB=forward), flags=cv2.DFT_SCALE)
 
 
-def quick_grid(height: int, width: int, side: int, around: int, overlap_parts: int) -> TileGrid:
+@lru_cache(maxsize=64)
+def quick_grid(height: int, width: int, side: int, around: int, overlap_parts: int, give: float = 0.0) -> TileGrid:
     """Tiles of about ``side``, of a size at which all their transforms together take little time.
 
-    They overlap by a part of their side, 1 / overlap_parts.  around: rows or columns that come on top of each tile's,
-    its margins and its bridge.
+    They overlap by a part of their side, 1 / overlap_parts, or by up to ``give`` of that less.  around: rows or columns
+    that come on top of each tile's, its margins and its bridge.
     """
     sides = [size - around for size in FAST_SIZES]
     fitting = [s for s in sides if LEAST_SIDE * side <= s <= LARGEST_SIDE * side] or [side]
-    grids = [tile_grid(height, width, s, s // overlap_parts) for s in fitting]
+    grids = [
+        tile_grid(height, width, s, overlap)
+        for s in fitting
+        for overlap in range(s // overlap_parts, int(np.ceil((1 - give) * (s // overlap_parts))) - 1, -1)
+    ]
     pixels = [len(grid.tops) * len(grid.lefts) * fast_size(grid.side + around) ** 2 for grid in grids]
-    quick = (grid for grid, count in zip(grids, pixels, strict=True) if count <= LITTLE_LONGER * min(pixels))
-    return min(quick, key=lambda grid: abs(grid.side - side))
+    quick = [(grid, count) for grid, count in zip(grids, pixels, strict=True) if count <= LITTLE_LONGER * min(pixels)]
+    return min(quick, key=lambda found: (abs(found[0].side - side), found[1], -found[0].overlap))[0]
 
 
-def _kernel_spectra(kernels: Image, size: int) -> Iterator[Image]:
-    """Spectra of the *flipped* use: conj, so that mulSpectrums applies the transpose of a correlation."""
+def _kernel_spectra(kernels: Image, size: int, into: Iterable[Image] | None = None) -> Iterator[Image]:
+    """Spectra of the *flipped* use: conj, so that mulSpectrums applies the transpose of a correlation.
+
+    into: where to put them, (size, size) each.
+    """
     radius = kernels.shape[1] // 2
     buffer = np.zeros((size, size), np.float32)
-    for kernel in kernels:
-        for rows, from_rows in ((np.s_[: radius + 1], np.s_[radius:]), (np.s_[size - radius :], np.s_[:radius])):
-            buffer[rows, : radius + 1] = kernel[from_rows, radius:]
-            buffer[rows, size - radius :] = kernel[from_rows, :radius]
-        yield cv2.dft(buffer)
+    for kernel, spectrum in zip(kernels, repeat(None) if into is None else into, strict=False):
+        buffer[: radius + 1, : radius + 1] = kernel[radius:, radius:]
+        buffer[: radius + 1, size - radius :] = kernel[radius:, :radius]
+        buffer[size - radius :, : radius + 1] = kernel[:radius, radius:]
+        buffer[size - radius :, size - radius :] = kernel[:radius, :radius]
+        yield cv2.dft(buffer, spectrum)
 
 
 def _bridge(length: int) -> Image:
@@ -232,28 +253,41 @@ def _bridge(length: int) -> Image:
 
 
 def packed_product(first: Image, second: Image) -> Image:
-    """The product of two packed spectra: of their complex numbers, and of the two columns that hold them otherwise.
+    """The product of packed spectra (..., size, size): of their complex numbers, and of the columns that hold others.
 
     OpenCV's own takes nearly twice as long, since it does not use the processor's vectors.
     """
     product = np.empty_like(first)
     np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(product))
-    _ends(product)[:] = cv2.mulSpectrums(_ends(first).copy(), _ends(second).copy(), 0)
+    _ends(product)[:] = _ends_product(_ends(first), _ends(second))
     return product
 
 
 def packed_power(spectrum: Image) -> Image:
-    """|K|² of a packed spectrum, as a real factor for packed spectra; as :func:`packed_product`."""
-    power, ends = np.empty_like(spectrum), _ends(spectrum).copy()
-    numbers, powers = _inner_numbers(spectrum), _inner_numbers(power)
-    np.multiply(numbers, np.conjugate(numbers, out=powers), out=powers)
-    powers *= np.complex64(1 + 1j)  # what is real, onto the imaginary places too
-    _ends(power)[:] = doubled(cv2.mulSpectrums(ends, ends, 0, conjB=True))
+    """|K|² of packed spectra, as real factors for packed spectra; as :func:`packed_product`."""
+    power = np.empty_like(spectrum)
+    _power_inside(spectrum, power)
+    _power_at_ends(spectrum, power)
     return power
 
 
+def _power_inside(spectrum: Image, power: Image) -> None:
+    """Write |K|² of all numbers but those of :func:`_ends`."""
+    numbers, powers = _inner_numbers(spectrum), _inner_numbers(power)
+    np.multiply(numbers, np.conjugate(numbers, out=powers), out=powers)
+    powers *= np.complex64(1 + 1j)  # what is real, onto the imaginary places too
+
+
+def _power_at_ends(spectrum: Image, power: Image) -> None:
+    ends = np.array(_ends(spectrum))
+    ends *= ends
+    ends[..., 1:-1:2, :] += ends[..., 2:-1:2, :]
+    ends[..., 2:-1:2, :] = ends[..., 1:-1:2, :]
+    _ends(power)[:] = ends
+
+
 def _inner_numbers(packed: Image) -> NDArray[np.complex64]:
-    """All that lies side by side in a packed spectrum as one row of complex numbers; a view.
+    """All that lies side by side in packed spectra as one row of complex numbers; a view.
 
     From a row's last place to the next one's first it pairs what does not belong together: see :func:`_ends`.
     """
@@ -261,8 +295,17 @@ def _inner_numbers(packed: Image) -> NDArray[np.complex64]:
 
 
 def _ends(packed: Image) -> Image:
-    """The first and the last column of a packed spectrum, where the parts of a number lie in alternate rows; a view."""
-    return packed[:, :: packed.shape[1] - 1]
+    """The first and the last column of packed spectra, where the parts of a number lie in alternate rows; a view."""
+    return packed[..., :: packed.shape[-1] - 1]
+
+
+def _ends_product(first: Image, second: Image) -> Image:
+    """The product of two :func:`_ends`: all numbers are complex but the corners, which are real."""
+    product = first * second
+    real, imaginary = np.s_[..., 1:-1:2, :], np.s_[..., 2:-1:2, :]
+    product[real] -= product[imaginary]
+    product[imaginary] = first[real] * second[imaginary] + first[imaginary] * second[real]
+    return product
 
 
 def doubled(packed: Image) -> Image:

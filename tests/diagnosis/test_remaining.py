@@ -1,0 +1,53 @@
+"""What is left of the points: the scene's relief and a sensor's last hundredths are no fault of the model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motion.synthetic_tracks import Recording, Setup
+
+from virest.diagnosis.geometric_evidence import make_evidence
+from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.diagnosis.remaining import points_left
+
+WALL = Setup(
+    seed=71, frames=31, points=40, velocity_m_s=(0.1, -0.05, 0.8), plane_per_m=(0.05, -0.1, 0.6), noise_px=0.08
+)
+
+
+@pytest.fixture(scope="module")
+def before_a_wall() -> GeometricVerdict:
+    """The true profile's verdict where a camera walks towards a wall."""
+    recording = Recording(WALL)
+    imu = recording.imu.between(-0.2, recording.stamp_s[-1] + 0.25)
+    profile = replace(recording.profile, depth_m=None)
+    return climb(make_evidence(imu, recording.observed), profile, (), (), max_rungs=0)
+
+
+def shifted(verdict: GeometricVerdict, *, across: bool) -> GeometricVerdict:
+    """Points of the picture's upper part off by a nearer scene, or by as much across its parallax."""
+    along = verdict.fit.along_px
+    assert along is not None
+    off = 0.15 * along * (verdict.table.second_px[:, 1:] < 250)
+    if across:
+        off = np.stack([-off[:, 1], off[:, 0]], axis=-1)
+    fit = replace(verdict.fit, difference_px=verdict.fit.difference_px + off, depth_spread_per_m=0.15)
+    return replace(verdict, fit=fit)
+
+
+def test_what_stands_before_the_plane_is_no_structure(before_a_wall: GeometricVerdict) -> None:
+    """A ceiling nearer than the wall shifts rows along their parallax; a fault of the same size crosses it."""
+    assert not points_left(before_a_wall).significant
+    assert not points_left(shifted(before_a_wall, across=False)).significant
+    found = points_left(shifted(before_a_wall, across=True))
+    assert found.significant
+    assert found.size > 0.05
+
+
+def test_some_hundredths_of_a_pixel_are_no_cause(before_a_wall: GeometricVerdict) -> None:
+    """A gyroscope's noise over sharp tracks is a large part of nearly nothing; the same part of more is a fault."""
+    calm = replace(before_a_wall, noise_px=0.027, final_rms_px=0.035)
+    assert not points_left(calm).significant
+    assert points_left(replace(before_a_wall, noise_px=0.08, final_rms_px=0.12)).significant

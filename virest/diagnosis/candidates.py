@@ -1,0 +1,147 @@
+"""Causes of moving points at the places where their fits may begin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.calibration.start_up import Schedule
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
+from virest.diagnosis.geometric_evidence import Evidence, Model, free_scene
+from virest.motion.scene_motion import InertialMotion
+from virest.motion.track_fit import Term
+from virest.motion.track_model import TrackTable, ground, predict
+
+Array = NDArray[np.float64]
+SCREEN_POINTS = 1500
+"""Points that a first look at a cause is fitted to."""
+CLOCKS = ("time_offset", "clock_skew")
+CONSTANT_EXPOSURE = 0.03
+"""Exposures within this part of their median are one."""
+
+
+@dataclass(frozen=True, slots=True)
+class FarClock:
+    """Changes of a profile's clocks, beyond a fit's reach, at which the turns of pictures and gyroscope agree."""
+
+    offset_s: float = 0.0
+    """At the profile's own clock rate; 0: none."""
+    skewed_offset_s: float = 0.0
+    """At the rate changed by ``skew``."""
+    skew: float = 0.0
+
+    def start(self, name: str, profile: CameraProfile, offset_free: bool) -> CameraProfile | None:
+        """Where a fit of this effect might begin; a skew moves the offset along if that is fitted too."""
+        offset_s = profile.time_offset_s or 0.0
+        if name == "time_offset" and self.offset_s:
+            return replace(profile, time_offset_s=offset_s + self.offset_s)
+        if name == "clock_skew" and self.skew:
+            skewed_s = offset_s + self.skewed_offset_s if offset_free else offset_s
+            return replace(profile, time_offset_s=skewed_s, clock_skew=profile.clock_skew + self.skew)
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One cause at one starting point: the model to begin from and the terms it adds."""
+
+    name: str
+    model: Model
+    added: tuple[Term, ...]
+    effect: GeometricEffect | None
+    word: str = ""
+    terms_with: int = 0
+
+
+def worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate]) -> list[Candidate]:
+    """Without far starts of the clocks that are further off than where the model stands: a fit would only come back."""
+    table = evidence.table(model, SCREEN_POINTS)
+    here = _off_px(evidence, model, table)
+    return [
+        candidate
+        for candidate in candidates
+        if candidate.name not in CLOCKS
+        or candidate.model.profile == model.profile
+        or _off_px(evidence, candidate.model, table) < here
+    ]
+
+
+def _off_px(evidence: Evidence, model: Model, table: TrackTable) -> float:
+    """Median distance of the points from where a model puts them."""
+    known = ground(evidence.imu, model.profile, translation=isinstance(model.scene, InertialMotion))
+    off = table.second_px - predict(known, table, model.scene).second_px
+    return float(np.median(np.linalg.norm(off, axis=-1)))
+
+
+def candidates_of(
+    evidence: Evidence,
+    nominal: CameraProfile,
+    model: Model,
+    tried: set[str],
+    lags: Sequence[Schedule],
+    far: FarClock,
+) -> list[Candidate]:
+    """All causes that are not in a model yet, each at all places where its fit may begin.
+
+    lags: the start-up schedules to try.  far: changes of the clocks at which turns were seen to agree.
+    """
+    in_terms = {term.name for term in model.terms}
+    found: list[Candidate] = []
+    for effect in GEOMETRIC_EFFECTS:
+        if effect.name in tried or effect.name in in_terms or not _tells(evidence, effect):
+            continue
+        if effect.term is None:
+            found += _words(effect, model)
+            continue
+        for values in (None, *effect.starts):
+            profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
+            found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
+        if (far_off := far.start(effect.name, nominal, "time_offset" in in_terms)) is not None:
+            clocks = replace(model.profile, time_offset_s=far_off.time_offset_s, clock_skew=far_off.clock_skew)
+            found.append(Candidate(effect.name, replace(model, profile=clocks), (effect.term,), effect))
+    found += _depths(evidence, model, tried)
+    if "frame_lag" not in tried:
+        found += [_lagging(model, *lag) for lag in lags]
+    return found
+
+
+def _tells(evidence: Evidence, effect: GeometricEffect) -> bool:
+    """Whether points can tell this cause: an exposure's length only by its changes, otherwise it is an offset."""
+    return effect.name != "exposure_time" or varies(evidence.observed.exposure_s)
+
+
+def varies(exposure_s: Array) -> bool:
+    """Whether logged exposures (n,) differ enough to move rows by different times."""
+    middle = float(np.median(exposure_s))
+    return middle > 0 and float(np.ptp(exposure_s)) >= CONSTANT_EXPOSURE * middle
+
+
+def _words(effect: GeometricEffect, model: Model) -> list[Candidate]:
+    assert effect.with_word is not None
+    now = next(iter(effect.read(model.profile).values()))
+    return [
+        Candidate(effect.name, replace(model, profile=effect.with_word(model.profile, word)), (), effect, word)
+        for word in effect.words
+        if word != now
+    ]
+
+
+def _depths(evidence: Evidence, model: Model, tried: set[str]) -> list[Candidate]:
+    depth_m = model.profile.depth_m
+    if "scene_depth" in tried or depth_m is None:
+        return []
+    scene = free_scene(evidence, model.profile, evidence.table(model, SCREEN_POINTS))
+    if scene is None:
+        return []
+    return [Candidate("scene_depth", replace(model, scene=scene), (), None)]
+
+
+def _lagging(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...]) -> Candidate:
+    extensions = replace(model.profile.extensions, frame_lag_s=lag_s, frame_lag_frames=frames)
+    return Candidate(
+        "frame_lag", replace(model, profile=replace(model.profile, extensions=extensions), lag=by_frame), (), None
+    )
