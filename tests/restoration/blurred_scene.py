@@ -59,9 +59,16 @@ def record(camera: TurningCamera, grey: bool = False, noise_levels: float = 1.0)
 
 
 def _record(camera: TurningCamera, grey: bool, noise_levels: float) -> Recorded:
+    height, width = camera.profile.height + 2 * MARGIN, camera.profile.width + 2 * MARGIN
+    return record_canvas(camera, _canvas(height, width, grey), 1 if grey else 3, noise_levels)
+
+
+def record_canvas(
+    camera: TurningCamera, canvas: NDArray[np.float32], noise_channels: int = 1, noise_levels: float = 1.0
+) -> Recorded:
+    """Record light on a canvas (height + 2 MARGIN, width + 2 MARGIN, 3); noise in as many channels."""
     profile, motion = camera.profile, camera.motion
     width, height = profile.width, profile.height
-    canvas = _canvas(height + 2 * MARGIN, width + 2 * MARGIN, grey)
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     pixels = np.stack([x, y], -1).reshape(-1, 2).astype(float)
     start_s = camera.row_start_s(pixels, motion.start_s)
@@ -71,7 +78,7 @@ def _record(camera: TurningCamera, grey: bool, noise_levels: float) -> Recorded:
         source = (seen + MARGIN).astype(np.float32).reshape(height, width, 2)
         light += cv2.remap(canvas, source, None, cv2.INTER_CUBIC) / INSTANTS
     rng = np.random.default_rng(1)
-    noise = rng.normal(0, noise_levels, (height, width, 1 if grey else 3))
+    noise = rng.normal(0, noise_levels, (height, width, noise_channels))
     inner = canvas[MARGIN : MARGIN + height, MARGIN : MARGIN + width]
     return Recorded(camera, _stored(light, profile.response, noise), _stored(inner, profile.response, 0))
 

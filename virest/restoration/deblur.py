@@ -68,6 +68,11 @@ BORDER_NOISE_TO_SIGNAL = 0.003
 """Least N / S of tiles that see beyond the picture."""
 RESIDUAL_SHARE = 0.05
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
+UNEVEN_NOISE_TO_SIGNAL = 0.03
+"""Least N / S of a picture whose power lies at few places: an error of the kernel there, or of what a tile sees around
+itself, is by so much in proportion to the power, and stands out of the noise."""
+LINEAR_SHARE = 0.5
+"""Part of such a picture that is the linear filter's: its gradients are not sparse, the prior makes them steps."""
 WEIGHED_PX = 5
 """Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
 SHRUNK_PARTS, LOOKED_AT = 8, 4
@@ -302,6 +307,10 @@ def _noise_to_signal(
     """Measured N / S on a tile's spectrum: for tiles inside the picture, and for those that see beyond it."""
     ratio = on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size, scale)
     guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)
+    if statistics.unevenness:
+        least = np.float32(UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness)
+        ratio, guarded, mean = np.maximum(ratio, least), np.maximum(guarded, least), ratio[0, 0]
+        ratio[0, 0] = mean
     guarded[0, 0] = ratio[0, 0]
     return ratio, guarded
 
@@ -525,17 +534,33 @@ def _tile_hyper_laplacian(
     projected = _projected_luma(blurred, deconvolution, settings)
     start = statistics.between_rings_and_level if few else statistics
     ratios = _noise_to_signal(deconvolution, settings, start)
-    sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
+    linear = sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
+    emptier = _emptier(statistics, deconvolution.size)
     before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
     for step, beta in enumerate(_beta_schedule(settings.iterations)):
         ahead, before = _further_on(sharp, before, step), sharp
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
         pulled = deconvolution.pulled(projected, pull, beta / trust, beta / guarded)
-        inner, at_border = (gradients * np.float32(beta / t) for t in (trust, guarded))
+        inner, at_border = (gradients * np.float32(beta / t) + emptier for t in (trust, guarded))
         sharp = deconvolution.blend(deconvolution.solutions(pulled, inner, at_border))
     if settings.iterations > FEW_ITERATIONS:
         sharp += _returned_residual(deconvolution, projected, sharp, statistics)
+    if statistics.unevenness:
+        share = LINEAR_SHARE * statistics.unevenness
+        sharp = cv2.addWeighted(linear, share, sharp, 1 - share, 0.0)
     return deconvolution.with_lamps(sharp)
+
+
+def _emptier(statistics: PictureStatistics, size: int) -> Image | np.float32:
+    """N / S beyond that of the rings: a prior of gradients lets noise through where a grating leaves nothing."""
+    if not statistics.unevenness:
+        return np.float32(0)
+    rings = on_spectrum(statistics, statistics.noise_to_signal, size, by_place=False)
+    places = on_spectrum(statistics, statistics.noise_to_signal, size)
+    least = np.float32(UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness)
+    emptier = cv2.max(cv2.subtract(np.maximum(places, least), rings), 0.0)
+    emptier[0, 0] = 0.0
+    return emptier
 
 
 def _further_on(sharp: Image, before: Image, step: int) -> Image:
@@ -637,6 +662,11 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
     operator, near = _whole_operator(blurred), near_clipped(blurred)
     height, width = blurred.light[0].shape
     statistics, slope = blurred.statistics, blurred.slopes(1, WEIGHED_PX, (width, height))
+    uneven = statistics.unevenness
+    if uneven:
+        in_tiles = _tile_hyper_laplacian(blurred, settings)
+        if uneven == 1.0:
+            return _with_colour(blurred, in_tiles, settings)
     start = _tile_hyper_laplacian(blurred, replace(settings, iterations=START_ITERATIONS))
     result = hyper_laplacian(
         _luma(blurred.light),
@@ -651,7 +681,10 @@ def _by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSet
         settings.inner_iterations,
     )
     sharp = _inner(result, operator.border)
-    return _with_colour(blurred, sharp if near is None else sharp + near * (start - sharp), settings)
+    whole = sharp if near is None else sharp + near * (start - sharp)
+    return _with_colour(
+        blurred, cv2.addWeighted(in_tiles, uneven, whole, 1 - uneven, 0.0) if uneven else whole, settings
+    )
 
 
 def _data_weight(slope: Image, blurred: BlurredPicture) -> Image:

@@ -52,6 +52,8 @@ FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
 """Gradients of so many times the noise are not wiped out with it; nor does it matter where so much is to be gained."""
 PART_STEP_PX = 80
 """Spacing of the places at which it is looked whether the blur is worth the trouble."""
+WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
+"""Methods whose kernels go over into each other between the tiles."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -306,7 +308,9 @@ def _deblurred(
         blurred = _evened(blurred, light)
     sharp = deblur(blurred, settings)
     if anchor == 0.5:
-        part = _blurred_part(motion, settings.min_blur_px) * _share_map(blurred, share)
+        by_tile = settings.deblur not in WHOLE_PICTURE or luma.unevenness > 0
+        part = _blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
+        part = part * _share_map(blurred, share)
         measured = measured_share(blurred)
         part = part if measured is None else part * measured
         if part.min() < 1.0:
@@ -366,7 +370,8 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
     if len(drowned):
         last = drowned[0] - 1
         signal[last + 1 :] = falling_power(frequency, signal, last)[last + 1 :]
-    return replace(defocused, signal=signal, passed=defocused.passed * left)
+    places = defocused.places and defocused.places.after(left)
+    return replace(defocused, signal=signal, passed=defocused.passed * left, places=places)
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
@@ -413,16 +418,20 @@ def _too_little_to_gain(luma: PictureStatistics) -> str:
     return ""
 
 
-def _blurred_part(motion: RowMotion, min_blur_px: float) -> NDArray[np.float32] | np.float32:
+def _blurred_part(motion: RowMotion, min_blur_px: float, tile_px: int) -> NDArray[np.float32] | np.float32:
     """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on.
 
-    (height, width), or one number for all.
+    So too where it is shorter than the path changes from a tile's middle to its side, as around the centre of a turn
+    about the optical axis: the tile has the kernel of its middle.  tile_px: its side, 0 where kernels go over into each
+    other.  (height, width), or one number for all.
     """
     width, height = motion.profile.width, motion.profile.height
     x, y = (np.linspace(0, length - 1, max(2, length // PART_STEP_PX)) for length in (width, height))
-    length_px = np.linalg.norm(blur_chords(motion, np.stack(np.meshgrid(x, y), -1)), axis=-1)
-    length_px = equivalent_length_px(motion.profile, length_px)
-    part = np.clip(length_px / min_blur_px - 1.0, 0.0, 1.0).astype(np.float32)
+    chords = blur_chords(motion, np.stack(np.meshgrid(x, y), -1))
+    length_px = equivalent_length_px(motion.profile, np.linalg.norm(chords, axis=-1))
+    change = np.linalg.norm([np.gradient(chords, x, axis=1), np.gradient(chords, y, axis=0)], axis=(0, -1))
+    least_px = np.maximum(min_blur_px, tile_px / 2 * change)
+    part = np.clip(length_px / least_px - 1.0, 0.0, 1.0).astype(np.float32)
     if part.min() == 1.0:
         return np.float32(1.0)
     return cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)

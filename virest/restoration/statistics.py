@@ -10,6 +10,10 @@ Grey levels throughout; a white noise of standard deviation σ has N = σ².
 Blur adds up light, and a steep curve gives the grey levels of a blurred edge frequencies that no light had: where the
 kernels cancel, they would pass for noise.  So its standard deviation, which weighs the data against the prior, is
 measured in light, brought to grey levels by the curve's slope at each tile's mean.
+
+Rings take S to be the same in all directions.  A grating, a brick wall or blinds have their power at few places of a
+ring: where these pass and others are cancelled, S is believed there too, and noise and errors of the kernels are
+restored for detail.  The fit's misfit tells such pictures, and their S is measured place by place.
 """
 
 from __future__ import annotations
@@ -57,6 +61,50 @@ _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 _EDGES_BEYOND = 2.0
 """A picture's edges stand out of its spectrum by so much: rings of tiles have the mean of edge and plain surface."""
+_LITTLE_MISFIT, _LARGE_MISFIT = 0.8, 1.1
+"""RMS of ln |G|² about the fit's, over its cells, up to which rings are believed, and from which on they are not.
+
+Of MANY_TILES; what fewer of them hold differs more from one to the next."""
+_SINGLE_PLACES = 2.0
+"""Along the axes, which the fit leaves out, single places scatter so many times as much as cells."""
+_PLACES_IN_CELL = 4
+"""The mean of fewer tells little."""
+_INDEPENDENT = 4.0
+"""Of a place's nine neighbours under the window, itself one of them, so many are independent."""
+_STEEPEST_PLACE = 4.0
+"""S of a place is at most so many times its ring's, or what came through the blur, whichever is more.
+
+What exceeds both where kernels cancel is the coder's pattern."""
+_FEW_PLACES = 20.0
+"""A ring with so many reliable places is half way from its fit to what these have."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceStatistics:
+    """What rings do not tell: power over the places of a tile's spectrum, as :func:`_power` orders them."""
+
+    weight: float
+    """How far the rings' S is wrong: more than 0, and 1 from a large misfit on."""
+    share: NDArray[np.float32]
+    """(_SIDE, _SIDE / 2 - 1) S of each place over that of its ring."""
+    passed: NDArray[np.float32]
+    """(_SIDE, _SIDE / 2 - 1) mean |K|² of the kernels."""
+
+    def after(self, passed: Array) -> PlaceStatistics:
+        """The same where more blur came on top, that passes so much (RINGS,) of |G|²."""
+        return replace(self, passed=(self.passed * passed[_place_ring()]).astype(np.float32))
+
+    def expected_gain_db(self, signal: Array, noise: Array) -> float:
+        """As :attr:`PictureStatistics.expected_gain_db`, by the rings' S and N, (RINGS,).
+
+        More noise than what comes through the blur counts as that: it may be a grating that the kernels nearly cancel,
+        and taking it away is no gain.
+        """
+        ring = _place_ring()
+        s, n = signal[ring] * self.share, noise[ring]
+        through = self.passed * s
+        left = np.sum((1 - np.sqrt(self.passed)) ** 2 * s + np.minimum(n, through))
+        return max(float(10 * np.log10(left / np.sum(s * n / (through + n)))), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +123,15 @@ class PictureStatistics:
     """One standard deviation of the noise: at the frequencies where signal and noise are about equal."""
     measured: bool = True
     """False where the picture told nothing, and the values stand in for it."""
+    misfit: float = 0.0
+    """RMS of the natural logarithm of |G|² over the fit's |K|² S + N, cell by cell."""
+    places: PlaceStatistics | None = None
+    """Of a picture that the rings do not fit; None: they do."""
+
+    @property
+    def unevenness(self) -> float:
+        """0 where S is even over each ring, up to 1 where it lies at few places."""
+        return 0.0 if self.places is None else self.places.weight
 
     @property
     def noise_to_signal(self) -> Array:
@@ -119,6 +176,8 @@ class PictureStatistics:
         """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured."""
         if not self.measured:
             return 0.0
+        if self.places is not None:
+            return self.places.expected_gain_db(self.signal, self.noise)
         area = self.frequency
         through = self.passed * self.signal
         left = np.sum(area * ((1 - np.sqrt(self.passed)) ** 2 * self.signal + self.noise))
@@ -158,9 +217,15 @@ def measure_picture(
     luma, red, _ = cv2.split(cv2.cvtColor(_some_rows(picture), cv2.COLOR_RGB2YCrCb))
     cells, white_levels = _RingCells(passed), white_noise(luma)
     noise_levels = _fit_rings(light, cells, white_levels).noise_levels
+    grey = observed(0, 1)
+    of_luma = replace(_fit_rings(grey, cells, white_levels), noise_levels=noise_levels)
+    of_chroma = _fit_rings(colour, _RingCells(passed[::2]), white_noise(red))
+    weight = _unevenness(max(of_luma.misfit, _scatter(of_luma, grey, passed) / _SINGLE_PLACES), len(chosen))
+    if not weight:
+        return of_luma, of_chroma
     return (
-        replace(_fit_rings(observed(0, 1), cells, white_levels), noise_levels=noise_levels),
-        _fit_rings(colour, _RingCells(passed[::2]), white_noise(red)),
+        replace(of_luma, places=_place_statistics(of_luma, grey, passed, weight)),
+        replace(of_chroma, places=_place_statistics(of_chroma, colour, passed[::2], weight)),
     )
 
 
@@ -168,6 +233,68 @@ def _some_rows(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Every other four rows of a picture (height, width, 3): enough for :func:`white_noise`, which looks at such."""
     height, width, channels = picture.shape
     return picture[: height - height % 8].reshape(-1, 8, width, channels)[:, :4].reshape(-1, width, channels)
+
+
+def _unevenness(misfit: float, tiles: int) -> float:
+    """0 where a misfit on so many tiles is an ordinary picture's, to 1 where its power lies at few places."""
+    misfit *= min(1.0, float(np.sqrt(tiles / MANY_TILES)))
+    return float(np.clip((misfit - _LITTLE_MISFIT) / (_LARGE_MISFIT - _LITTLE_MISFIT), 0.0, 1.0))
+
+
+def _scatter(rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32]) -> float:
+    """Standard deviation of ln |G|² about the fit's along the axes, where upright things have their power.
+
+    Boards, print and the coder's blocks have more of it there than elsewhere, but about as much everywhere; upright
+    bars and lying blinds have theirs at few places.  observed, passed: as in :func:`_place_statistics`.
+    """
+    rows, columns = _axes()
+    ring = _place_ring()[rows, columns]
+    seen, k = (spectra[:, rows, columns].mean(axis=0) for spectra in (observed, passed))
+    return float(np.std(np.log(np.maximum(seen, _ROUNDING_POWER) / (k * rings.signal[ring] + rings.noise[ring]))))
+
+
+@lru_cache(maxsize=1)
+def _axes() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the places of :func:`_power` that :func:`_ring_index` leaves out near the axes."""
+    fy, fx = np.fft.fftfreq(_SIDE)[:, None], np.arange(1, _SIDE // 2)[None, :] / _SIDE
+    radius = np.hypot(fx, fy)
+    rows, columns = np.nonzero((_ring_index(_SIDE) == RINGS) & (radius > 2.5 / _SIDE) & (radius < 0.5))
+    return rows, columns
+
+
+def _place_statistics(
+    rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32], weight: float
+) -> PlaceStatistics:
+    """S of each place, (|G|² − N) / |K|² around it, as far as that is known; else what is typical of its ring.
+
+    Typical is the mean of the logarithm, which a few strong places do not raise, over those that come through the blur.
+    observed, passed: |G|² and |K|² of the tiles, (n, _SIDE, _SIDE / 2 - 1).
+    """
+    count, ring = _INDEPENDENT * len(observed), _place_ring()
+    signal, noise = rings.signal[ring], rings.noise[ring]
+    seen, k = (_around(np.asarray(spectra.mean(axis=0))) for spectra in (observed, passed))
+    k = np.maximum(k, 1e-6)
+    own, doubt = (seen - noise) / k, noise / (k * np.sqrt(count))
+    most = np.maximum(_STEEPEST_PLACE * signal, seen - noise)
+    logarithms = np.log(np.clip(own, np.minimum(doubt, signal), most) / signal)
+    reliable = k * signal / (k * signal + noise)
+    sums, counts = (np.bincount(ring.ravel(), w.ravel(), RINGS) for w in (reliable * logarithms, reliable))
+    typical = signal * np.exp(np.minimum(sums / (counts + _FEW_PLACES), 0.0))[ring]
+    known = count / (count + (1 + noise / (k * typical)) ** 2)
+    found = np.clip(typical + known * (own - typical), np.minimum(doubt, typical), most)
+    return PlaceStatistics(weight, ((found / signal) ** weight).astype(np.float32), k.astype(np.float32))
+
+
+def _around(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean of each place and its eight neighbours; the rows go round."""
+    return cv2.blur(cv2.copyMakeBorder(spectrum, 1, 1, 0, 0, cv2.BORDER_WRAP), (3, 3))[1:-1]
+
+
+@lru_cache(maxsize=1)
+def _place_ring() -> NDArray[np.intp]:
+    """Ring of each place of :func:`_power`, the highest for those beyond half a cycle per pixel."""
+    fy, fx = np.fft.fftfreq(_SIDE)[:, None], np.arange(1, _SIDE // 2)[None, :] / _SIDE
+    return np.minimum((np.hypot(fx, fy) / 0.5 * RINGS).astype(np.intp), RINGS - 1)
 
 
 def _evenly_steep(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
@@ -319,7 +446,15 @@ def _fit_rings(observed: NDArray[np.float32], cells: _RingCells, white_levels: f
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
     spread = np.sqrt(np.maximum((count * k * k).sum(1) / in_ring - mean_k**2, 0))
     determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
-    return _settled(signal, noise, mean_k, mean_g, determined, white_levels)
+    settled = _settled(signal, noise, mean_k, mean_g, determined, white_levels)
+    return replace(settled, misfit=_misfit(count, g, settled.noise[:, None] + settled.signal[:, None] * k))
+
+
+def _misfit(count: Array, observed: Array, expected: Array) -> float:
+    """RMS of ln(observed / expected) over the cells, by their places; of what is below the rounding's power, none."""
+    weight = count * (count >= _PLACES_IN_CELL)
+    logarithms = np.log(np.maximum(observed, _ROUNDING_POWER) / np.maximum(expected, _ROUNDING_POWER))
+    return float(np.sqrt(np.sum(weight * logarithms**2) / max(np.sum(weight), 1.0)))
 
 
 def _settled(
@@ -411,16 +546,40 @@ def packed_frequency(size: int) -> NDArray[np.float32]:
 
 
 def on_spectrum(
-    statistics: PictureStatistics, ring_values: Array, size: int, scale: float = 1.0
+    statistics: PictureStatistics, ring_values: Array, size: int, scale: float = 1.0, by_place: bool = True
 ) -> NDArray[np.float32]:
     """Noise-to-signal of the rings spread over a packed spectrum of a tile; falls as f² below the lowest ring.
 
-    scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.
+    scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.  by_place: where S
+    is uneven, by each place's own.
     """
-    below, part, falling = _between_rings(size, scale * float(statistics.frequency[0] + statistics.frequency[-1]) / 0.5)
+    below, part, falling = _between_rings(size, _widening(statistics, scale))
     levels = np.log(ring_values).astype(np.float32)
-    values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below])
-    return np.asarray(values * falling, np.float32)
+    values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below]) * falling
+    if statistics.places is not None and by_place:
+        values = values / _spread_places(statistics.places.share, size, _widening(statistics, scale))
+    return np.asarray(values, np.float32)
+
+
+def _widening(statistics: PictureStatistics, scale: float) -> float:
+    """Pixels of the picture whose rings were measured per pixel of a tile."""
+    return scale * float(statistics.frequency[0] + statistics.frequency[-1]) / 0.5
+
+
+def _spread_places(share: NDArray[np.float32], size: int, scale: float) -> NDArray[np.float32]:
+    """Values at the places of :func:`_power` on a packed spectrum (size, size); the nearest beyond them."""
+    rising = np.roll(share, _SIDE // 2, axis=0)
+    return cv2.remap(rising, *_on_places(size, scale), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@lru_cache(maxsize=8)
+def _on_places(size: int, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row, rows from the lowest frequency on, at which each place of a packed spectrum lies."""
+    packed = (np.arange(size) + 1) // 2 / size
+    fx, fy = (a.copy() for a in np.broadcast_arrays(packed[None, :], np.fft.fftfreq(size)[:, None]))
+    fx[:, -1] = 0.5
+    fy[:, 0] = fy[:, -1] = packed
+    return (fx / scale * _SIDE - 1).astype(np.float32), (fy / scale * _SIDE + _SIDE // 2).astype(np.float32)
 
 
 @lru_cache(maxsize=8)
