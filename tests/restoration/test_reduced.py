@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import KernelField
-from virest.restoration import deblur
+from virest.restoration import blurred, clipped_light, colour, tile_layout
 from virest.restoration.settings import PRESETS
 from virest.restoration.statistics import PictureStatistics
 
@@ -25,15 +25,15 @@ def _field(centres_px: NDArray[np.float64]) -> KernelField:
     return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5)
 
 
-def _blurred(picture: NDArray[np.uint8]) -> deblur.BlurredPicture:
+def _blurred(picture: NDArray[np.uint8]) -> blurred.BlurredPicture:
     frequency = (np.arange(24) + 0.5) / 48
     statistics = PictureStatistics(frequency, frequency**-3.0, np.ones(24), np.ones(24), 1.0)
-    return deblur.blurred_picture(picture, CURVE, (statistics, statistics), _field, 12.0)
+    return blurred.blurred_picture(picture, CURVE, (statistics, statistics), _field, 12.0)
 
 
 def test_kernels_and_light_go_to_the_smaller_picture() -> None:
     """A pixel of the small picture has the kernel of the place that it shows, shortened; one grey stays that grey."""
-    small = deblur._reduced(_blurred(np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8)), 1.5)
+    small = blurred.reduced(_blurred(np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8)), 1.5)
     assert small.light[0].shape == (80, 112)
     assert np.ptp(small.light[0]) < 1e-6
     assert small.slopes(1, 40, (112, 80)).shape == (80, 112)
@@ -47,7 +47,7 @@ def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
     """A lamp is a hole of the small picture that covers all of it, and nothing far from it."""
     picture = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
     picture[40:47, 90:101] = 255
-    hole = deblur._reduced(_blurred(picture), 1.5).clipped[0]
+    hole = blurred.reduced(_blurred(picture), 1.5).clipped[0]
     assert hole is not None
     rows, columns = np.nonzero(hole)
     assert (rows.min(), rows.max()) == (26, 31)
@@ -57,7 +57,7 @@ def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
 def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator) -> None:
     """Whole squares, and the narrower rest at the right and below, each have the mean of their own pixels."""
     plane = rng.random((11, 16)).astype(np.float32)
-    means = deblur._block_means(plane, 3)
+    means = colour._block_means(plane, 3)
     assert means.shape == (4, 6)
     expected = [[plane[r : r + 3, c : c + 3].mean() for c in range(0, 16, 3)] for r in range(0, 11, 3)]
     np.testing.assert_allclose(means, expected, rtol=1e-5)
@@ -73,7 +73,7 @@ def test_tiles_are_as_large_as_their_kernels_hold() -> None:
 
         blurred = _blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
         statistics = replace(blurred.statistics, noise_levels=noise_levels)
-        return deblur._kernel_holds_px(replace(blurred, field=field, statistics=statistics))
+        return tile_layout._kernel_holds_px(replace(blurred, field=field, statistics=statistics))
 
     assert side(0.02, 1.0) == pytest.approx(side(0.01, 1.0) / 2, rel=1e-6)
     assert side(0.01, 0.5) == pytest.approx(side(0.01, 1.0) / 2, rel=1e-6)
@@ -89,7 +89,7 @@ def test_a_path_longer_than_its_tiles_still_fits_them() -> None:
         return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5)
 
     long = replace(blurred, field=field, longest_px=460.0)
-    deconvolution = deblur._luma_tiles(long, PRESETS["fast"], deblur.THINNEST_MARGIN)
+    deconvolution = tile_layout.luma_tiles(long, PRESETS["fast"], tile_layout.THINNEST_MARGIN)
     assert deconvolution.size >= 465
     ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
     projected = deconvolution.back_projected(blurred.light[0])
@@ -101,7 +101,7 @@ def test_the_measured_part_is_looked_for_around_holes_only() -> None:
     """It is 0 in the holes, rises within the codec's reach, and is 1 beyond; at the picture's corner too."""
     holes = np.zeros((HEIGHT, WIDTH), np.float32)
     holes[2:9, 3:14] = 1
-    part = deblur._measured_part(holes)
+    part = clipped_light.measured_part(holes)
     assert part[holes > 0].max() == 0
     assert 0 < part[5, 18] < part[5, 22] < 1
     assert part[5, 40] == part[60, 5] == 1
@@ -111,9 +111,9 @@ def test_the_measured_part_is_looked_for_around_holes_only() -> None:
 def test_any_channel_may_be_clipped() -> None:
     """1 where the brightest channel is clipped, whichever it is, and None where none is."""
     picture = np.full((30, 44, 3), 100, np.uint8)
-    assert deblur.clipped_anywhere(picture, CURVE) is None
+    assert blurred.clipped_anywhere(picture, CURVE) is None
     picture[3, 5, 0] = picture[7, 11, 1] = picture[13, 17, 2] = 255
-    found = deblur.clipped_anywhere(picture, CURVE)
+    found = blurred.clipped_anywhere(picture, CURVE)
     assert found is not None
     assert np.argwhere(found).tolist() == [[3, 5], [7, 11], [13, 17]]
     assert found.max() == 1

@@ -20,19 +20,11 @@ from virest.degradation.light import FrameLight, equivalent_length_px, frame_lig
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
-from virest.restoration.deblur import (
-    BAND_ROWS,
-    FEW_ITERATIONS,
-    BlurredPicture,
-    LightOfRows,
-    blurred_picture,
-    clipped_anywhere,
-    deblur,
-    measured_share,
-    near_clipped,
-    unseen_masks,
-)
-from virest.restoration.settings import RestorationSettings
+from virest.restoration.bands import BAND_ROWS
+from virest.restoration.blurred import BlurredPicture, LightOfRows, blurred_picture, clipped_anywhere
+from virest.restoration.clipped_light import measured_share, near_clipped, unseen_masks
+from virest.restoration.deblur import deblur
+from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics import FEW_TILES, MANY_TILES, PictureStatistics, falling_power, measure_picture
 

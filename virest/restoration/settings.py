@@ -15,6 +15,8 @@ DEBLUR_METHODS = (
 )
 SHUTTER_METHODS = ("none", "perspective", "rowwise")
 REFERENCES = ("exposure-start", "frame-middle")
+FEW_ITERATIONS = 2
+"""Up to so many, what is dear beside the iterations is done more coarsely."""
 
 
 @dataclass(frozen=True, slots=True)

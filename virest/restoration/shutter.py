@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, dense_map, straightened_points
-from virest.restoration.deblur import BAND_ROWS
+from virest.restoration.bands import BAND_ROWS
 
 
 def rowwise_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:

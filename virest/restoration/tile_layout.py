@@ -1,0 +1,98 @@
+"""How a picture is cut into tiles, and the noise that each of them is taken to have."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from virest.degradation.blur import Image
+from virest.restoration import tiles
+from virest.restoration.blurred import BlurredPicture
+from virest.restoration.settings import RestorationSettings
+from virest.restoration.statistics import PictureStatistics, on_spectrum
+
+Surroundings = tuple[float, int, int]
+FULL_MARGIN, THIN_MARGIN, THINNEST_MARGIN = (0.0, 16, 16), (0.3, 4, 16), (0.3, 3, 12)
+"""What a tile sees around it is as long as the blur path, less this part of the tiles' overlap; its least length, px;
+and the least length of the tile's bridge.
+
+The bridge is as long as the path: a steep one is an edge that the deconvolution carries into the tile.  Where tiles
+overlap widely, a window's ramp gives next to no weight to what a margin would keep away; the thinnest margins are for
+pictures that are reduced.
+"""
+COARSE_OVERLAP, FINE_OVERLAP, WIDE_OVERLAP = 6, 4, 3
+"""Tiles overlap by this part of their side: those of colour, those of luma, and those of luma in few iterations."""
+MOST_WRONG, LEAST_TILE, FIELD_SAMPLES = 0.7, 0.7, (6, 5)
+"""Error in noises that a tile's kernel may make of edges half a step away; part of the preset's side to which tiles
+shrink for it; rows and columns of places at which the kernels' change is looked at."""
+OVERLAP_GIVE = 0.1
+"""Wide overlaps may be narrower by so much, where fewer tiles then reach to the picture's edge."""
+BORDER_NOISE_TO_SIGNAL = 0.003
+"""Least N / S of tiles that see beyond the picture."""
+UNEVEN_NOISE_TO_SIGNAL = 0.03
+"""Least N / S of a picture whose power lies at few places: an error of the kernel there, or of what a tile sees around
+itself, is by so much in proportion to the power, and stands out of the noise."""
+
+
+def luma_tiles(
+    blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
+) -> tiles.TileDeconvolution:
+    """Tiles over the picture."""
+    if around is FULL_MARGIN:
+        return tile_deconvolution(blurred, settings.tile_px, FINE_OVERLAP, around=around)
+    side = int(np.clip(_kernel_holds_px(blurred), LEAST_TILE * settings.tile_px, settings.tile_px))
+    return tile_deconvolution(blurred, side, WIDE_OVERLAP, around=around)
+
+
+def _kernel_holds_px(blurred: BlurredPicture) -> float:
+    """Side of a tile at whose middle's kernel half a step away, a third of its side, moves edges by a noise's worth.
+
+    Paths change over the picture as the camera rolls and as the rows go by; under noise that matters less.
+    """
+    height, width = blurred.light[0].shape
+    y, x = (
+        (np.arange(count) + 0.5) * length / count for count, length in zip(FIELD_SAMPLES, (height, width), strict=True)
+    )
+    field = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+    paths_px = field.paths_px[:, ::4].reshape(len(y), len(x), -1, 2)
+    changes = [np.diff(paths_px, axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
+    per_px = np.sqrt(0.5 * sum(np.mean(np.linalg.norm(c, axis=-1).mean(-1)) ** 2 for c in changes))
+    wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
+    return float(3 * wrong_px / max(per_px, 1e-6))
+
+
+def tile_deconvolution(
+    blurred: BlurredPicture,
+    side: int,
+    overlap_parts: int,
+    scale: float = 1.0,
+    around: Surroundings = FULL_MARGIN,
+) -> tiles.TileDeconvolution:
+    """Tiles over the picture, or over one that is ``scale`` times smaller, with kernels to its measure."""
+    height, width = (int(np.ceil(length / scale)) for length in blurred.light[0].shape)
+    per_overlap, least_margin_px, least_bridge_px = around
+    seen_px = blurred.longest_px - per_overlap * side / overlap_parts
+    margin = int(np.clip(seen_px / scale, least_margin_px / scale, 96))
+    bridge = int(np.clip(blurred.longest_px / scale, least_bridge_px / scale, 96))
+    give = OVERLAP_GIVE if overlap_parts == WIDE_OVERLAP else 0.0
+    grid = tiles.quick_grid(height, width, int(side / scale), 2 * margin + bridge, overlap_parts, give)
+    field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
+    kernels = field.scaled(1 / scale).arrays()
+    held = kernels.shape[1] // 2 + 1 - (0 if around is FULL_MARGIN else grid.side // 2)
+    return tiles.TileDeconvolution(grid, kernels, max(margin, held), bridge)
+
+
+def noise_to_signal(
+    deconvolution: tiles.TileDeconvolution,
+    settings: RestorationSettings,
+    statistics: PictureStatistics,
+    scale: float = 1.0,
+) -> tuple[Image, Image]:
+    """Measured N / S on a tile's spectrum: for tiles inside the picture, and for those that see beyond it."""
+    ratio = on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size, scale)
+    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)
+    if statistics.unevenness:
+        least = np.float32(UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness)
+        ratio, guarded, mean = np.maximum(ratio, least), np.maximum(guarded, least), ratio[0, 0]
+        ratio[0, 0] = mean
+    guarded[0, 0] = ratio[0, 0]
+    return ratio, guarded

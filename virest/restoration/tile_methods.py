@@ -1,0 +1,207 @@
+"""Methods that restore a picture tile by tile: filters, and the hyper-Laplacian by half-quadratic splitting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from virest.degradation.blur import Image
+from virest.restoration import tiles
+from virest.restoration.bands import BAND_ROWS
+from virest.restoration.blurred import BlurredPicture, LightOfRows, luma_of, reduced
+from virest.restoration.clipped_light import measured_part
+from virest.restoration.colour import with_colour
+from virest.restoration.deconvolution import LEVELS_PER_UNIT, shrinkage_levels
+from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
+from virest.restoration.statistics import PictureStatistics, on_spectrum
+from virest.restoration.tile_layout import (
+    BORDER_NOISE_TO_SIGNAL,
+    FULL_MARGIN,
+    THIN_MARGIN,
+    THINNEST_MARGIN,
+    UNEVEN_NOISE_TO_SIGNAL,
+    Surroundings,
+    luma_tiles,
+    noise_to_signal,
+)
+
+REDUCTIONS = (1.5, 4 / 3)
+"""A picture so many times smaller serves few iterations as well, where noise hides all finer detail."""
+FEW_SCALE = 0.6
+"""Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
+FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
+"""Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
+RESIDUAL_SHARE = 0.05
+"""Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
+LINEAR_SHARE = 0.5
+"""Of a picture whose power lies at few places, the linear filter's part: the prior makes its waves steps."""
+
+
+def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
+    """One linear filter for each tile."""
+    deconvolution = luma_tiles(blurred, settings)
+    projected = _projected_luma(blurred, deconvolution, settings)
+    factors = _tile_factors(deconvolution, settings, blurred.statistics)
+    sharp = deconvolution.blend(cv2.multiply(s, f) for s, f in zip(projected, factors, strict=True))
+    return with_colour(blurred, deconvolution.with_lamps(sharp), settings)
+
+
+def _tile_factors(
+    deconvolution: tiles.TileDeconvolution, settings: RestorationSettings, statistics: PictureStatistics
+) -> Iterator[Image]:
+    """What follows conj(K) in each tile: by the method that the settings name, the measured N / S one by default."""
+    match settings.deblur:
+        case "inverse":
+            return deconvolution.filters(tiles.inverse_filter)
+        case "wiener":
+            weight = statistics.frequency
+            flat = float(np.sum(statistics.noise * weight) / np.sum(statistics.signal * weight))
+            ratio = np.full((deconvolution.size,) * 2, settings.strength**2 * flat, np.float32)
+            ratio[0, 0] = 0.0  # the mean is no noise
+            return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
+    ratio, guarded = noise_to_signal(deconvolution, settings, statistics.between_rings_and_level)
+    return deconvolution.filters(
+        lambda power: tiles.wiener_filter(power, ratio), lambda power: tiles.wiener_filter(power, guarded)
+    )
+
+
+def _projected_luma(
+    blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
+) -> Image:
+    """Spectra of Kᵀ g, (tiles, size, size); tiles with clipped light are tamed."""
+    luma, holes = luma_of(blurred.light), blurred.holes
+    if holes is not None:
+        numbers = deconvolution.touched(holes)
+        kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
+        deconvolution.tame(numbers, kernels, luma, measured_part(holes), float(luma.max()))
+    return deconvolution.back_projected(luma)
+
+
+def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
+    """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
+    times = _reduction(blurred.statistics, settings)
+    if times == 1.0:
+        around = THIN_MARGIN if settings.iterations <= FEW_ITERATIONS else FULL_MARGIN
+        return with_colour(blurred, tile_hyper_laplacian(blurred, settings, around), settings)
+    height, width = blurred.light[0].shape
+    small = replace(settings, tile_px=round(settings.tile_px / times))
+    sharp = tile_hyper_laplacian(reduced(blurred, times), small, THINNEST_MARGIN)
+    return with_colour(blurred, cv2.resize(sharp, (width, height), interpolation=cv2.INTER_CUBIC), settings)
+
+
+def _reduction(statistics: PictureStatistics, settings: RestorationSettings) -> float:
+    """How many times smaller the luma is restored: as much as loses nothing that stands out of the noise."""
+    few = settings.iterations <= FEW_ITERATIONS
+    return next((times for times in REDUCTIONS if few and statistics.finest < 0.5 / times), 1.0)
+
+
+def tile_hyper_laplacian(
+    blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
+) -> Image:
+    """The sharp luma, (height, width): Krishnan & Fergus 2009, each step over all tiles."""
+    deconvolution = luma_tiles(blurred, settings, around)
+    statistics, few = blurred.statistics, settings.iterations <= FEW_ITERATIONS
+    unit = statistics.gradient_scale * (FEW_SCALE if few else 1.0)
+    noise = settings.strength * np.array([statistics.noise_levels, _border_noise(blurred)])
+    trust, guarded = (float(t) for t in (unit / noise) ** 2)
+    gradients = tiles.gradient_power(deconvolution.size)
+    projected = _projected_luma(blurred, deconvolution, settings)
+    start = statistics.between_rings_and_level if few else statistics
+    ratios = noise_to_signal(deconvolution, settings, start)
+    linear = sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
+    emptier = _emptier(statistics, deconvolution.size)
+    before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
+    for step, beta in enumerate(beta_schedule(settings.iterations)):
+        ahead, before = _further_on(sharp, before, step), sharp
+        pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
+        pulled = deconvolution.pulled(projected, pull, beta / trust, beta / guarded)
+        inner, at_border = (gradients * np.float32(beta / t) + emptier for t in (trust, guarded))
+        sharp = deconvolution.blend(deconvolution.solutions(pulled, inner, at_border))
+    if settings.iterations > FEW_ITERATIONS:
+        sharp += _returned_residual(deconvolution, projected, sharp, statistics)
+    if statistics.unevenness:
+        share = LINEAR_SHARE * statistics.unevenness
+        sharp = cv2.addWeighted(linear, share, sharp, 1 - share, 0.0)
+    return deconvolution.with_lamps(sharp)
+
+
+def _emptier(statistics: PictureStatistics, size: int) -> Image | np.float32:
+    """N / S beyond that of the rings: a prior of gradients lets noise through where a grating leaves nothing."""
+    if not statistics.unevenness:
+        return np.float32(0)
+    rings = on_spectrum(statistics, statistics.noise_to_signal, size, by_place=False)
+    places = on_spectrum(statistics, statistics.noise_to_signal, size)
+    least = np.float32(UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness)
+    emptier = cv2.max(cv2.subtract(np.maximum(places, least), rings), 0.0)
+    emptier[0, 0] = 0.0
+    return emptier
+
+
+def _further_on(sharp: Image, before: Image, step: int) -> Image:
+    """The picture on along its last step, by more as the steps settle: it takes two thirds as many of them.
+
+    Nesterov 1983's momentum, as Beck and Teboulle 2009 (doi:10.1137/080716542) apply it to shrinkage.
+    """
+    momentum = step / (step + 1)
+    return cv2.addWeighted(sharp, 1 + momentum, before, -momentum, 0.0) if momentum else sharp
+
+
+def _border_noise(blurred: BlurredPicture) -> float:
+    """Noise to assume where tiles see beyond the picture, grey levels: what is guessed there is a rough guess.
+
+    A weakly regularised inverse would carry the guess's error many blur lengths inwards.
+    """
+    statistics = blurred.statistics
+    power = np.interp(2.0 / max(blurred.longest_px, 4.0), statistics.frequency, statistics.signal)
+    return max(statistics.noise_levels, float(np.sqrt(BORDER_NOISE_TO_SIGNAL * power)))
+
+
+def _returned_residual(
+    deconvolution: tiles.TileDeconvolution, projected: Image, sharp: Image, statistics: PictureStatistics
+) -> Image:
+    """Fine texture that the prior took for noise: the residual g − K f, filtered as a picture of little power."""
+    ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
+    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
+    left = (
+        cv2.subtract(back, cv2.multiply(power, spectrum))
+        for back, power, spectrum in zip(projected, deconvolution.powers, deconvolution.spectra(sharp), strict=True)
+    )
+    return deconvolution.blend(deconvolution.solutions(left, ratio, guarded))
+
+
+def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:
+    """Dᵀ w, with w the shrunk gradients; factors: w / v over |v| · 32, as :func:`shrinkage_levels` tabulates it.
+
+    Band by band: what is worked on stays in the cache.
+    """
+    pull = np.zeros_like(sharp)
+    for top in range(0, len(sharp), BAND_ROWS):
+        rows = slice(top, top + BAND_ROWS + 1)
+        band, steepness, pulled = sharp[rows], scale[rows], pull[rows]
+        _pull_along(band[:-1], band[1:], steepness[:-1], factors, pulled[:-1], pulled[1:])
+        band, steepness, pulled = (p[top : top + BAND_ROWS] for p in (sharp, scale, pull))
+        _pull_along(band[:, :-1], band[:, 1:], steepness[:, :-1], factors, pulled[:, :-1], pulled[:, 1:])
+    return pull
+
+
+def _pull_along(
+    behind: Image, ahead: Image, steepness: Image, factors: Image, pull_behind: Image, pull_ahead: Image
+) -> None:
+    """Add the shrunk gradient between neighbours to the pull on the one ahead, and take it from the one behind."""
+    if not len(behind):
+        return
+    gradient = cv2.subtract(ahead, behind)
+    level = cv2.convertScaleAbs(cv2.multiply(gradient, steepness), alpha=LEVELS_PER_UNIT)
+    gradient = cv2.multiply(gradient, cv2.LUT(level, factors))
+    pull_ahead += gradient
+    pull_behind -= gradient
+
+
+def beta_schedule(iterations: int, first: float = FIRST_BETA) -> tuple[float, ...]:
+    """Rising penalties of the half-quadratic splitting, in units of the gradients' own scale."""
+    if iterations <= FEW_ITERATIONS:
+        return FEW_BETAS[-max(iterations, 1) :]
+    return tuple(float(b) for b in np.geomspace(first, LAST_BETA, iterations))
