@@ -1,6 +1,12 @@
-"""How much of a picture is worked on at a time."""
+"""How much of a picture is worked on at a time, where several steps follow each other: it stays in the cache."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 BAND_ROWS = 64
-"""Of a picture, that stay in the cache."""
+
+
+def bands(height: int) -> Iterator[slice]:
+    """Rows of a picture, band by band."""
+    return (slice(top, min(top + BAND_ROWS, height)) for top in range(0, height, BAND_ROWS))

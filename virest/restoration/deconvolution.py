@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.restoration.bands import bands
+
 Image = NDArray[np.float32]
 Operator = Callable[[Image], Image]
 ALPHA = 2.0 / 3.0
@@ -103,30 +105,38 @@ def difference_adjoint(gradient: Image, axis: int) -> Image:
 
 def add_roughness(result: Image, picture: Image, weight: Image) -> None:
     """Add Dᵀ w D of a picture to the result, with the forward differences D along both axes."""
-    for turned in (False, True):
-        x, w, total = (plane.T if turned else plane for plane in (picture, weight, result))
+    for rows in bands(len(picture)):
+        x, w, total = (plane[rows.start : rows.stop + 1] for plane in (picture, weight, result))
         steps = (x[1:] - x[:-1]) * w[:-1]
         total[:-1] -= steps
         total[1:] += steps
+        x, w, total = (plane[rows] for plane in (picture, weight, result))
+        steps = (x[:, 1:] - x[:, :-1]) * w[:, :-1]
+        total[:, :-1] -= steps
+        total[:, 1:] += steps
 
 
 def conjugate_gradients(normal: Operator, right: Image, start: Image, precondition: Image, iterations: int) -> Image:
     """Solve normal(x) = right for a symmetric positive operator; precondition: about its inverse diagonal."""
     x = start.copy()
     residual = right - normal(x)
-    direction = precondition * residual
-    energy = float(np.vdot(residual, direction))
-    conjugate = direction
+    conjugate = precondition * residual
+    energy = float(np.vdot(residual, conjugate))
     for _ in range(iterations):
         if energy <= 0:
             break
         product = normal(conjugate)
-        step = energy / max(float(np.vdot(conjugate, product)), 1e-20)
-        x += np.float32(step) * conjugate
-        residual -= np.float32(step) * product
-        direction = precondition * residual
-        before, energy = energy, float(np.vdot(residual, direction))
-        conjugate = direction + np.float32(energy / before) * conjugate
+        step = np.float32(energy / max(float(np.vdot(conjugate, product)), 1e-20))
+        before, energy = energy, 0.0
+        for rows in bands(len(x)):
+            x[rows] += step * conjugate[rows]
+            residual[rows] -= step * product[rows]
+            product[rows] = precondition[rows] * residual[rows]
+            energy += float(np.vdot(residual[rows], product[rows]))
+        kept = np.float32(energy / before)
+        for rows in bands(len(x)):
+            conjugate[rows] *= kept
+            conjugate[rows] += product[rows]
     return x
 
 
@@ -162,7 +172,9 @@ def hyper_laplacian(
             right += difference_adjoint(unit_slope * target, axis)
 
         def normal(x: Image, data: Image = data) -> Image:
-            result = adjoint(data * apply(x))
+            blurred = apply(x)
+            blurred *= data
+            result = adjoint(blurred)
             add_roughness(result, x, squared)
             return result
 

@@ -20,7 +20,7 @@ from virest.degradation.light import FrameLight, equivalent_length_px, frame_lig
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
-from virest.restoration.bands import BAND_ROWS
+from virest.restoration.bands import bands
 from virest.restoration.blurred import BlurredPicture, LightOfRows, blurred_picture, clipped_anywhere
 from virest.restoration.clipped_light import measured_share, near_clipped, unseen_masks
 from virest.restoration.deblur import deblur
@@ -216,15 +216,15 @@ def _encoded(light: LightOfRows, height: int, curve: ResponseCurve) -> NDArray[n
     """The stored picture (height, width, 3), through a table over the root of light, band by band."""
     low, high = curve.light_range
     table = _encoding_table(curve)
-    bands = []
-    for top in range(0, height, BAND_ROWS):
-        part = cv2.merge(light(slice(top, top + BAND_ROWS)))
+    encoded = []
+    for rows in bands(height):
+        part = cv2.merge(light(rows))
         if (low, high) != (0.0, 1.0):
             part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
         root = cv2.sqrt(cv2.threshold(part, 0.0, 0.0, cv2.THRESH_TOZERO)[1])
         steps = cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U)
-        bands.append(cv2.LUT(steps, table))
-    return np.concatenate(bands)
+        encoded.append(cv2.LUT(steps, table))
+    return np.concatenate(encoded)
 
 
 def _beyond_the_curve_kept(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, dense_map, straightened_points
-from virest.restoration.bands import BAND_ROWS
+from virest.restoration.bands import bands
 
 
 def rowwise_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
@@ -36,8 +36,7 @@ def warp(picture: NDArray[np.uint8], source_px: NDArray[np.float32]) -> NDArray[
     """
     levels = picture.astype(np.float32)
     warped = np.empty((*source_px.shape[:2], *picture.shape[2:]), np.uint8)
-    for top in range(0, len(warped), BAND_ROWS):
-        rows = slice(top, top + BAND_ROWS)
+    for rows in bands(len(warped)):
         read = cv2.remap(levels, source_px[rows], None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         cv2.convertScaleAbs(cv2.max(read, 0.0, dst=read), warped[rows])
     return warped

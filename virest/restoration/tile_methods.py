@@ -10,7 +10,7 @@ import numpy as np
 
 from virest.degradation.blur import Image
 from virest.restoration import tiles
-from virest.restoration.bands import BAND_ROWS
+from virest.restoration.bands import bands
 from virest.restoration.blurred import BlurredPicture, LightOfRows, luma_of, reduced
 from virest.restoration.clipped_light import measured_part
 from virest.restoration.colour import with_colour
@@ -178,11 +178,10 @@ def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:
     Band by band: what is worked on stays in the cache.
     """
     pull = np.zeros_like(sharp)
-    for top in range(0, len(sharp), BAND_ROWS):
-        rows = slice(top, top + BAND_ROWS + 1)
-        band, steepness, pulled = sharp[rows], scale[rows], pull[rows]
+    for rows in bands(len(sharp)):
+        band, steepness, pulled = (p[rows.start : rows.stop + 1] for p in (sharp, scale, pull))
         _pull_along(band[:-1], band[1:], steepness[:-1], factors, pulled[:-1], pulled[1:])
-        band, steepness, pulled = (p[top : top + BAND_ROWS] for p in (sharp, scale, pull))
+        band, steepness, pulled = (p[rows] for p in (sharp, scale, pull))
         _pull_along(band[:, :-1], band[:, 1:], steepness[:, :-1], factors, pulled[:, :-1], pulled[:, 1:])
     return pull
 

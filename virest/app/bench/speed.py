@@ -34,9 +34,10 @@ from virest.restoration.settings import PRESETS as SETTINGS
 
 FLOOR = "floor"
 ARGUMENTS = {FLOOR: ("--preset", "fast", "--deblur", "none"), **{preset: ("--preset", preset) for preset in PRESETS}}
-FRAMES = {FLOOR: 120, "fast": 120, "balanced": 80, "best": 20}
-QUICK_FRAMES = {FLOOR: 60, "fast": 60, "balanced": 40, "best": 20}
-"""Frames N with two processes, in segments of ten; one process gets half as many."""
+FRAMES = {FLOOR: 120, "fast": 120, "balanced": 120, "best": 60}
+QUICK_FRAMES = dict.fromkeys(FRAMES, 60)
+"""Frames N with two processes, in segments of ten; one process gets half as many.  Whole loops of the capture, whose
+frames are not blurred alike."""
 JOBS = 2
 PEER_TRIES = 2
 """The quicker one counts."""
