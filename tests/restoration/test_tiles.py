@@ -10,14 +10,17 @@ import pytest
 from laws import psnr_db, random_picture, texture
 from numpy.typing import NDArray
 
-from virest.degradation.blur import fast_size, tile_grid
+from virest.degradation.blur import Image, fast_size, tile_grid
 from virest.restoration.statistics import packed_frequency
 from virest.restoration.tiles import (
     TileDeconvolution,
+    _ends,
+    _ends_product,
+    _inner_numbers,
+    _power_at_ends,
+    _power_inside,
     gradient_power,
     inverse_filter,
-    packed_power,
-    packed_product,
     quick_grid,
     wiener_filter,
 )
@@ -44,6 +47,22 @@ def _lopsided_kernel(size: int = 15) -> NDArray[np.float32]:
     cv2.polylines(kernel, [points[:, None]], False, 1.0)
     kernel[8, 10] += 2
     return kernel / kernel.sum()
+
+
+def packed_power(spectrum: Image) -> Image:
+    """|K|² of packed spectra as tiles have it."""
+    power = np.empty_like(spectrum)
+    _power_inside(spectrum, power)
+    _power_at_ends(spectrum, power)
+    return power
+
+
+def packed_product(first: Image, second: Image) -> Image:
+    """Multiply packed spectra as tiles do."""
+    product = np.empty_like(first)
+    np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(product))
+    _ends(product)[:] = _ends_product(_ends(first), _ends(second))
+    return product
 
 
 @pytest.mark.parametrize("size", SIZES)

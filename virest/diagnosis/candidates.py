@@ -54,7 +54,6 @@ class Candidate:
     added: tuple[Term, ...]
     effect: GeometricEffect | None
     word: str = ""
-    terms_with: int = 0
 
 
 def worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate]) -> list[Candidate]:

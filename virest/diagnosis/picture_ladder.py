@@ -64,7 +64,6 @@ MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
 BLUR_Z = 3.6
 MIN_DEFOCUS_PX = 0.5
 MIN_EXPOSURE_CHANGE = 0.08
-GREY_LEVELS = 255.0
 
 SENTENCES = {
     "response_curve": "the grey levels follow a gamma of {gamma} on top of the profile's curve",

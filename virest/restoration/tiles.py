@@ -252,33 +252,18 @@ def _bridge(length: int) -> Image:
     return np.stack([1 - smooth, smooth]).astype(np.float32)
 
 
-def packed_product(first: Image, second: Image) -> Image:
-    """The product of packed spectra (..., size, size): of their complex numbers, and of the columns that hold others.
-
-    OpenCV's own takes nearly twice as long, since it does not use the processor's vectors.
-    """
-    product = np.empty_like(first)
-    np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(product))
-    _ends(product)[:] = _ends_product(_ends(first), _ends(second))
-    return product
-
-
-def packed_power(spectrum: Image) -> Image:
-    """|K|² of packed spectra, as real factors for packed spectra; as :func:`packed_product`."""
-    power = np.empty_like(spectrum)
-    _power_inside(spectrum, power)
-    _power_at_ends(spectrum, power)
-    return power
-
-
 def _power_inside(spectrum: Image, power: Image) -> None:
-    """Write |K|² of all numbers but those of :func:`_ends`."""
+    """Write |K|² of all numbers but those of :func:`_ends`, as a real factor for packed spectra.
+
+    OpenCV's own products take nearly twice as long, since they do not use the processor's vectors.
+    """
     numbers, powers = _inner_numbers(spectrum), _inner_numbers(power)
     np.multiply(numbers, np.conjugate(numbers, out=powers), out=powers)
     powers *= np.complex64(1 + 1j)  # what is real, onto the imaginary places too
 
 
 def _power_at_ends(spectrum: Image, power: Image) -> None:
+    """Write |K|² of the numbers of :func:`_ends`, real parts on the imaginary places too."""
     ends = np.array(_ends(spectrum))
     ends *= ends
     ends[..., 1:-1:2, :] += ends[..., 2:-1:2, :]
@@ -306,18 +291,6 @@ def _ends_product(first: Image, second: Image) -> Image:
     product[real] -= product[imaginary]
     product[imaginary] = first[real] * second[imaginary] + first[imaginary] * second[real]
     return product
-
-
-def doubled(packed: Image) -> Image:
-    """Copy the real parts of a packed spectrum onto its imaginary places: a real factor for packed spectra.
-
-    OpenCV's packing: column 0 and the last hold their real and imaginary parts in alternate rows, all others in
-    alternate columns; the corners are real.  Sizes are even.
-    """
-    packed[:, 2:-1:2] = packed[:, 1:-2:2]
-    packed[2:-1:2, 0] = packed[1:-2:2, 0]
-    packed[2:-1:2, -1] = packed[1:-2:2, -1]
-    return packed
 
 
 @lru_cache(maxsize=8)
