@@ -8,28 +8,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from blurred_scene import FRAME, camera, record
+from blurred_scene import FRAME, MARGIN, camera, record, record_canvas
 from laws import TurningCamera, phone, psnr_db
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.restoration.frame import RestoredFrame, _most_blurred, copied_frame, encode_picture, restore_frame
+from virest.restoration.frame import RestoredFrame, _most_blurred, copied_frame, restore_frame
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 
 BALANCED = RestorationSettings()
 METHODS = [m for m in DEBLUR_METHODS if m != "none"]
-CURVES = {
-    "linear": ResponseCurve("linear"),
-    "srgb": ResponseCurve("srgb"),
-    "gamma": ResponseCurve("gamma", gamma=2.2),
-    "five_segment": ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.80), y_max=0.93),
-    "table": ResponseCurve("table", x=(0.0, 0.02, 0.1, 0.35, 0.7, 1.0), y=(0.0, 0.11, 0.33, 0.66, 0.9, 1.0)),
-    "wide table": ResponseCurve("table", x=(0.01, 0.5, 4.0), y=(0.02, 0.6, 0.98)),
-    "extended": ResponseCurve("srgb", extra_gamma=1.2, black_level=0.06),
-    "extended five_segment": ResponseCurve(
-        "five_segment", b=(0.1, 0.1), c=(0.7, 0.9), extra_gamma=0.8, black_level=0.03
-    ),
-}
+FIVE_SEGMENT = ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.80), y_max=0.93)
 
 
 def _restore(
@@ -51,25 +40,6 @@ def _shift_px(picture: NDArray[np.uint8], truth: NDArray[np.uint8], border: int 
     )
     window = cv2.createHanningWindow(one.shape[::-1], cv2.CV_32F)
     return float(np.hypot(*cv2.phaseCorrelate(one, two, window)[0]))
-
-
-# ── encoding ─────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-@pytest.mark.parametrize("curve", [pytest.param(c, id=n) for n, c in CURVES.items()])
-def test_encoding_undoes_the_table_at_every_level(curve: ResponseCurve) -> None:
-    """All 256 levels, through the table to light and back, are themselves, held between black and the curve's top."""
-    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    picture = np.stack([levels, levels.T, levels[::-1]], -1)
-    low, high = np.rint(255 * curve.encode(np.array(curve.light_range)))
-    light = list(cv2.split(cv2.LUT(picture, curve.linear_table())))
-    np.testing.assert_array_equal(encode_picture(light, curve), np.clip(picture, low, high))
-
-
-def test_encoding_holds_light_that_no_curve_reaches() -> None:
-    """Light below nothing and beyond the brightest becomes black and the top, never a wrapped-around level."""
-    light = [np.array([[-5.0, -1e-3, 1.001, 40.0]], np.float32)] * 3
-    np.testing.assert_array_equal(encode_picture(light, ResponseCurve("srgb"))[..., 0], [[0, 0, 255, 255]])
 
 
 # ── sharper, and in its place ────────────────────────────────────────────────────────────────────────────────────
@@ -235,6 +205,29 @@ def test_lights_in_the_dark_do_not_ring(settings: RestorationSettings) -> None:
     assert np.abs(result - picture)[far].max() <= 6
 
 
+@pytest.mark.parametrize(("preset", "left"), [("fast", 0.7), ("balanced", 0.45), ("best", 0.35)])
+def test_the_dark_beside_a_bright_colour_gets_its_own_colour_back(preset: str, left: float) -> None:
+    """A surface of one hue, light and shade in squares: the colour that blur carried into the shade is taken out again.
+
+    The luma's edges are the colour's.
+    """
+    turning = camera(reference="frame-middle")
+    height, width = turning.profile.height + 2 * MARGIN, turning.profile.width + 2 * MARGIN
+    squares = np.random.default_rng(5).random((height // 24 + 1, width // 24 + 1)) < 0.5
+    light = (0.02 + 0.9 * np.kron(squares, np.ones((24, 24)))).astype(np.float32)[:height, :width]
+    recorded = record_canvas(turning, light[..., None] * np.array([0.9, 0.5, 0.2], np.float32))
+    settings = replace(PRESETS[preset], shutter="none", reference="frame-middle")
+    restored = _picture(_restore(turning, recorded.picture, settings))
+    shade = recorded.truth[..., 1] < 60
+
+    def wrong(picture: NDArray[np.uint8]) -> float:
+        more_red = [p[..., 0].astype(float) - p[..., 2] for p in (picture, recorded.truth)]
+        inside = np.s_[30:-30, 30:-30]
+        return float(np.sqrt(np.mean((more_red[0] - more_red[1])[inside][shade[inside]] ** 2)))
+
+    assert wrong(restored) < left * wrong(recorded.picture)
+
+
 @pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
 def test_a_vivid_surface_keeps_its_colour(settings: RestorationSettings) -> None:
     """Green tiles too bright for one channel stay as green as they were, edges included."""
@@ -316,7 +309,7 @@ def test_the_log_holds_the_contracts_figures() -> None:
 def test_what_is_censored_all_around_stays_as_it_was(preset: str, level: int) -> None:
     """Inside an area beyond A or D, a blur length from its edge, the recorded grey level comes back."""
     turning = camera(reference="frame-middle")
-    turning = replace(turning, profile=replace(turning.profile, response=CURVES["five_segment"]))
+    turning = replace(turning, profile=replace(turning.profile, response=FIVE_SEGMENT))
     picture = np.clip(record(turning).picture, 40, 220)
     picture[60:180, 90:250] = level
     settings = replace(PRESETS[preset], shutter="none", reference="frame-middle")

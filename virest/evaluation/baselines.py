@@ -21,7 +21,7 @@ from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import KernelField, blur_chords, kernel_field
 from virest.degradation.row_motion import RowMotion
 from virest.evaluation.dong2020 import Weights, filtered, poisson_tv_l0
-from virest.restoration.frame import encode_picture
+from virest.restoration.encoding import encode_picture
 from virest.restoration.shutter import rowwise_map, warp
 
 Picture = NDArray[np.uint8]

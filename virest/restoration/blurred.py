@@ -26,8 +26,6 @@ SHRUNK_PARTS, LOOKED_AT = 8, 4
 on such a pixel so many are looked at, or a few more."""
 SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
-LightOfRows = Callable[[slice], list[Image]]
-"""Light of each channel over some rows of a picture, (rows, width): what is made band by band stays in the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +52,10 @@ class BlurredPicture:
     """Longest blur path in the picture."""
     holes: Image | None
     """1.0 where light is clipped in all channels, and in any beside such; None: nowhere; see :func:`_holes`."""
+    curve: ResponseCurve
+    """Takes light back to grey levels."""
+    kept: Image | None = None
+    """Vignetting (height, width) that the restored picture has and ``light`` has not; None: none."""
 
 
 def blurred_picture(
@@ -72,7 +74,8 @@ def blurred_picture(
     def slopes(channel: int, side_px: int, size: tuple[int, int]) -> Image:
         return _slopes_around(light[channel], curve, side_px, size)
 
-    return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px, _holes(clipped, longest_px))
+    holes = _holes(clipped, longest_px)
+    return BlurredPicture(light, slopes, dark, clipped, *statistics, field, longest_px, holes, curve)
 
 
 def _slopes_around(light: Image, curve: ResponseCurve, side_px: int, size: tuple[int, int]) -> Image:

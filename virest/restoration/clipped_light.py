@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.degradation.blur import Image
-from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture, LightOfRows
+from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
 """Part of what is not clipped that lies clear of clipped light, from which on restoring begins, and is all taken;
@@ -69,20 +69,14 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     return masks
 
 
-def unseen_kept(sharp: LightOfRows, blurred: BlurredPicture) -> LightOfRows:
-    """The recorded light where nothing says more."""
-    masks = unseen_masks(blurred)
-    if all(mask is None for mask in masks):
-        return sharp
+def unseen_kept(sharp: NDArray[np.uint8], recorded: NDArray[np.uint8], blurred: BlurredPicture) -> None:
+    """Put the recorded grey levels (height, width, 3) into a sharp picture where nothing says more.
 
-    def kept(rows: slice) -> list[Image]:
-        planes = sharp(rows)
-        for plane, light, unseen in zip(planes, blurred.light, masks, strict=True):
-            if unseen is not None:
-                cv2.copyTo(light[rows], unseen[rows], plane)
-        return planes
-
-    return kept
+    Among them are some that no light gives, as noise and codec leave them beyond the curve's ends.
+    """
+    for channel, unseen in enumerate(unseen_masks(blurred)):
+        if unseen is not None:
+            np.copyto(sharp[..., channel], recorded[..., channel], where=unseen > 0)
 
 
 def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -20,10 +19,10 @@ from virest.degradation.light import FrameLight, equivalent_length_px, frame_lig
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
-from virest.restoration.bands import bands
-from virest.restoration.blurred import BlurredPicture, LightOfRows, blurred_picture, clipped_anywhere
-from virest.restoration.clipped_light import measured_share, near_clipped, unseen_masks
+from virest.restoration.blurred import BlurredPicture, blurred_picture, clipped_anywhere
+from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept
 from virest.restoration.deblur import deblur
+from virest.restoration.encoding import encode_picture
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics import FEW_TILES, MANY_TILES, PictureStatistics, falling_power, measure_picture
@@ -207,54 +206,6 @@ def unknown_parameters(profile: CameraProfile) -> dict[str, Any]:
     }
 
 
-def encode_picture(light: list[NDArray[np.float32]], curve: ResponseCurve) -> NDArray[np.uint8]:
-    """Linear light of the channels to a stored picture (height, width, 3)."""
-    return _encoded(lambda rows: [plane[rows] for plane in light], len(light[0]), curve)
-
-
-def _encoded(light: LightOfRows, height: int, curve: ResponseCurve) -> NDArray[np.uint8]:
-    """The stored picture (height, width, 3), through a table over the root of light, band by band."""
-    low, high = curve.light_range
-    table = _encoding_table(curve)
-    encoded = []
-    for rows in bands(height):
-        part = cv2.merge(light(rows))
-        if (low, high) != (0.0, 1.0):
-            part = cv2.addWeighted(part, 1.0 / (high - low), part, 0.0, -low / (high - low))
-        root = cv2.sqrt(cv2.threshold(part, 0.0, 0.0, cv2.THRESH_TOZERO)[1])
-        steps = cv2.addWeighted(root, 65535.0, root, 0.0, 0.0, dtype=cv2.CV_16U)
-        encoded.append(cv2.LUT(steps, table))
-    return np.concatenate(encoded)
-
-
-def _beyond_the_curve_kept(
-    restored: NDArray[np.uint8], picture: NDArray[np.uint8], blurred: BlurredPicture, curve: ResponseCurve
-) -> NDArray[np.uint8]:
-    """Grey levels that no light gives, as noise and codec leave them beyond the curve's ends: kept where unseen."""
-    darkest, brightest = _returned_levels(curve)
-    if picture.min() >= darkest and picture.max() <= brightest:
-        return restored
-    for channel, unseen in enumerate(unseen_masks(blurred)):
-        if unseen is not None:
-            np.copyto(restored[..., channel], picture[..., channel], where=unseen > 0)
-    return restored
-
-
-@lru_cache(maxsize=8)
-def _returned_levels(curve: ResponseCurve) -> tuple[int, int]:
-    """The darkest and the brightest grey level that a curve's light comes back to."""
-    levels = _encoding_table(curve)
-    return int(levels.min()), int(levels.max())
-
-
-@lru_cache(maxsize=8)
-def _encoding_table(curve: ResponseCurve) -> NDArray[np.uint8]:
-    """Grey level over 65,536 steps of the root of light; (65536,)."""
-    low, high = curve.light_range
-    grey = curve.encode(low + (high - low) * np.linspace(0.0, 1.0, 65536) ** 2)
-    return np.clip(np.rint(grey * 255.0), 0, 255).astype(np.uint8)
-
-
 def _source_map(
     motion: RowMotion, settings: RestorationSettings, anchor: float, deblurred: str
 ) -> NDArray[np.float32] | None:
@@ -298,20 +249,15 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
-    sharp = deblur(blurred, settings)
+    restored = deblur(blurred, settings)
+    recorded = picture if light is None else _relit(picture, curve, light)
+    unseen_kept(restored, recorded, blurred)
     if anchor == 0.5:
         by_tile = settings.deblur not in WHOLE_PICTURE or luma.unevenness > 0
         part = _blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
         part = part * _share_map(blurred, share)
         measured = measured_share(blurred)
-        part = part if measured is None else part * measured
-        if part.min() < 1.0:
-            sharp = _mixed(sharp, blurred.light, part)
-    if light is not None:
-        sharp = _lit(sharp, light.kept)
-    restored = _encoded(sharp, height, curve)
-    if light is None:
-        restored = _beyond_the_curve_kept(restored, picture, blurred, curve)
+        restored = _mixed(restored, recorded, part if measured is None else part * measured)
     details = {
         "method": settings.deblur,
         "preset": settings.preset,
@@ -374,7 +320,7 @@ def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
         lit = cv2.resize(light.recorded, size, interpolation=cv2.INTER_LINEAR)
         return blurred.slopes(channel, side_px, size) * lit
 
-    return replace(blurred, light=planes, slopes=slopes)
+    return replace(blurred, light=planes, slopes=slopes, kept=light.kept)
 
 
 def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
@@ -384,21 +330,15 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
 
 
-def _mixed(sharp: LightOfRows, recorded: list[NDArray[np.float32]], part: Any) -> LightOfRows:
-    """So much of the sharp light, the rest recorded; part: (height, width), or one number for all."""
-
-    def mixed(rows: slice) -> list[NDArray[np.float32]]:
-        pairs = zip(sharp(rows), (plane[rows] for plane in recorded), strict=True)
-        if np.ndim(part):
-            return [plane + part[rows] * (s - plane) for s, plane in pairs]
-        return [cv2.addWeighted(plane, 1.0 - float(part), s, float(part), 0.0) for s, plane in pairs]
-
-    return mixed
-
-
-def _lit(sharp: LightOfRows, factor: NDArray[np.float32]) -> LightOfRows:
-    """Light times a factor (height, width)."""
-    return lambda rows: [plane * factor[rows] for plane in sharp(rows)]
+def _mixed(
+    restored: NDArray[np.uint8], recorded: NDArray[np.uint8], part: NDArray[np.float32] | np.float32
+) -> NDArray[np.uint8]:
+    """So much of the restored picture, the rest recorded; part: (height, width), or one number for all."""
+    if np.min(part) == 1.0:
+        return restored
+    if np.ndim(part):
+        return np.asarray(cv2.blendLinear(restored, recorded, part, 1 - part), np.uint8)
+    return np.asarray(cv2.addWeighted(restored, float(part), recorded, 1 - float(part), 0.0), np.uint8)
 
 
 def _too_little_to_gain(luma: PictureStatistics) -> str:

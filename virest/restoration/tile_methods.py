@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from virest.degradation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.bands import bands
-from virest.restoration.blurred import BlurredPicture, LightOfRows, luma_of, reduced
+from virest.restoration.blurred import BlurredPicture, luma_of, reduced
 from virest.restoration.clipped_light import measured_part
 from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import LEVELS_PER_UNIT, shrinkage_levels
@@ -40,7 +41,7 @@ LINEAR_SHARE = 0.5
 """Of a picture whose power lies at few places, the linear filter's part: the prior makes its waves steps."""
 
 
-def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
+def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> NDArray[np.uint8]:
     """One linear filter for each tile."""
     deconvolution = luma_tiles(blurred, settings)
     projected = _projected_luma(blurred, deconvolution, settings)
@@ -80,16 +81,14 @@ def _projected_luma(
     return deconvolution.back_projected(luma)
 
 
-def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LightOfRows:
+def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> NDArray[np.uint8]:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
     times = _reduction(blurred.statistics, settings)
     if times == 1.0:
         around = THIN_MARGIN if settings.iterations <= FEW_ITERATIONS else FULL_MARGIN
         return with_colour(blurred, tile_hyper_laplacian(blurred, settings, around), settings)
-    height, width = blurred.light[0].shape
     small = replace(settings, tile_px=round(settings.tile_px / times))
-    sharp = tile_hyper_laplacian(reduced(blurred, times), small, THINNEST_MARGIN)
-    return with_colour(blurred, cv2.resize(sharp, (width, height), interpolation=cv2.INTER_CUBIC), settings)
+    return with_colour(blurred, tile_hyper_laplacian(reduced(blurred, times), small, THINNEST_MARGIN), settings)
 
 
 def _reduction(statistics: PictureStatistics, settings: RestorationSettings) -> float:
