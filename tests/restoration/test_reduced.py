@@ -61,6 +61,7 @@ def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator)
     assert means.shape == (4, 6)
     expected = [[plane[r : r + 3, c : c + 3].mean() for c in range(0, 16, 3)] for r in range(0, 11, 3)]
     np.testing.assert_allclose(means, expected, rtol=1e-5)
+    np.testing.assert_allclose(colour._block_means(plane[:8], 4), plane[:8].reshape(2, 4, 4, 4).mean((1, 3)), rtol=1e-5)
 
 
 def test_tiles_are_as_large_as_their_kernels_hold() -> None:

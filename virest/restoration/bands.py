@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+
+from virest.degradation.blur import Image
 
 BAND_ROWS = 64
+LevelsOfRows = Callable[[slice], Image]
+"""Grey levels of some rows of a picture, (rows, width, 3), from 0 to 255 and not rounded."""
 
 
 def bands(height: int) -> Iterator[slice]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.degradation.blur import Image
+from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
@@ -69,14 +70,23 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     return masks
 
 
-def unseen_kept(sharp: NDArray[np.uint8], recorded: NDArray[np.uint8], blurred: BlurredPicture) -> None:
-    """Put the recorded grey levels (height, width, 3) into a sharp picture where nothing says more.
+def unseen_kept(sharp: LevelsOfRows, recorded: NDArray[np.uint8], blurred: BlurredPicture) -> LevelsOfRows:
+    """The grey levels (height, width, 3) that were recorded where nothing says more.
 
     Among them are some that no light gives, as noise and codec leave them beyond the curve's ends.
     """
-    for channel, unseen in enumerate(unseen_masks(blurred)):
-        if unseen is not None:
-            np.copyto(sharp[..., channel], recorded[..., channel], where=unseen > 0)
+    masks = unseen_masks(blurred)
+    if all(mask is None for mask in masks):
+        return sharp
+
+    def kept(rows: slice) -> Image:
+        levels = sharp(rows)
+        for channel, unseen in enumerate(masks):
+            if unseen is not None:
+                np.copyto(levels[..., channel], recorded[rows, :, channel], where=unseen[rows] > 0)
+        return levels
+
+    return kept
 
 
 def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:

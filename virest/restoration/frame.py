@@ -19,12 +19,13 @@ from virest.degradation.light import FrameLight, equivalent_length_px, frame_lig
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
+from virest.restoration.bands import LevelsOfRows, bands
 from virest.restoration.blurred import BlurredPicture, blurred_picture, clipped_anywhere
 from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
-from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
+from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics import FEW_TILES, MANY_TILES, PictureStatistics, falling_power, measure_picture
 
 LOG_TILE_PX = 128
@@ -87,7 +88,8 @@ def restore_frame(
     anchor = 0.5 if straighten or settings.reference == "frame-middle" or method == "none" else 0.0
     light = frame_light(motion, anchor, straighten and motion.profile.readout_known)
     clock.lap("estimate")
-    restored, parameters["deblur"] = picture, {"method": "none"}
+    restored: NDArray[Any] = picture
+    parameters["deblur"] = {"method": "none"}
     if method != "none":
         restored, parameters["deblur"], why_not = _deblurred(picture, motion, settings, anchor, longest_px, light)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
@@ -97,6 +99,8 @@ def restore_frame(
     valid_px = (0, 0, width, height)
     if source is not None:
         restored, valid_px = warp(restored, source), valid_rectangle(source)
+    elif restored.dtype != np.uint8:
+        restored = rounded(restored)
     clock.lap("shutter")
     parameters["shutter"]["method"] = settings.shutter if source is not None else "none"
     status = "copied" if restored is picture else "restored"
@@ -234,8 +238,8 @@ def _deblurred(
     anchor: float,
     longest_px: float,
     light: FrameLight | None,
-) -> tuple[NDArray[np.uint8], dict[str, Any], tuple[str, ...]]:
-    """The deblurred picture and how it was made; or the picture itself, and why it was left alone."""
+) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
+    """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     centres_px = _most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
@@ -249,15 +253,15 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
-    restored = deblur(blurred, settings)
     recorded = picture if light is None else _relit(picture, curve, light)
-    unseen_kept(restored, recorded, blurred)
+    sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
+    part: NDArray[np.float32] | np.float32 = np.float32(1.0)
     if anchor == 0.5:
         by_tile = settings.deblur not in WHOLE_PICTURE or luma.unevenness > 0
         part = _blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
-        part = part * _share_map(blurred, share)
-        measured = measured_share(blurred)
-        restored = _mixed(restored, recorded, part if measured is None else part * measured)
+        part, measured = part * _share_map(blurred, share), measured_share(blurred)
+        part = part if measured is None else part * measured
+    restored = _mixed(sharp, recorded, part)
     details = {
         "method": settings.deblur,
         "preset": settings.preset,
@@ -331,14 +335,22 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
 
 
 def _mixed(
-    restored: NDArray[np.uint8], recorded: NDArray[np.uint8], part: NDArray[np.float32] | np.float32
-) -> NDArray[np.uint8]:
-    """So much of the restored picture, the rest recorded; part: (height, width), or one number for all."""
-    if np.min(part) == 1.0:
-        return restored
-    if np.ndim(part):
-        return np.asarray(cv2.blendLinear(restored, recorded, part, 1 - part), np.uint8)
-    return np.asarray(cv2.addWeighted(restored, float(part), recorded, 1 - float(part), 0.0), np.uint8)
+    sharp: LevelsOfRows, recorded: NDArray[np.uint8], part: NDArray[np.float32] | np.float32
+) -> NDArray[np.float32]:
+    """So much of the sharp picture, the rest recorded, (height, width, 3): grey levels of 255, not rounded.
+
+    part: (height, width), or one number for all.
+    """
+    mixed = np.empty(recorded.shape, np.float32)
+    for rows in bands(len(recorded)):
+        picture = sharp(rows)
+        if isinstance(part, np.ndarray):
+            left = cv2.subtract(picture, recorded[rows], dtype=cv2.CV_32F)
+            picture = cv2.add(cv2.multiply(left, cv2.merge([part[rows]] * 3)), recorded[rows], dtype=cv2.CV_32F)
+        elif part < 1.0:
+            picture = cv2.addWeighted(picture, float(part), recorded[rows], 1 - float(part), 0.0, dtype=cv2.CV_32F)
+        mixed[rows] = picture
+    return mixed
 
 
 def _too_little_to_gain(luma: PictureStatistics) -> str:

@@ -29,17 +29,22 @@ def perspective_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
     return np.stack([source_x, source_y], -1).astype(np.float32)
 
 
-def warp(picture: NDArray[np.uint8], source_px: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Cubic interpolation at ``source_px``; where there are no data the edge is repeated.
+def warp(picture: NDArray[np.uint8 | np.float32], source_px: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Cubic interpolation of grey levels of 255 at ``source_px``; where there are no data the edge is repeated.
 
     In floats, since OpenCV's fixed-point sums take half as long again; band by band: what is read stays in the cache.
     """
-    levels = picture.astype(np.float32)
+    levels = picture.astype(np.float32, copy=False)
     warped = np.empty((*source_px.shape[:2], *picture.shape[2:]), np.uint8)
     for rows in bands(len(warped)):
         read = cv2.remap(levels, source_px[rows], None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        cv2.convertScaleAbs(cv2.max(read, 0.0, dst=read), warped[rows])
+        rounded(read, warped[rows])
     return warped
+
+
+def rounded(levels: NDArray[np.float32], into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    """The nearest of 256 grey levels."""
+    return np.asarray(cv2.convertScaleAbs(cv2.max(levels, 0.0), into), np.uint8)
 
 
 def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int, int, int, int]:

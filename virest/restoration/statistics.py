@@ -216,10 +216,11 @@ def measure_picture(
     colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
     luma, red, _ = cv2.split(cv2.cvtColor(_some_rows(picture), cv2.COLOR_RGB2YCrCb))
     cells, white_levels = _RingCells(passed), white_noise(luma)
-    noise_levels = _fit_rings(light, cells, white_levels).noise_levels
-    grey = observed(0, 1)
-    of_luma = replace(_fit_rings(grey, cells, white_levels), noise_levels=noise_levels)
-    of_chroma = _fit_rings(colour, _RingCells(passed[::2]), white_noise(red))
+    grey, cells_of_colour = observed(0, 1), _RingCells(passed[::2])
+    of_light, of_luma, of_chroma = _fit_rings(
+        (light, cells, white_levels), (grey, cells, white_levels), (colour, cells_of_colour, white_noise(red))
+    )
+    of_luma = replace(of_luma, noise_levels=of_light.noise_levels)
     weight = _unevenness(max(of_luma.misfit, _scatter(of_luma, grey, passed) / _SINGLE_PLACES), len(chosen))
     if not weight:
         return of_luma, of_chroma
@@ -430,24 +431,34 @@ class _RingCells:
         return sums[: RINGS * _CELLS].reshape(RINGS, _CELLS)
 
 
-def _fit_rings(observed: NDArray[np.float32], cells: _RingCells, white_levels: float) -> PictureStatistics:
-    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|²."""
-    count, g, k = cells.count, cells.means(observed), cells.passed
-    in_ring = np.maximum(count.sum(1), 1)
-    mean_k, mean_g = (count * k).sum(1) / in_ring, (count * g).sum(1) / in_ring
+def _fit_rings(*spectra: tuple[NDArray[np.float32], _RingCells, float]) -> list[PictureStatistics]:
+    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|².
+
+    spectra: |G|², its cells, and the white noise of the picture that it is of; all are fitted at once.
+    """
+    count, k, g = (
+        np.stack(parts)
+        for parts in zip(*((cells.count, cells.passed, cells.means(seen)) for seen, cells, _ in spectra), strict=True)
+    )
+    in_ring = np.maximum(count.sum(-1), 1)
+    mean_k, mean_g = (count * k).sum(-1) / in_ring, (count * g).sum(-1) / in_ring
     signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
     products = np.stack([np.ones_like(k), k, k * k, g, k * g], -1)
     for _ in range(_FIT_STEPS):
-        expected = np.maximum(noise[:, None] + signal[:, None] * k, 1e-6)
+        expected = np.maximum(noise[..., None] + signal[..., None] * k, 1e-6)
         weight = count / (expected * np.sqrt(expected))
-        w, wk, wkk, wg, wkg = (weight[:, None] @ products)[:, 0].T
+        w, wk, wkk, wg, wkg = np.moveaxis((weight[..., None, :] @ products)[..., 0, :], -1, 0)
         determinant = np.maximum(w * wkk - wk * wk, 1e-30)
         signal = np.clip((w * wkg - wk * wg) / determinant, 1e-4 * mean_g, None)
         noise = np.clip((wkk * wg - wk * wkg) / determinant, _ROUNDING_POWER, None)
-    spread = np.sqrt(np.maximum((count * k * k).sum(1) / in_ring - mean_k**2, 0))
+    spread = np.sqrt(np.maximum((count * k * k).sum(-1) / in_ring - mean_k**2, 0))
     determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
-    settled = _settled(signal, noise, mean_k, mean_g, determined, white_levels)
-    return replace(settled, misfit=_misfit(count, g, settled.noise[:, None] + settled.signal[:, None] * k))
+    found = []
+    for i, (_, _, white_levels) in enumerate(spectra):
+        settled = _settled(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels)
+        misfit = _misfit(count[i], g[i], settled.noise[:, None] + settled.signal[:, None] * k[i])
+        found.append(replace(settled, misfit=misfit))
+    return found
 
 
 def _misfit(count: Array, observed: Array, expected: Array) -> float:

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.degradation.blur import Image
 from virest.restoration import tiles
-from virest.restoration.bands import bands
+from virest.restoration.bands import LevelsOfRows, bands
 from virest.restoration.blurred import BlurredPicture, luma_of, reduced
 from virest.restoration.clipped_light import measured_part
 from virest.restoration.colour import with_colour
@@ -41,7 +40,7 @@ LINEAR_SHARE = 0.5
 """Of a picture whose power lies at few places, the linear filter's part: the prior makes its waves steps."""
 
 
-def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> NDArray[np.uint8]:
+def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
     """One linear filter for each tile."""
     deconvolution = luma_tiles(blurred, settings)
     projected = _projected_luma(blurred, deconvolution, settings)
@@ -81,7 +80,7 @@ def _projected_luma(
     return deconvolution.back_projected(luma)
 
 
-def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> NDArray[np.uint8]:
+def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
     times = _reduction(blurred.statistics, settings)
     if times == 1.0:

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.degradation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
+from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import BlurredPicture, luma_of
 from virest.restoration.clipped_light import near_clipped
 from virest.restoration.colour import as_kept, with_colour
 from virest.restoration.deconvolution import hyper_laplacian, richardson_lucy
-from virest.restoration.encoding import encode_picture
+from virest.restoration.encoding import grey_levels
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.tile_methods import beta_schedule, tile_hyper_laplacian
 
@@ -23,7 +23,7 @@ WEIGHED_PX = 5
 """Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
 
 
-def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> NDArray[np.uint8]:
+def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
     """Each channel by itself; what is censored has no weight."""
     operator = _whole_operator(blurred, positive=True)
     sharp = []
@@ -32,10 +32,11 @@ def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -
         start = _extended(light, operator.border)
         result = richardson_lucy(light, operator.apply, operator.adjoint, start, weight, settings.iterations)
         sharp.append(_inner(result, operator.border))
-    return encode_picture([as_kept(plane, blurred) for plane in sharp], blurred.curve)
+    sharp = [grey_levels(as_kept(plane, blurred), blurred.curve) for plane in sharp]
+    return lambda rows: cv2.merge([plane[rows] for plane in sharp])
 
 
-def by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> NDArray[np.uint8]:
+def by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
     """Luma over the whole operator, where censored pixels have no weight; colour as in tiles, all that a movie stores.
 
     Near clipped light the tiles' solution stays: its lamps were found with light held positive.
