@@ -15,7 +15,9 @@ from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import kernel_field
 from virest.restoration.frame import _blurred_part, _most_blurred, restore_frame
 from virest.restoration.settings import PRESETS, RestorationSettings
-from virest.restoration.statistics import PictureStatistics, PlaceStatistics, measure_picture, on_spectrum
+from virest.restoration.statistics.measure import measure_picture
+from virest.restoration.statistics.on_tiles import on_spectrum
+from virest.restoration.statistics.records import PictureStatistics, PlaceStatistics
 
 WIDTH, HEIGHT = 520, 400
 Scene = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]

@@ -12,7 +12,7 @@ from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import KernelField
 from virest.restoration import blurred, clipped_light, colour, tile_layout
 from virest.restoration.settings import PRESETS
-from virest.restoration.statistics import PictureStatistics
+from virest.restoration.statistics.records import PictureStatistics
 
 HEIGHT, WIDTH = 120, 168
 CURVE = ResponseCurve("srgb")

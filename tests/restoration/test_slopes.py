@@ -9,7 +9,7 @@ from blurred_scene import camera
 from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import kernel_field
 from virest.restoration.blurred import BlurredPicture, blurred_picture
-from virest.restoration.statistics import measure_picture
+from virest.restoration.statistics.measure import measure_picture
 
 NOISE_LEVELS = 1.5
 SIDE_PX = 40

@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import KernelField
-from virest.restoration import statistics as statistics_room
-from virest.restoration.statistics import PictureStatistics, measure_picture, on_spectrum
+from virest.restoration.statistics import ring_fit, tile_power
+from virest.restoration.statistics.measure import measure_picture
+from virest.restoration.statistics.on_tiles import on_spectrum
+from virest.restoration.statistics.records import PictureStatistics
+from virest.restoration.statistics.rings import ring_index
 
 HEIGHT, WIDTH = 420, 560
 STRAIGHT = ResponseCurve("linear")
@@ -191,9 +194,9 @@ def test_detail_that_a_coder_took_away_is_taken_to_fall_as_a_pictures_does() -> 
     frequency = (np.arange(24) + 0.5) / 48
     signal, noise, passed = 40.0 * frequency**-3, np.full(24, 900.0), np.linspace(0.9, 0.1, 24)
     cut = np.where(frequency > 0.3, 1e-3 * signal, signal)
-    found = statistics_room._as_detail_falls(frequency, cut, passed, noise)
+    found = ring_fit._as_detail_falls(frequency, cut, passed, noise)
     np.testing.assert_allclose(found, signal, rtol=1e-9)
-    clear = statistics_room._as_detail_falls(frequency, signal, passed, np.full(24, 1e-3))
+    clear = ring_fit._as_detail_falls(frequency, signal, passed, np.full(24, 1e-3))
     np.testing.assert_array_equal(clear, signal)
 
 
@@ -204,7 +207,7 @@ def test_white_noise_is_the_median_second_difference(height: int, rng: np.random
     mask = np.outer([1, -2, 1], [1, -2, 1]).astype(float)
     differences = cv2.filter2D(plane.astype(float), -1, mask)[2 : height - 2 : 4, 2:-2:4]
     expected = np.median(np.abs(differences)) / 0.6745 / 6.0
-    assert statistics_room.white_noise(plane) == pytest.approx(expected, rel=1e-9)
+    assert tile_power.white_noise(plane) == pytest.approx(expected, rel=1e-9)
 
 
 def _coded(picture: NDArray[np.float64], step: float) -> NDArray[np.float64]:
@@ -227,7 +230,7 @@ def test_a_coders_noise_is_level_where_the_picture_stands_out_of_it() -> None:
     low = luma.frequency < 0.15
     lost = (coded - blurred).astype(np.float32)
     tiles = [lost[y : y + 128, x : x + 128] for y in (10, 150, 280) for x in (20, 200, 400)]
-    error = np.mean([statistics_room._windowed_power(tile) for tile in tiles], 0)
-    rings = statistics_room._ring_index(128)
+    error = np.mean([tile_power.windowed_power(tile) for tile in tiles], 0)
+    rings = ring_index(128)
     truth = np.array([error[rings == number].mean() for number in np.flatnonzero(low)[1:]])
     assert (luma.noise[low][1:] < 2 * truth).all()

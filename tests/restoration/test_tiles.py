@@ -11,7 +11,7 @@ from laws import psnr_db, random_picture, texture
 from numpy.typing import NDArray
 
 from virest.degradation.blur import Image, fast_size, tile_grid
-from virest.restoration.statistics import packed_frequency
+from virest.restoration.statistics.on_tiles import packed_frequency
 from virest.restoration.tiles import (
     TileDeconvolution,
     _ends,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
-from virest.restoration.statistics import white_noise
+from virest.restoration.statistics.tile_power import white_noise
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from virest.camera.response import ResponseCurve
 from virest.degradation.blur import Image
 from virest.degradation.kernels import KernelField
-from virest.restoration.statistics import LUMA_BLUE, LUMA_RED, PictureStatistics
+from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
 CLIPPED_LEVELS = 2.0
 """A pixel this close to the top was clipped."""

@@ -13,7 +13,7 @@ from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import BlurredPicture, luma_of
 from virest.restoration.encoding import grey_levels
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
-from virest.restoration.statistics import LUMA_BLUE, LUMA_RED
+from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED
 from virest.restoration.tile_layout import COARSE_OVERLAP, noise_to_signal, tile_deconvolution
 
 COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 4

@@ -26,7 +26,9 @@ from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
-from virest.restoration.statistics import FEW_TILES, MANY_TILES, PictureStatistics, falling_power, measure_picture
+from virest.restoration.statistics.measure import measure_picture
+from virest.restoration.statistics.records import PictureStatistics, falling_power
+from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
 
 LOG_TILE_PX = 128
 """Spacing of the tiles in the log."""

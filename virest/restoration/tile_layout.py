@@ -8,7 +8,8 @@ from virest.degradation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.blurred import BlurredPicture
 from virest.restoration.settings import RestorationSettings
-from virest.restoration.statistics import PictureStatistics, on_spectrum
+from virest.restoration.statistics.on_tiles import on_spectrum
+from virest.restoration.statistics.records import PictureStatistics
 
 Surroundings = tuple[float, int, int]
 FULL_MARGIN, THIN_MARGIN, THINNEST_MARGIN = (0.0, 16, 16), (0.3, 4, 16), (0.3, 3, 12)

@@ -16,7 +16,8 @@ from virest.restoration.clipped_light import measured_part
 from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import LEVELS_PER_UNIT, shrinkage_levels
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
-from virest.restoration.statistics import PictureStatistics, on_spectrum
+from virest.restoration.statistics.on_tiles import on_spectrum
+from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.tile_layout import (
     BORDER_NOISE_TO_SIGNAL,
     FULL_MARGIN,

@@ -1,0 +1,108 @@
+"""Measuring a picture: which tiles, and what of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.response import ResponseCurve
+from virest.degradation.kernels import KernelField
+from virest.restoration.statistics.place_fit import place_statistics, unevenness
+from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics, unknown_picture
+from virest.restoration.statistics.ring_fit import RingCells, fit_rings
+from virest.restoration.statistics.rings import SIDE
+from virest.restoration.statistics.tile_power import (
+    MANY_TILES,
+    cut,
+    known_part,
+    passed_power,
+    white_noise,
+    windowed_power,
+)
+
+_MAX_CLIPPED = 0.002
+"""Tiles with a larger part of clipped pixels are taken only where there are none better."""
+
+
+def measure_picture(
+    picture: NDArray[np.uint8],
+    field: KernelField,
+    curve: ResponseCurve,
+    clipped: NDArray[np.uint8] | None = None,
+    most_tiles: int = MANY_TILES,
+) -> tuple[PictureStatistics, PictureStatistics]:
+    """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
+
+    picture: (height, width, 3) RGB.  clipped: (height, width), 1 where light was too much to be measured; it and what a
+    path reaches from it are left out.  Returns the statistics of luma and of chroma, both colour differences together.
+    """
+    corners = _corners(field, picture.shape[:2])
+    if not corners or field.radius_px >= SIDE // 2:
+        return unknown_picture(), unknown_picture()
+    chosen = _least_clipped(clipped, corners, most_tiles)
+    kernels = field.chosen(chosen).arrays()
+    passed = np.stack([passed_power(kernel) for kernel in kernels])
+    known = [
+        None if clipped is None else known_part(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)
+    ]
+
+    parts = [cv2.split(cv2.cvtColor(cut(picture, corners[i]), cv2.COLOR_RGB2YCrCb)) for i in chosen]
+
+    def observed(plane: int, every: int) -> NDArray[np.float32]:
+        tiles = zip(parts[::every], known[::every], strict=True)
+        return np.stack([windowed_power(part[plane], seen) for part, seen in tiles])
+
+    tiles = zip(chosen, known, strict=True)
+    light = np.stack([windowed_power(_evenly_steep(cut(picture, corners[i]), curve), seen) for i, seen in tiles])
+    colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
+    luma, red, _ = cv2.split(cv2.cvtColor(_some_rows(picture), cv2.COLOR_RGB2YCrCb))
+    cells, white_levels = RingCells(passed), white_noise(luma)
+    grey, cells_of_colour = observed(0, 1), RingCells(passed[::2])
+    of_light, of_luma, of_chroma = fit_rings(
+        (light, cells, white_levels), (grey, cells, white_levels), (colour, cells_of_colour, white_noise(red))
+    )
+    of_luma = replace(of_luma, noise_levels=of_light.noise_levels)
+    weight = unevenness(of_luma, grey, passed)
+    if not weight:
+        return of_luma, of_chroma
+    return (
+        replace(of_luma, places=place_statistics(of_luma, grey, passed, weight)),
+        replace(of_chroma, places=place_statistics(of_chroma, colour, passed[::2], weight)),
+    )
+
+
+def _some_rows(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Every other four rows of a picture (height, width, 3): enough for :func:`white_noise`, which looks at such."""
+    height, width, channels = picture.shape
+    return picture[: height - height % 8].reshape(-1, 8, width, channels)[:, :4].reshape(-1, width, channels)
+
+
+def _evenly_steep(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
+    """Light of a tile (height, width, 3) as grey levels (height, width) of the straight curve through its mean."""
+    weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
+    light = cv2.transform(cv2.LUT(tile, curve.linear_table()), weights)
+    mean_level = 255 * float(curve.encode(np.array(light.mean())))
+    return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
+
+
+def _least_clipped(
+    clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]], most_tiles: int
+) -> NDArray[np.intp]:
+    """Numbers of the tiles to measure: at most so many, evenly over those with the least clipped light."""
+    chosen = np.arange(len(corners))
+    if clipped is not None:
+        parts = np.array([np.count_nonzero(cut(clipped, corner)) for corner in corners]) / SIDE**2
+        chosen = np.flatnonzero(parts <= max(_MAX_CLIPPED, float(np.quantile(parts, 0.25))))
+    return chosen[:: int(np.ceil(len(chosen) / most_tiles))]
+
+
+def _corners(field: KernelField, shape: tuple[int, ...]) -> list[tuple[int, int]]:
+    """(top, left) of the tile around each centre, moved inside the picture; none if the picture is too small."""
+    height, width = shape
+    if min(height, width) < SIDE:
+        return []
+    corners = np.clip(field.centres_px[:, ::-1] - SIDE / 2, 0, (height - SIDE, width - SIDE))
+    return [(top, left) for top, left in corners.astype(int).tolist()]

@@ -1,0 +1,70 @@
+"""Measured spectra spread over the packed spectrum of a tile that is restored."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.restoration.statistics.records import Array, PictureStatistics
+from virest.restoration.statistics.rings import RINGS, SIDE
+
+
+@lru_cache(maxsize=8)
+def packed_frequency(size: int) -> NDArray[np.float32]:
+    """Frequency in cycles per pixel of each place of OpenCV's packed spectrum, (size, size)."""
+    index = (np.arange(size) + 1) // 2
+    along = np.minimum(np.arange(size), size - np.arange(size)) / size
+    packed = np.hypot(along[:, None], index[None, :] / size)
+    packed[:, 0] = index / size
+    packed[:, -1] = np.hypot(index / size, 0.5)
+    return packed.astype(np.float32)
+
+
+def on_spectrum(
+    statistics: PictureStatistics, ring_values: Array, size: int, scale: float = 1.0, by_place: bool = True
+) -> NDArray[np.float32]:
+    """Noise-to-signal of the rings spread over a packed spectrum of a tile; falls as f² below the lowest ring.
+
+    scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.  by_place: where S
+    is uneven, by each place's own.
+    """
+    below, part, falling = _between_rings(size, _widening(statistics, scale))
+    levels = np.log(ring_values).astype(np.float32)
+    values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below]) * falling
+    if statistics.places is not None and by_place:
+        values = values / _spread_places(statistics.places.share, size, _widening(statistics, scale))
+    return np.asarray(values, np.float32)
+
+
+def _widening(statistics: PictureStatistics, scale: float) -> float:
+    """Pixels of the picture whose rings were measured per pixel of a tile."""
+    return scale * float(statistics.frequency[0] + statistics.frequency[-1]) / 0.5
+
+
+def _spread_places(share: NDArray[np.float32], size: int, scale: float) -> NDArray[np.float32]:
+    """Values at the places of :func:`_power` on a packed spectrum (size, size); the nearest beyond them."""
+    rising = np.roll(share, SIDE // 2, axis=0)
+    return cv2.remap(rising, *_on_places(size, scale), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@lru_cache(maxsize=8)
+def _on_places(size: int, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row, rows from the lowest frequency on, at which each place of a packed spectrum lies."""
+    packed = (np.arange(size) + 1) // 2 / size
+    fx, fy = (a.copy() for a in np.broadcast_arrays(packed[None, :], np.fft.fftfreq(size)[:, None]))
+    fx[:, -1] = 0.5
+    fy[:, 0] = fy[:, -1] = packed
+    return (fx / scale * SIDE - 1).astype(np.float32), (fy / scale * SIDE + SIDE // 2).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _between_rings(size: int, scale: float) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+    """Ring below each place of a packed spectrum, part of the way to the next one, and f² below the lowest ring."""
+    position = packed_frequency(size) / scale * (RINGS / 0.5) - 0.5
+    held = np.clip(position, 0, RINGS - 1)
+    below = np.floor(held).astype(np.intp)
+    falling = np.minimum((position + 0.5) / 0.5, 1.0) ** 2
+    return below, (held - below).astype(np.float32), falling.astype(np.float32)

@@ -1,0 +1,77 @@
+"""Pictures whose power lies at few places of the spectrum: told by the rings' misfit, measured place by place."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.restoration.statistics.records import PictureStatistics, PlaceStatistics
+from virest.restoration.statistics.ring_fit import ROUNDING_POWER
+from virest.restoration.statistics.rings import RINGS, axes, place_ring
+from virest.restoration.statistics.tile_power import MANY_TILES
+
+_LITTLE_MISFIT, _LARGE_MISFIT = 0.8, 1.1
+"""RMS of ln |G|² about the fit's, over its cells, up to which rings are believed, and from which on they are not.
+
+Of MANY_TILES; what fewer of them hold differs more from one to the next."""
+_SINGLE_PLACES = 2.0
+"""Along the axes, which the fit leaves out, single places scatter so many times as much as cells."""
+_INDEPENDENT = 4.0
+"""Of a place's nine neighbours under the window, itself one of them, so many are independent."""
+_STEEPEST_PLACE = 4.0
+"""S of a place is at most so many times its ring's, or what came through the blur, whichever is more.
+
+What exceeds both where kernels cancel is the coder's pattern."""
+_FEW_PLACES = 20.0
+"""A ring with so many reliable places is half way from its fit to what these have."""
+
+
+def unevenness(rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32]) -> float:
+    """0 where what rings do not fit is an ordinary picture's, to 1 where its power lies at few places.
+
+    observed, passed: as in :func:`place_statistics`.
+    """
+    misfit = max(rings.misfit, _scatter_along_axes(rings, observed, passed) / _SINGLE_PLACES)
+    misfit *= min(1.0, float(np.sqrt(len(observed) / MANY_TILES)))
+    return float(np.clip((misfit - _LITTLE_MISFIT) / (_LARGE_MISFIT - _LITTLE_MISFIT), 0.0, 1.0))
+
+
+def _scatter_along_axes(rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32]) -> float:
+    """Standard deviation of ln |G|² about the fit's along the axes, where upright things have their power.
+
+    Boards, print and the coder's blocks have more of it there than elsewhere, but about as much everywhere; upright
+    bars and lying blinds have theirs at few places.  observed, passed: as in :func:`place_statistics`.
+    """
+    rows, columns = axes()
+    ring = place_ring()[rows, columns]
+    seen, k = (spectra[:, rows, columns].mean(axis=0) for spectra in (observed, passed))
+    return float(np.std(np.log(np.maximum(seen, ROUNDING_POWER) / (k * rings.signal[ring] + rings.noise[ring]))))
+
+
+def place_statistics(
+    rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32], weight: float
+) -> PlaceStatistics:
+    """S of each place, (|G|² − N) / |K|² around it, as far as that is known; else what is typical of its ring.
+
+    Typical is the mean of the logarithm, which a few strong places do not raise, over those that come through the blur.
+    observed, passed: |G|² and |K|² of the tiles, (n, SIDE, SIDE / 2 - 1).
+    """
+    count, ring = _INDEPENDENT * len(observed), place_ring()
+    signal, noise = rings.signal[ring], rings.noise[ring]
+    seen, k = (_around(np.asarray(spectra.mean(axis=0))) for spectra in (observed, passed))
+    k = np.maximum(k, 1e-6)
+    own, doubt = (seen - noise) / k, noise / (k * np.sqrt(count))
+    most = np.maximum(_STEEPEST_PLACE * signal, seen - noise)
+    logarithms = np.log(np.clip(own, np.minimum(doubt, signal), most) / signal)
+    reliable = k * signal / (k * signal + noise)
+    sums, counts = (np.bincount(ring.ravel(), w.ravel(), RINGS) for w in (reliable * logarithms, reliable))
+    typical = signal * np.exp(np.minimum(sums / (counts + _FEW_PLACES), 0.0))[ring]
+    known = count / (count + (1 + noise / (k * typical)) ** 2)
+    found = np.clip(typical + known * (own - typical), np.minimum(doubt, typical), most)
+    return PlaceStatistics(weight, ((found / signal) ** weight).astype(np.float32), k.astype(np.float32))
+
+
+def _around(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean of each place and its eight neighbours; the rows go round."""
+    return cv2.blur(cv2.copyMakeBorder(spectrum, 1, 1, 0, 0, cv2.BORDER_WRAP), (3, 3))[1:-1]

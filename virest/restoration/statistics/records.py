@@ -1,0 +1,141 @@
+"""What was measured on a blurred picture: over rings of spatial frequency, and over places where those do not do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.restoration.statistics.rings import RINGS, place_ring
+
+Array = NDArray[np.float64]
+LUMA_RED, LUMA_BLUE = 0.299, 0.114
+_HYPER_LAPLACIAN_RMS = 3.62
+"""RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
+_EDGES_BEYOND = 2.0
+"""A picture's edges stand out of its spectrum by so much: rings of tiles have the mean of edge and plain surface."""
+_DETAIL_SLOPE = 3.0
+"""The power of a natural picture falls with frequency about like f⁻³."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceStatistics:
+    """What rings do not tell: power over the places of a tile's spectrum, as :func:`_power` orders them."""
+
+    weight: float
+    """How far the rings' S is wrong: more than 0, and 1 from a large misfit on."""
+    share: NDArray[np.float32]
+    """(SIDE, SIDE / 2 - 1) S of each place over that of its ring."""
+    passed: NDArray[np.float32]
+    """(SIDE, SIDE / 2 - 1) mean |K|² of the kernels."""
+
+    def after(self, passed: Array) -> PlaceStatistics:
+        """The same where more blur came on top, that passes so much (RINGS,) of |G|²."""
+        return replace(self, passed=(self.passed * passed[place_ring()]).astype(np.float32))
+
+    def expected_gain_db(self, signal: Array, noise: Array) -> float:
+        """As :attr:`PictureStatistics.expected_gain_db`, by the rings' S and N, (RINGS,).
+
+        More noise than what comes through the blur counts as that: it may be a grating that the kernels nearly cancel,
+        and taking it away is no gain.
+        """
+        ring = place_ring()
+        s, n = signal[ring] * self.share, noise[ring]
+        through = self.passed * s
+        left = np.sum((1 - np.sqrt(self.passed)) ** 2 * s + np.minimum(n, through))
+        return max(float(10 * np.log10(left / np.sum(s * n / (through + n)))), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class PictureStatistics:
+    """Measured on one blurred picture, over rings of spatial frequency, in grey levels squared."""
+
+    frequency: Array
+    """(RINGS,) middle of each ring, cycles per pixel."""
+    signal: Array
+    """(RINGS,) power of the sharp picture."""
+    noise: Array
+    """(RINGS,) power of the noise."""
+    passed: Array
+    """(RINGS,) mean |K|² of the kernels."""
+    noise_levels: float
+    """One standard deviation of the noise: at the frequencies where signal and noise are about equal."""
+    measured: bool = True
+    """False where the picture told nothing, and the values stand in for it."""
+    misfit: float = 0.0
+    """RMS of the natural logarithm of |G|² over the fit's |K|² S + N, cell by cell."""
+    places: PlaceStatistics | None = None
+    """Of a picture that the rings do not fit; None: they do."""
+
+    @property
+    def unevenness(self) -> float:
+        """0 where S is even over each ring, up to 1 where it lies at few places."""
+        return 0.0 if self.places is None else self.places.weight
+
+    @property
+    def noise_to_signal(self) -> Array:
+        """(RINGS,) N / S."""
+        return self.noise / self.signal
+
+    @property
+    def between_rings_and_level(self) -> PictureStatistics:
+        """The same with noise half way, by its logarithm, from the rings' own to the level that was measured in light.
+
+        The rings' takes in the overtones of blurred edges, most of all at low frequencies; the level is that of the
+        frequencies where signal and noise are about equal, and a coder's noise is not level.  The truth lies between.
+        """
+        return replace(self, noise=np.sqrt(self.noise) * self.noise_levels)
+
+    @property
+    def gradient_scale(self) -> float:
+        """Unit u of the prior exp(−|∇f/u|^⅔): of edges, that stand out of the sharp picture's mean square gradient."""
+        # forward differences pass 4 sin²(π f_x); its mean over a ring's directions is 2 − 2 J0(2π f)
+        gain = 2 - 2 * _bessel_j0(2 * np.pi * self.frequency)
+        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]) * (self.frequency < 0.5)
+        return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
+
+    @property
+    def finest(self) -> float:
+        """Highest frequency, in cycles per pixel, at which more of the picture than of noise comes through the blur."""
+        clear = np.flatnonzero(self.passed * self.signal > self.noise)
+        return float(self.frequency[clear[-1] if len(clear) else 0])
+
+    def scaled(self, scale: float) -> PictureStatistics:
+        """Those of the same picture ``scale`` times as large, each pixel the mean of what it covers; the rings stay."""
+        return replace(
+            self,
+            frequency=self.frequency / scale,
+            signal=scale**2 * self.signal,
+            noise=scale**2 * self.noise,
+            noise_levels=scale * self.noise_levels,
+        )
+
+    @property
+    def expected_gain_db(self) -> float:
+        """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured."""
+        if not self.measured:
+            return 0.0
+        if self.places is not None:
+            return self.places.expected_gain_db(self.signal, self.noise)
+        area = self.frequency
+        through = self.passed * self.signal
+        left = np.sum(area * ((1 - np.sqrt(self.passed)) ** 2 * self.signal + self.noise))
+        restored = np.sum(area * self.signal * self.noise / (through + self.noise))
+        return float(10 * np.log10(left / restored))
+
+
+def falling_power(frequency: Array, signal: Array, ring: int) -> Array:
+    """S by a ring's own, falling as f⁻³: between edges (f⁻³) and the lens's softening of the texture."""
+    return np.asarray(signal[ring] * (frequency[ring] / frequency) ** _DETAIL_SLOPE)
+
+
+def unknown_picture() -> PictureStatistics:
+    """Nothing could be measured: the picture is smaller than a tile, or the blur larger."""
+    frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
+    return PictureStatistics(frequency, np.ones(RINGS), np.ones(RINGS), np.ones(RINGS), 1.0, False)
+
+
+def _bessel_j0(x: Array) -> Array:
+    angle = (np.arange(64) + 0.5) * np.pi / 64
+    return np.cos(x[:, None] * np.sin(angle)).mean(axis=1)

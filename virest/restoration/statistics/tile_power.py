@@ -1,0 +1,93 @@
+"""Power spectra of a picture's tiles and of their kernels, and a picture's white noise."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.restoration.statistics.rings import SIDE
+
+_WINDOW = np.outer(np.hanning(SIDE + 2)[1:-1], np.hanning(SIDE + 2)[1:-1]).astype(np.float32)
+_WINDOW_SUM = float(_WINDOW.sum())
+_WINDOW_POWER = np.float32((_WINDOW**2).sum())
+MANY_TILES, FEW_TILES = 12, 8
+"""So many are measured at most; fewer tell weak noise to a third only."""
+_ON_PATH = 2e-3
+"""Kernels are larger than this where the path goes."""
+_FILLING_PX = (5, 15, 45, 135)
+
+
+def cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]:
+    """The tile of a plane or picture whose top and left these are."""
+    return plane[corner[0] : corner[0] + SIDE, corner[1] : corner[1] + SIDE]
+
+
+def known_part(
+    clipped: NDArray[np.uint8], corner: tuple[int, int], kernel: NDArray[np.float32]
+) -> NDArray[np.float32] | None:
+    """1.0 where a tile shows no light that a path reaches from clipped light; None: everywhere."""
+    tile = cut(clipped, corner)
+    if not tile.any():
+        return None
+    reach = (kernel + kernel[::-1, ::-1] > _ON_PATH).astype(np.uint8)
+    return np.float32(1) - cv2.dilate(cv2.dilate(tile, reach), np.ones((3, 3), np.uint8))
+
+
+def windowed_power(
+    tile: NDArray[np.uint8] | NDArray[np.float32], known: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Power of a tile less its mean under a Hann window; white noise of variance σ² gives σ² everywhere.
+
+    What is not known (0 in ``known``) is filled in smoothly and adds no power.
+    """
+    values, power = tile.astype(np.float32), float(_WINDOW_POWER)
+    if known is not None:
+        values, power = _smoothly_filled(values, known), max(float(np.vdot(_WINDOW**2, known)), 1.0)
+    mean = np.float32(np.vdot(values, _WINDOW) / _WINDOW_SUM)
+    return _power((values - mean) * _WINDOW) / np.float32(power)
+
+
+def _smoothly_filled(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of what is known around each unknown place, over the smallest neighbourhood that knows any."""
+    filled, left = values * known, known == 0
+    for side in _FILLING_PX:
+        near = cv2.blur(known, (side, side))
+        here = left & (near > 0.1)
+        filled[here] = (cv2.blur(values * known, (side, side))[here]) / near[here]
+        left &= ~here
+    if left.any():
+        filled[left] = filled[~left].mean() if not left.all() else 0.0
+    return filled
+
+
+def passed_power(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """|K|² as seen through the tile's window."""
+    padded = np.zeros((SIDE, SIDE), np.float32)
+    padded[: kernel.shape[0], : kernel.shape[1]] = kernel
+    return cv2.blur(_power(padded), (3, 3), borderType=cv2.BORDER_REPLICATE)
+
+
+def _power(tile: NDArray[np.float32]) -> NDArray[np.float32]:
+    """|F|² at the horizontal frequencies 1 ... side / 2 − 1 of the transform, (side, side / 2 − 1)."""
+    packed = cv2.dft(tile)[:, 1:-1]
+    squares = packed * packed
+    return squares[:, ::2] + squares[:, 1::2]
+
+
+def white_noise(plane: NDArray[np.uint8]) -> float:
+    """Standard deviation of a plane's white noise, grey levels: the median absolute second difference both ways.
+
+    Immerkær 1996, doi:10.1006/cviu.1996.0060; edges and texture are outliers to the median.
+    """
+    above, here, below = (plane[first : len(plane) - 4 + first : 4].astype(np.int16) for first in (1, 2, 3))
+    down = above - 2 * here + below
+    residual = down[:, 1:-3:4] - 2 * down[:, 2:-2:4] + down[:, 3:-1:4]
+    return _median(np.abs(residual)) / 0.6745 / 6.0
+
+
+def _median(levels: NDArray[np.int16]) -> float:
+    """The median of whole numbers from 0 on, by their histogram: quicker than by their order."""
+    reached = np.cumsum(np.bincount(levels.ravel()))
+    middles = (reached[-1] + 1) // 2, reached[-1] // 2 + 1
+    return float(np.mean(np.searchsorted(reached, middles)))
