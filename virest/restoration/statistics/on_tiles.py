@@ -45,7 +45,7 @@ def _widening(statistics: PictureStatistics, scale: float) -> float:
 
 
 def _spread_places(share: NDArray[np.float32], size: int, scale: float) -> NDArray[np.float32]:
-    """Values at the places of :func:`_power` on a packed spectrum (size, size); the nearest beyond them."""
+    """Values at the places of a spectrum on a packed spectrum (size, size); the nearest beyond them."""
     rising = np.roll(share, SIDE // 2, axis=0)
     return cv2.remap(rising, *_on_places(size, scale), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 

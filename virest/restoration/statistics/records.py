@@ -21,7 +21,7 @@ _DETAIL_SLOPE = 3.0
 
 @dataclass(frozen=True, slots=True)
 class PlaceStatistics:
-    """What rings do not tell: power over the places of a tile's spectrum, as :func:`_power` orders them."""
+    """What rings do not tell: power over the places of a tile's spectrum, ordered as in :mod:`rings`."""
 
     weight: float
     """How far the rings' S is wrong: more than 0, and 1 from a large misfit on."""

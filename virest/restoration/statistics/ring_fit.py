@@ -31,7 +31,7 @@ class RingCells:
     """The places of all tiles' spectra, sorted into cells of equal ring and nearly equal |K|²."""
 
     def __init__(self, passed: NDArray[np.float32]) -> None:
-        """passed: |K|² of each tile, as :func:`_power` orders it."""
+        """passed: |K|² of each tile, ordered as in :mod:`rings`."""
         share = np.minimum((passed * np.float32(_CELLS)).astype(np.intp), _CELLS - 1)
         self._cell = (ring_index(SIDE) * _CELLS + share).ravel()
         self.count = self._sums(None)
