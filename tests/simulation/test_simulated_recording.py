@@ -187,7 +187,7 @@ def test_odd_sizes_are_refused(simulate):
         simulate("odd", width=97)
 
 
-@pytest.mark.parametrize("scene", ["bright", "board", "text"])
+@pytest.mark.parametrize("scene", ["bright", "board", "text", "photographs"])
 def test_every_scene_can_be_filmed(scene, simulate):
     """Each kind gives pictures with contrast; the bright one clips a few percent."""
     truth = read_truth(simulate(scene, scene=scene, frames=1, depth_m=1.2, tilt_deg=(10.0, -5.0)))

@@ -22,9 +22,11 @@ from virest.errors import SettingsError
 
 log = logging.getLogger(__name__)
 
-KINDS = ("leaves", "bright", "board", "text")
+KINDS = ("leaves", "bright", "board", "text", "photographs")
 LENS_SIGMA_PX = 0.5
 MAX_CHART_PX = 36_000_000
+PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "rocket")
+"""Of scikit-image's data, in colour: a portrait, fur, a table, a rocket before the night."""
 _TEXTURE_SIDE = 512
 _TEXT = (
     "the quick brown fox jumps over the lazy dog",
@@ -247,7 +249,40 @@ def _draw_text(rng: np.random.Generator, width: int, height: int, scale: float) 
     return np.clip(grey * shade, 0.004, 0.9)[..., None] * tint
 
 
-_DRAWINGS = {"leaves": _draw_leaves, "bright": _draw_bright, "board": _draw_board, "text": _draw_text}
+def _draw_photographs(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
+    """Photographs side by side, row above row, as fine as the picture: colours and brightness that go together."""
+    try:
+        from skimage import data
+    except ImportError:
+        raise SettingsError(
+            "scene 'photographs' is made of scikit-image's, which is not installed", hint="pip install scikit-image"
+        ) from None
+    pictures = [getattr(data, name)() for name in PHOTOGRAPHS]
+    wide, tall = int(np.ceil(width / scale)), int(np.ceil(height / scale))
+    grey, top = np.empty((tall, wide, 3), np.uint8), 0
+    while top < tall:
+        in_row, filled = [], 0
+        while filled < wide:
+            in_row.append(pictures[rng.integers(len(pictures))])
+            filled += in_row[-1].shape[1]
+        rows = min(min(len(picture) for picture in in_row), tall - top)
+        grey[top : top + rows] = np.hstack([picture[:rows] for picture in in_row])[:, :wide]
+        top += rows
+    light = _SRGB_LIGHT[cv2.resize(grey, (width, height), interpolation=cv2.INTER_CUBIC)]
+    return np.clip(0.9 * light, 0.004, 0.9)
+
+
+_SRGB_LIGHT = np.where(
+    np.arange(256) <= 10, np.arange(256) / 255 / 12.92, ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4
+).astype(np.float32)
+"""Light of the grey levels of an ordinary picture file (IEC 61966-2-1)."""
+_DRAWINGS = {
+    "leaves": _draw_leaves,
+    "bright": _draw_bright,
+    "board": _draw_board,
+    "text": _draw_text,
+    "photographs": _draw_photographs,
+}
 
 
 # ── dead leaves ────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -25,6 +25,7 @@ from virest.evaluation.fidelity import psnr_db
 METHODS = (*PRESETS, *PEERS)
 KIND_TITLES = {
     "ordinary": "ordinary: 5-20 px",
+    "photographs": "photographs: 5-20 px",
     "fine": "the same at 1 bit/px",
     "long": "long blur, strong noise: 15-45 px",
     "bright": "bright clipped areas: 5-20 px",

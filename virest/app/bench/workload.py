@@ -51,7 +51,7 @@ class Workload:
 
     name: str
     kind: str
-    """``ordinary``, ``fine``, ``long`` or ``bright``."""
+    """``ordinary``, ``photographs``, ``fine``, ``long`` or ``bright``."""
     blur_range_px: tuple[float, float]
     """Frames whose blur at the centre lies in here count in the means; all count in the minimum."""
     options: dict[str, Any] = field(default_factory=dict)
@@ -78,6 +78,8 @@ WORKLOADS = (
     _workload("leaves-p", "ordinary", ORDINARY_PX, "leaves", 10.0, 1.2, 2.5),
     _workload("text-p", "ordinary", ORDINARY_PX, "text", 10.0, 1.2, 1.5),
     _workload("board-p", "ordinary", ORDINARY_PX, "board", 10.0, 1.2, 2.0),
+    _workload("photographs", "photographs", ORDINARY_PX, "photographs", 16.0, 1.4, 1.5),
+    _workload("photographs-p", "photographs", ORDINARY_PX, "photographs", 10.0, 1.2, 2.0),
     _workload("leaves-fine", "fine", ORDINARY_PX, "leaves", 16.0, 1.4, 1.5),
     _workload("text-fine-p", "fine", ORDINARY_PX, "text", 10.0, 1.2, 2.0),
     _workload("long", "long", LONG_PX, "leaves", 25.0, 2.2, 4.0),
@@ -85,7 +87,7 @@ WORKLOADS = (
     _workload("bright", "bright", ORDINARY_PX, "bright", 16.0, 1.4, 2.0),
     _workload("bright-p", "bright", ORDINARY_PX, "bright", 10.0, 1.2, 2.0),
 )
-QUICK = ("leaves", "long", "bright")
+QUICK = ("leaves", "photographs", "long", "bright")
 
 
 def quality_workloads(scale: Scale) -> list[Workload]:

@@ -38,7 +38,7 @@ def simulate(
         Path | None,
         typer.Option(metavar="CAPTURE", help="Re-create this capture: its camera, times, exposures and motion."),
     ] = None,
-    scene: Annotated[str, typer.Option(metavar="KIND", help="leaves, bright, board or text.")] = "leaves",
+    scene: Annotated[str, typer.Option(metavar="KIND", help="leaves, bright, board, text or photographs.")] = "leaves",
     width: Annotated[int, typer.Option(metavar="PX")] = 720,
     height: Annotated[int, typer.Option(metavar="PX")] = 1280,
     frames: Annotated[
