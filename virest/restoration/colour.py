@@ -92,9 +92,10 @@ def _slopes_on(luma: Image, differences: list[Image], noise_power: Any, side: in
         return cv2.blur(plane, (side, side))
 
     mean = around(luma)
-    power = cv2.subtract(around(cv2.multiply(luma, luma)), cv2.multiply(mean, mean)) + np.float32(noise_power)
+    power = cv2.max(cv2.subtract(around(cv2.multiply(luma, luma)), cv2.multiply(mean, mean)), 0.0)
+    divisor = cv2.add(power, noise_power)
     together = (cv2.subtract(around(cv2.multiply(luma, d)), cv2.multiply(mean, around(d))) for d in differences)
-    return [cv2.divide(product, power) for product in together]
+    return [cv2.divide(product, divisor) for product in together]
 
 
 def _shrunk(sharp: Image, blurred: BlurredPicture, scale: int) -> Image:
