@@ -214,7 +214,7 @@ def test_a_gyroscope_s_wander_does_not_shrink_with_tracking() -> None:
     """Sharper tracks tell a readout's or a lens's values better, but a gyroscope drifts all the same."""
     fitted = fitted_from(recorded(PORTRAIT), BASIC)
     blurred, sharp = (bias_std(fitted, "gyro_bias", noise_px) for noise_px in (0.3, 0.05))
-    assert np.all(blurred > sharp)
+    assert np.all(blurred >= sharp)
     assert np.all(sharp >= 1.5e-4)
     assert np.all(bias_std(fitted, "focal_length", 0.05) < 0.5 * bias_std(fitted, "focal_length", 0.15))
 
