@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
-from math import inf
 from functools import lru_cache
+from math import inf
 from pathlib import Path
 from typing import Any
 

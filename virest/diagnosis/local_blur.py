@@ -56,8 +56,8 @@ DAMPING = (0.92, 0.84)
 DAMPING_STD = 0.13
 """Its spread: more is lost under defocus, less at 1 bit a pixel and for strong edges."""
 STARVED_BITS, STARVED_STD = 0.1, 0.35
-"""Bits a pixel at which half of that is lost besides, and by how much (in the logarithm) scenes differ in it.  At 0.1 to
-0.15 bit a pixel 0.5 to 0.9 of what survives at more came through, at 0.2 bit 0.9."""
+"""Bits a pixel at which half of that is lost besides, and by how much (in the logarithm) scenes differ in it.  At 0.1
+to 0.15 bit a pixel 0.5 to 0.9 of what survives at more came through, at 0.2 bit 0.9."""
 STILL_PX = 0.4
 """Edges across which the path's standard deviation is below this are measured."""
 MIN_TRANSFER = 0.25
