@@ -246,14 +246,17 @@ def test_relief_that_stands_in_its_place_is_one_error_and_not_many() -> None:
     parts = (table.first_px // 120).astype(int)
     relief = 0.06 * np.random.default_rng(3).normal(size=(8, 8))[parts[:, 0], parts[:, 1]]
     strewn = np.random.default_rng(4).permutation(relief)
-    standing, scattered = (
+    standing, scattered, flat = (
         fit_tracks(
             recording.imu, replace(table, second_px=table.second_px + along * shape[:, None]), recording.profile,
             (terms_of.GYRO_BIAS,), scene,
-        ).std("gyro_bias")
-        for shape in (relief, strewn)
+        )
+        for shape in (relief, strewn, 0 * relief)
     )  # fmt: skip
-    assert np.all(standing > 1.5 * scattered)
+    assert np.all(standing.std("gyro_bias") > 1.5 * scattered.std("gyro_bias"))
+    deep, even = (bias_std(fit, "gyro_bias", 0.0) for fit in (scattered, flat))
+    assert np.max(deep / even) > 2
+    assert np.all(deep > even)
 
 
 def test_a_wall_needs_an_accelerometer() -> None:

@@ -77,6 +77,8 @@ class TrackFit:
     """(k + scene, k + scene): the terms first."""
     curvature: Array
     """The same from the curvature alone, as if points were independent."""
+    by_relief: Array
+    """(k + scene,) by how much values err where depths go along with their own pattern by all of their spread."""
     scale: float
     """Robust standard deviation of the whitened differences; 1 where the model explains all."""
     depth_spread_per_m: float
@@ -448,8 +450,8 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
         slices[term.name] = slice(place, place + len(term))
         place += len(term)
     return TrackFit(
-        state.known.profile, state.scene, terms, state.change, covariance, inverse, system.scale,
-        system.depth_spread, difference, system.weight, np.sqrt(system.squared), stretches,
+        state.known.profile, state.scene, terms, state.change, covariance, inverse,
+        _by_relief(table, system, inverse), system.scale, system.depth_spread, difference, system.weight, np.sqrt(system.squared), stretches,
         _cost(system, 1.0), state.known,
         system.prediction.second_s, table.noise_px[table.pair],
         None if isinstance(state.scene, DirectedMotion) else system.prediction.along_px, slices,
@@ -486,6 +488,19 @@ def _scatter(moved: Array, group: Index) -> Array:
     sums = np.stack([np.bincount(dense, column) for column in moved.T], axis=-1)
     sums -= sums.mean(axis=0)
     return np.asarray(sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
+
+
+def _by_relief(table: TrackTable, system: _System, inverse: Array) -> Array:
+    """What depths that are off by their spread, each in the sense in which a value moves it, do to the values."""
+    along_px = system.prediction.along_px
+    if along_px is None or not inverse.size or system.depth_spread == ANY_DEPTH:
+        return np.zeros(len(inverse))
+    length = np.linalg.norm(along_px, axis=-1)
+    way = along_px / np.maximum(length, 1e-12)[:, None]
+    square = (system.depth_spread * length / table.noise_px[table.pair]) ** 2
+    weight = system.weight * square / (1 + square)
+    moved = np.einsum("ni,nik->nk", way, system.rows) @ inverse / system.scale**2
+    return np.asarray(np.sqrt(weight.sum() * (weight[:, None] * moved**2).sum(axis=0)))
 
 
 def _parts_of_picture(points_px: Array) -> Index:

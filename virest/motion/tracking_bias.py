@@ -25,6 +25,9 @@ at 0.04 to 0.19 px of noise; statistics alone had put one in five of them more t
 SHARED_READOUT = 0.06
 """The same for a readout: predicted blocks shear less than rows do.  Readouts of simulated captures came out 0.02 to
 0.16 ms short."""
+SHARED_RELIEF = 0.25
+"""Part of the spread of depths about the plane that goes along with a constant rate: travel of which the depths are
+wrong looks like one.  Biases of rooms that were walked through came out wrong by 0.04 to 0.6 of it."""
 BIAS_STD: dict[str, tuple[float, ...]] = {
     "time_offset": (2e-5,),
     "imu_rotation": (2.5e-4,) * 3,
@@ -56,4 +59,7 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
     if name == "readout_time":
         return np.asarray(SHARED_READOUT * told)
     scaled = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX * np.array(BIAS_STD[name])
-    return np.asarray(np.maximum(np.maximum(scaled, SHARED * told), WANDER_STD.get(name, 0.0)))
+    floor = np.maximum(np.maximum(scaled, SHARED * told), WANDER_STD.get(name, 0.0))
+    if name == "gyro_bias" and own is not None:
+        floor = np.hypot(floor, SHARED_RELIEF * fit.by_relief[own])
+    return np.asarray(floor)
