@@ -78,7 +78,8 @@ class TrackFit:
     curvature: Array
     """The same from the curvature alone, as if points were independent."""
     by_relief: Array
-    """(k + scene,) by how much values err where depths go along with their own pattern by all of their spread."""
+    """(k + scene,) by how much values err where the picture's parts lie off the plane by the spread of depths, each in
+    the sense that moves the value."""
     scale: float
     """Robust standard deviation of the whitened differences; 1 where the model explains all."""
     depth_spread_per_m: float
@@ -451,7 +452,8 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
         place += len(term)
     return TrackFit(
         state.known.profile, state.scene, terms, state.change, covariance, inverse,
-        _by_relief(table, system, inverse), system.scale, system.depth_spread, difference, system.weight, np.sqrt(system.squared), stretches,
+        _by_relief(table, system, inverse), system.scale, system.depth_spread,
+        difference, system.weight, np.sqrt(system.squared), stretches,
         _cost(system, 1.0), state.known,
         system.prediction.second_s, table.noise_px[table.pair],
         None if isinstance(state.scene, DirectedMotion) else system.prediction.along_px, slices,
@@ -491,16 +493,22 @@ def _scatter(moved: Array, group: Index) -> Array:
 
 
 def _by_relief(table: TrackTable, system: _System, inverse: Array) -> Array:
-    """What depths that are off by their spread, each in the sense in which a value moves it, do to the values."""
+    """What depths that are off by their spread, part by part of the picture in a value's own sense, do to the values.
+
+    A camera that travels to and fro sees the same relief pull one way and the other; one that walks on does not.
+    """
     along_px = system.prediction.along_px
     if along_px is None or not inverse.size or system.depth_spread == ANY_DEPTH:
         return np.zeros(len(inverse))
     length = np.linalg.norm(along_px, axis=-1)
     way = along_px / np.maximum(length, 1e-12)[:, None]
-    square = (system.depth_spread * length / table.noise_px[table.pair]) ** 2
-    weight = system.weight * square / (1 + square)
-    moved = np.einsum("ni,nik->nk", way, system.rows) @ inverse / system.scale**2
-    return np.asarray(np.sqrt(weight.sum() * (weight[:, None] * moved**2).sum(axis=0)))
+    ratio = length / table.noise_px[table.pair]
+    pull = system.weight / system.scale**2 * ratio / np.sqrt(1 + (system.depth_spread * ratio) ** 2)
+    moved = np.einsum("ni,nik->nk", way, system.rows) @ inverse * pull[:, None]
+    place = _parts_of_picture(table.first_px)
+    points = np.maximum(np.bincount(place), 1)[:, None]
+    together = np.stack([np.bincount(place, column) for column in moved.T], axis=-1)
+    return np.asarray(system.depth_spread * np.sqrt(len(table) * (together**2 / points).sum(axis=0)))
 
 
 def _parts_of_picture(points_px: Array) -> Index:

@@ -25,9 +25,9 @@ at 0.04 to 0.19 px of noise; statistics alone had put one in five of them more t
 SHARED_READOUT = 0.06
 """The same for a readout: predicted blocks shear less than rows do.  Readouts of simulated captures came out 0.02 to
 0.16 ms short."""
-SHARED_RELIEF = 0.25
-"""Part of the spread of depths about the plane that goes along with a constant rate: travel of which the depths are
-wrong looks like one.  Biases of rooms that were walked through came out wrong by 0.04 to 0.6 of it."""
+SHARED_RELIEF = 0.6
+"""Part of the spread of depths about the plane that parts of the picture share in a constant rate's own sense: travel
+of which the depths are wrong looks like one.  In rooms that were walked through biases were off by 0.5 to 2 of it."""
 BIAS_STD: dict[str, tuple[float, ...]] = {
     "time_offset": (2e-5,),
     "imu_rotation": (2.5e-4,) * 3,
