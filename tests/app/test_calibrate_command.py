@@ -204,6 +204,17 @@ def test_config_comes_before_the_capture_s_own_profile(shaken: Path, tmp_path: P
     assert_recovered(facts)
 
 
+def test_a_focal_length_that_makes_up_for_a_gyroscope_s_scale_is_said(shaken: Path, tmp_path: Path) -> None:
+    """Turns about the optical axis tell the two apart: a scale 2 % too high is not made good by the lens in silence."""
+    for scale, said in ((1.02, True), (1.0, False)):
+        start_profile(shaken, imu__gyro_scale=[scale] * 3)
+        output = CalibrationOutput(tmp_path / f"{scale}.yaml")
+        facts, _ = run_calibration(plan_calibration(shaken, None, ("focal",)), output)
+        notes = [note for note in facts["notes"] if "gyro-scale" in note]
+        assert bool(notes) is said
+        assert not said or ("-2." in notes[0] and "--with focal,gyro-scale" in notes[0])
+
+
 def test_what_another_sensor_s_imu_yaml_says_is_compared(
     done: tuple[Path, dict[str, Any], str], shaken: Path, tmp_path: Path
 ) -> None:

@@ -31,11 +31,11 @@ Observed = tuple[BlurObservations, CameraProfile, Trajectory]
 BOTH = (ExposureTime(), Defocus())
 
 
-def observed(folder: Path, seed: int, *effects: str) -> Observed:
+def observed(folder: Path, seed: int, *effects: str, bits_per_px: float = 0.5) -> Observed:
     """A short simulated capture, its nominal profile, and what its pictures show."""
     simulate_command(
         folder, width=448, height=336, frames=42, exposure_ms=[13.0, 8.0, 10.0], rate_rad_s=1.3, seed=seed,
-        bitrate_bits_per_px=0.5, effects=effects,
+        bitrate_bits_per_px=bits_per_px, effects=effects,
     )  # fmt: skip
     capture = read_capture(folder, look_at_pictures=False)
     profile = read_profile(folder / "camera.yaml")
@@ -172,3 +172,14 @@ def test_a_scene_of_smooth_things_is_not_called_defocused(rng: np.random.Generat
     assert found.determined == (False,)
     assert np.isnan(found.values[0]).all()
     assert np.isinf(found.std).all()
+
+
+def test_a_starved_encoder_shortens_no_exposure(nominal: Observed, tmp_path: Path) -> None:
+    """Few bits bring spectra closer together, as shorter exposures would; the fit allows for it, and doubts more."""
+    starved = observed(tmp_path / "trip", 51, bits_per_px=0.1)
+    assert starved[0].bits_per_px == pytest.approx(0.1, rel=0.2)
+    found, rich = fit(*starved, (ExposureTime(),)), fit(*nominal, (ExposureTime(),))
+    assert abs(found.values[0][0] - 1) < 2.5 * found.std[0]
+    assert found.std[0] > 2 * rich.std[0]
+    as_if_rich = replace(starved[0], bits_per_px=np.inf)
+    assert fit(as_if_rich, *starved[1:], (ExposureTime(),)).values[0][0] < 0.85

@@ -422,9 +422,11 @@ def test_a_small_gamma_that_was_not_named_is_not_excluded(rng: np.random.Generat
     assert std == pytest.approx(np.hypot(narrow, pull * np.log(1.05)), rel=0.2)
 
 
-def followed_late(observed: PhotometricObservations, rng: np.random.Generator) -> PhotometricObservations:
+def followed_late(
+    observed: PhotometricObservations, rng: np.random.Generator, most: float = 0.7
+) -> PhotometricObservations:
     """The same as an encoder passes it on: each patch keeps a part of its last picture, some much and some nothing."""
-    return kept_in_part(observed, rng.uniform(0.0, 0.7, int(observed.patch.max()) + 1)[observed.patch])
+    return kept_in_part(observed, rng.uniform(0.0, most, int(observed.patch.max()) + 1)[observed.patch])
 
 
 def kept_in_part(observed: PhotometricObservations, keeps: NDArray[np.float64]) -> PhotometricObservations:
@@ -448,6 +450,17 @@ def test_an_exposure_that_an_encoder_follows_late_is_no_gain(rng: np.random.Gene
     walk = np.exp(0.08 * np.sin(0.35 * np.arange(FRAMES) + 1))
     drifting = made_observations(hidden(gain=tuple(walk / np.median(walk))), rng, 1.0, 0.1)
     assert p_of_gains(followed_late(drifting, rng)) < 1e-5
+
+
+def test_a_jitter_of_three_percent_shows_between_neighbouring_frames(rng: np.random.Generator) -> None:
+    """While the exposure walks, what frames share hides a small gain; from frame to frame it does not."""
+    jitter = np.exp(0.03 * rng.normal(size=FRAMES))
+    true = hidden(gain=tuple(jitter / np.median(jitter)))
+    shaken, steady = (
+        followed_late(made_observations(profile, rng, 1.0, 0.1), rng, 0.3) for profile in (true, hidden())
+    )
+    assert p_of_gains(shaken) < 1e-5
+    assert p_of_gains(steady) > 1e-3
 
 
 def test_gains_of_frames_without_a_common_patch_cannot_be_compared(rng: np.random.Generator) -> None:

@@ -10,6 +10,7 @@ from motion.synthetic_tracks import Recording, Setup
 
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.diagnosis.ladder import MOST_TRAVEL_PX, travel_blur_px
 from virest.diagnosis.remaining import points_left
 
 WALL = Setup(
@@ -51,3 +52,22 @@ def test_some_hundredths_of_a_pixel_are_no_cause(before_a_wall: GeometricVerdict
     calm = replace(before_a_wall, noise_px=0.027, final_rms_px=0.035)
     assert not points_left(calm).significant
     assert points_left(replace(before_a_wall, noise_px=0.08, final_rms_px=0.12)).significant
+
+
+def exposed_for(verdict: GeometricVerdict, exposure_s: float) -> GeometricVerdict:
+    """The same points, exposed for so long."""
+    table = verdict.table
+    return replace(verdict, table=replace(table, second_exposure_s=np.full(len(table), exposure_s)))
+
+
+def test_travel_blurs_by_what_it_moves_points_within_an_exposure(before_a_wall: GeometricVerdict) -> None:
+    """Walking on at 0.8 m/s before a wall 1.6 m away blurs a long exposure, a short one hardly; turning not."""
+    short, long = (travel_blur_px(exposed_for(before_a_wall, exposure_s)) for exposure_s in (0.0005, 0.01))
+    assert long == pytest.approx(20 * short, rel=0.2)
+    assert short < MOST_TRAVEL_PX < long
+    lens = before_a_wall.fit.profile.intrinsics
+    assert lens is not None
+    edge_px = 0.5 * np.hypot(before_a_wall.fit.profile.width, before_a_wall.fit.profile.height)
+    assert 0.3 * edge_px < long / (0.01 * 0.8 * 0.6) < 1.5 * max(edge_px, lens.fx_px)
+    turning = replace(before_a_wall, model=replace(before_a_wall.model, scene=None))
+    assert travel_blur_px(turning) == 0.0

@@ -57,6 +57,10 @@ MIN_STRETCHES = 2.5
 """A value that rests on fewer stretches of time is a single moment's, and nothing else bears it out."""
 MANY_OUTLIERS = 0.1
 LARGE_CORRELATION = 0.9
+TWINS = {"focal": "gyro-scale", "gyro-scale": "focal"}
+"""What turns about the picture's axes tell only the product of; turns about the optical axis tell the two apart."""
+TWIN_SIGMA, TWIN_STD = 3.0, 0.01
+"""A twin held fixed is said to be wrong from so many deviations on, and to be open above this part of itself."""
 
 OPTIONAL = {
     "focal": terms_of.FOCAL,
@@ -177,9 +181,35 @@ def calibrate_geometry(
         left_out += (1 - left_out) * astray
         if not astray:
             break
-    say("joint")
     found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out)
+    found = replace(found, notes=(*found.notes, *_twin_notes(capture.imu, table, fit, names, found.noise_px)))
+    say("joint")
     return found if lag is None else _with_lag(found, lag)
+
+
+def _twin_notes(imu: ImuSamples, table: TrackTable, fit: TrackFit, names: Sequence[str], noise_px: float) -> list[str]:
+    """Warnings about a focal length or a gyroscope's scale that was fitted while its twin was held where it was."""
+    notes = []
+    for name in names:
+        twin = TWINS.get(name)
+        if twin is None or twin in names:
+            continue
+        term = OPTIONAL[twin]
+        free = fit_tracks(imu, table, fit.profile, [*fit.terms, term], fit.scene)
+        change = float(free.value(term.name)[0])
+        std = float(np.hypot(free.std(term.name)[0], bias_std(free, term.name, noise_px)[0]))
+        pair = f"--with {','.join([*names, twin])}"
+        if abs(change) > TWIN_SIGMA * std:
+            notes.append(
+                f"{name} makes up for a wrong {twin}: the points want that {change:+.1%} ± {std:.1%} off; "
+                f"fit both, {pair}"
+            )
+        elif std > TWIN_STD:
+            notes.append(
+                f"{name} is only as right as {twin}, which was held fixed: this motion tells it to ± {std:.1%} only; "
+                "turn the phone about its optical axis too"
+            )
+    return notes
 
 
 def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) -> ObservedTracks:

@@ -110,6 +110,7 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
         clock_shift_ns=shift_ns,
         imu_gaps_s=gaps,
         keyframes=files.movie.keyframes,
+        bits_per_px=files.movie.bits_per_px,
         notes=tuple(notes),
         counts=_counts(files, joined, frames),
         stamp_0_ns=zero_ns,

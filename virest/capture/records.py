@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 
 from virest.camera.profile import CameraProfile
@@ -86,6 +87,8 @@ class Capture:
     """(start, end) of each hole in the inertial data."""
     keyframes: tuple[int, ...] = ()
     """Indices of the frames that the decoder can start from."""
+    bits_per_px: float = inf
+    """What the encoder spent on a pixel of a frame, in the mean; inf for pictures that were not encoded as a movie."""
     notes: tuple[Note, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)
     """Rows and frames read, joined, and dropped, by reason."""

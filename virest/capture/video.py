@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,8 @@ class MovieIndex:
     """Access units left out since another one has their time."""
     pictures: tuple[str, ...] = ()
     """Of a folder of pictures: their paths, from the folder or from the list's folder; empty for a movie."""
+    bits_per_px: float = inf
+    """What the encoder spent on a pixel of a frame, in the mean; inf for pictures, which are taken as they are."""
 
     def __len__(self) -> int:
         return len(self.pts_ticks)
@@ -221,13 +224,13 @@ def _check_size(width: int, height: int, path: Path) -> None:
 
 
 def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> MovieIndex:
-    rows: list[tuple[int, int, bool]] = []
+    rows: list[tuple[int, int, bool, int]] = []
     try:
         for packet in container.demux(stream):
             pts = packet.pts if packet.pts is not None else packet.dts
             if pts is None or packet.is_discard or packet.size == 0:
                 continue
-            rows.append((pts, packet.dts if packet.dts is not None else pts, packet.is_keyframe))
+            rows.append((pts, packet.dts if packet.dts is not None else pts, packet.is_keyframe, packet.size))
             if len(rows) > MAX_FRAMES:
                 raise VideoError(f"{label(path)}: more than {MAX_FRAMES} frames", hint="cut the movie")
     except av.FFmpegError as fault:
@@ -250,6 +253,7 @@ def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> 
         stream.codec_context.name,
         int(stream.frames or 0),
         int(len(table) - len(kept)),
+        bits_per_px=8.0 * float(kept[:, 3].mean()) / (width * height),
     )
 
 

@@ -18,7 +18,7 @@ from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, me
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
 from virest.diagnosis.light_values import settle_light
-from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve
+from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
 from virest.diagnosis.points import (
     MIN_PAIRS,
     TrackedPoints,
@@ -33,10 +33,14 @@ from virest.diagnosis.remaining import points_left, remaining_structure, residua
 from virest.errors import CaptureError
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import observe_tracks
+from virest.motion.scene_motion import InertialMotion
 from virest.motion.shared_out import Each, one_by_one
+from virest.motion.track_model import predict
 from virest.motion.tracking import track_frames, track_pairs
 
 Progress = Callable[[str, float], None]
+MOST_TRAVEL_PX = 0.35
+"""A tenth of the shortest blur whose mixing of light is looked at: such travel turns no path by more than that."""
 
 
 def diagnose_capture(
@@ -158,7 +162,13 @@ class _Story:
         """The curve from what blur mixes, where the paths of blur are sure."""
         assert self.curve is not None
         extended = self.curve.profile
-        if points_left(self.geometric).significant or _paths_uncertain(extended, self.geometric):
+        if points_left(self.geometric).significant:
+            return
+        if _paths_uncertain(extended, self.geometric):
+            if self.light.observations is None or not light_varies(self.light.observations):
+                self.curve.notes.append(
+                    "blur depends on more than turns: the curve was not judged at constant exposure"
+                )
             return
         trajectory = integrate_gyro(self.capture.imu, extended)
         self.curve = judge_curve(extended, self.light.observations, self.frames, trajectory, pictures, self.each)
@@ -204,4 +214,19 @@ class _Story:
 def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> bool:
     """Whether blur depends on more than turns: then what blur mixes says little about the curve."""
     extensions = profile.extensions
-    return bool(extensions.stabilisation_fraction or extensions.defocus_sigma_px or geometric.model.scene is not None)
+    moved = bool(extensions.stabilisation_fraction or extensions.defocus_sigma_px)
+    return moved or travel_blur_px(geometric) > MOST_TRAVEL_PX
+
+
+def travel_blur_px(geometric: GeometricVerdict) -> float:
+    """How far the camera's travel moves points within an exposure, px; of the nearest and quickest, one in ten."""
+    fitted, table = geometric.fit, geometric.table
+    if geometric.model.scene is None:
+        return 0.0
+    if not isinstance(fitted.scene, InertialMotion):
+        return float("inf")
+    seen = (predict(fitted.ground, table, scene).second_px for scene in (fitted.scene, None))
+    apart_s = np.maximum(table.second_stamp_s - table.first_stamp_s, 1e-6)
+    exposure_s = np.asarray(fitted.profile.shutter.true_exposure_s(table.second_exposure_s))
+    travelled_px = np.linalg.norm(np.subtract(*seen), axis=-1) * exposure_s / apart_s
+    return float(np.quantile(travelled_px, 0.9))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,10 @@ LENS_STD_PX = 0.13
 DAMPING = (0.92, 0.84)
 """Part of a log ratio that survives the coding, in each ring of frequencies."""
 DAMPING_STD = 0.13
-"""Its spread: more is lost at 0.15 bit a pixel and under defocus, less at 1 bit and for strong edges."""
+"""Its spread: more is lost under defocus, less at 1 bit a pixel and for strong edges."""
+STARVED_BITS, STARVED_STD = 0.1, 0.35
+"""Bits a pixel at which half of that is lost besides, and by how much (in the logarithm) scenes differ in it.  At 0.1
+to 0.15 bit a pixel 0.5 to 0.9 of what survives at more came through, at 0.2 bit 0.9."""
 STILL_PX = 0.4
 """Edges across which the path's standard deviation is below this are measured."""
 MIN_TRANSFER = 0.25
@@ -82,6 +86,8 @@ class BlurObservations:
     """Strong slopes that were tried as edges, across which the picture hardly moved or not."""
     isolated: int
     """Those of them that are isolated steps."""
+    bits_per_px: float = inf
+    """What the encoder spent on a pixel."""
 
     def __len__(self) -> int:
         return len(self.edges) + int(self.valid.sum())
@@ -101,6 +107,16 @@ class BlurObservations:
     def is_edge(self) -> Mask:
         """Which residuals are edges."""
         return np.arange(len(self)) < len(self.edges)
+
+    @property
+    def surviving(self) -> float:
+        """Part of DAMPING that the encoder's bits let through."""
+        return 1.0 / (1.0 + (STARVED_BITS / self.bits_per_px) ** 3)
+
+    @property
+    def damping_std(self) -> float:
+        """Relative standard deviation of what comes through."""
+        return float(np.hypot(DAMPING_STD, 3.0 * (1.0 - self.surviving) * STARVED_STD))
 
     @property
     def edges_determined(self) -> bool:
@@ -145,7 +161,7 @@ def look_for_blur(
     ]
     seen = each(_measured_part, calls)
     edges, pairs = ([one for part in seen for one in part[kind]] for kind in (0, 1))
-    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory)
+    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
 
 
 def _measured_part(
@@ -168,7 +184,7 @@ def observe_blur(
     """
     curve = profile.response or ResponseCurve("srgb")
     edges, pairs = _measured(pictures, capture.frames, curve, settings or EdgeSettings(), frozenset())
-    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory)
+    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
 
 
 def _measured(
@@ -191,12 +207,12 @@ def _measured(
 
 
 def _chosen(
-    edges: EdgeWidths, ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory
+    edges: EdgeWidths, ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory, bits_per_px: float
 ) -> BlurObservations:
     still = edges.select(_motion_px(edges, profile, trajectory) < STILL_PX)
     through = transfers(ratios, profile, trajectory)[:, :, 0].min(axis=1)
     ratio = np.where(through > MIN_TRANSFER, ratios.log_ratio, np.nan)
-    return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, len(edges))
+    return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, len(edges), bits_per_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +256,7 @@ def residuals(
 def _ratio_residuals(observations: BlurObservations, log_ratios: Array, damping: float) -> Array:
     valid = observations.valid
     ring = np.broadcast_to(ring_of_bin(), valid.shape)[valid]
-    share = damping * np.array(DAMPING)[ring]
+    share = damping * observations.surviving * np.array(DAMPING)[ring]
     own, *earlier = (log_ratios * share[:, None]).T
     off = observations.ratios.log_ratio[valid] - own
     scale = 1.0 / (2.0 * (2 * np.pi * (np.array(BANDS_PER_PX[:-1]) + np.array(BANDS_PER_PX[1:])) / 2) ** 2)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.local_blur import (
-    DAMPING_STD,
     LENS_SIGMA_PX,
     LENS_STD_PX,
     MIN_CONTRAST,
@@ -251,7 +250,7 @@ class _Problem:
         meat = gradients.T @ gradients * count / max(count - 1, 1) + np.diag(self.precision)
         inverse = np.linalg.pinv(self._hessian(jacobian, weight))
         by_damping = (self.residual(theta, 1.0 + _DAMPING_STEP) - residual) / _DAMPING_STEP
-        pulled = inverse @ (jacobian.T @ (weight * by_damping)) * np.hypot(DAMPING_STD, 2 * PATH_STD)
+        pulled = inverse @ (jacobian.T @ (weight * by_damping)) * np.hypot(self.observations.damping_std, 2 * PATH_STD)
         return inverse @ meat @ inverse + np.outer(pulled, pulled)
 
     def held(self, theta: Array) -> Array:

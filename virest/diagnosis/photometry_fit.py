@@ -47,6 +47,8 @@ were alike came out 1.3 to 3 times further off than it says, on movies of 1 to 0
 LATE_FRAMES, CURVE_DOUBT = 0.5, 0.02
 """What gains may make of changes of the logarithm of exposure × ISO that are none of their own: an encoder is about so
 many frames late beyond its memory, and a curve is that far off in its slope and in its bend."""
+NEIGHBOURS = 3.0
+"""Changes from frame to frame of which one counts: each shares a frame with the next."""
 BLOCKS_S = 0.3
 """About the length of a block of frames: longer than a hand's sway keeps its direction, and than the encoder's memory
 of a picture that moves."""
@@ -227,7 +229,9 @@ def significance(fit: PhotometricFit, effect_name: str, observations: Photometri
 def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covariance: Array) -> float:
     """Probability that frames' gains are nothing but errors, and what curve and encoder make of exposure × ISO.
 
-    Frames of one stretch of time share their errors: each stretch counts once.
+    Frames of one stretch of time share their errors: each stretch counts once.  From one frame to the next what they
+    share cancels, so quick changes are looked at on their own; neighbouring ones have a frame in common, and a third of
+    them counts.
     """
     product = _per_frame(observations, observations.log_product)
     rounding = _per_frame(observations, observations.log_product_std)
@@ -237,8 +241,25 @@ def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covarian
     off = log_gain - np.mean(log_gain)
     freedom = max(len(off) - 1, 1)
     stretches = min(len(np.unique(time_blocks(observations))), freedom)
-    z2 = float(off @ np.linalg.solve(spread, off)) / freedom * stretches
-    return float(stats.chi2.sf(z2, stretches))
+    slow = float(off @ np.linalg.solve(spread, off)) / freedom
+    quick = _quick_changes(log_gain, spread - _lag_of_gains(log_gain, np.abs(late)))
+    tests = ((slow, stretches), (quick, max(freedom / NEIGHBOURS, 1.0)))
+    return float(min(1.0, 2 * min(stats.chi2.sf(ratio * count, count) for ratio, count in tests)))
+
+
+def _quick_changes(log_gain: Array, spread: Array) -> float:
+    """Mean square of the changes between neighbouring frames, in their variances."""
+    if len(log_gain) < 2:
+        return 0.0
+    variance = spread.diagonal()[1:] + spread.diagonal()[:-1] - 2 * spread.diagonal(1)
+    return float(np.mean(np.diff(log_gain) ** 2 / np.maximum(variance, RESOLUTION["gain_drift"] ** 2)))
+
+
+def _lag_of_gains(log_gain: Array, exposed: Array) -> Array:
+    """What an encoder's lag behind the gains' own changes adds to their covariance: without gains there is none."""
+    own = np.abs(log_gain - _frames_before(log_gain, 1))
+    centre = np.eye(len(own)) - 1 / len(own)
+    return np.asarray(centre @ np.diag(LAG_DOUBT**2 * ((own + exposed) ** 2 - exposed**2)) @ centre)
 
 
 def _frames_before(values: Array, frames: int) -> Array:

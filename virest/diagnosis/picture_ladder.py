@@ -63,6 +63,8 @@ MIXING_LEAST = {"response_curve": 0.05, "black_level": 0.02}
 MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
 BLUR_Z = 3.6
 MIN_DEFOCUS_PX = 0.5
+SOFT_Z = 5.0
+"""A defocus that is not named, for lenses differ, is said from so many deviations on; named from twice BLUR_Z."""
 MIN_EXPOSURE_CHANGE = 0.08
 
 SENTENCES = {
@@ -386,6 +388,11 @@ def climb_blur(
         named.append(0)
     if fitted.determined[1] and sigma > MIN_DEFOCUS_PX and sigma**2 > BLUR_Z * 2 * sigma * float(std[1]):
         named.append(1)
+    if 1 not in named and fitted.determined[1] and sigma > SOFT_Z * float(std[1]):
+        soft = float(np.hypot(sigma, fitted.nuisance[0]))
+        verdict.notes.append(
+            f"edges are {soft:.2f} px soft: by the lens, or a defocus of about {sigma:.1f} px; not named"
+        )
     for k in named:
         alone = tuple(effects[j] for j in named)
         before, after = local_blur_fit.held_out(observations, profile, trajectory, alone)

@@ -21,7 +21,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
-from virest.motion.track_model import Ground, Prediction, TrackTable, ground, predict, with_profile
+from virest.motion.track_model import Ground, Index, Prediction, TrackTable, ground, predict, with_profile
 from virest.motion.travel_direction import find_directions, without_directions
 
 Array = NDArray[np.float64]
@@ -35,6 +35,8 @@ GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4
 MAX_DAMPING = 1e3
 SMALLEST_SCALE = 0.03
+PLACES = 5
+"""The picture is taken in so many parts each way: a wall or a ceiling fills some of them."""
 ON_THE_WAY, AT_THE_END = (1.5, 0.5), (0.1, 0.05)
 """Slopes serve until the points have moved so many pixels (median), or the scene's own values by this part, since."""
 NOT_AT_ALL = (0.0, 0.0)
@@ -75,6 +77,9 @@ class TrackFit:
     """(k + scene, k + scene): the terms first."""
     curvature: Array
     """The same from the curvature alone, as if points were independent."""
+    by_relief: Array
+    """(k + scene,) by how much values err where the picture's parts lie off the plane by the spread of depths, each in
+    the sense that moves the value."""
     scale: float
     """Robust standard deviation of the whitened differences; 1 where the model explains all."""
     depth_spread_per_m: float
@@ -446,8 +451,9 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
         slices[term.name] = slice(place, place + len(term))
         place += len(term)
     return TrackFit(
-        state.known.profile, state.scene, terms, state.change, covariance, inverse, system.scale,
-        system.depth_spread, difference, system.weight, np.sqrt(system.squared), stretches,
+        state.known.profile, state.scene, terms, state.change, covariance, inverse,
+        _by_relief(table, system, inverse), system.scale, system.depth_spread,
+        difference, system.weight, np.sqrt(system.squared), stretches,
         _cost(system, 1.0), state.known,
         system.prediction.second_s, table.noise_px[table.pair],
         None if isinstance(state.scene, DirectedMotion) else system.prediction.along_px, slices,
@@ -455,21 +461,61 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
 
 
 def _block_covariance(table: TrackTable, system: _System, inverse: Array, blocks: int) -> Array:
-    """Sandwich H⁻¹ (Σ g gᵀ) H⁻¹ over blocks of consecutive pairs, not below the curvature's along any parameter."""
+    """Sandwich H⁻¹ S H⁻¹, S of the gradients' scatter, not below the curvature's along any parameter.
+
+    Points of one moment share its errors, and points of one part of the picture share the relief that stands there as
+    long as the camera travels on: S counts both (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
+    """
     count = min(blocks, table.n_pairs)
     if count < MIN_BLOCKS or not inverse.size:
         return inverse
     block = table.pair * count // table.n_pairs
     weighted = system.left * (system.weight / system.scale**2)[:, None]
-    per_point = np.einsum("nki,nk->ni", system.rows, weighted)
-    gradients = np.stack([np.bincount(block, column, count) for column in per_point.T], axis=-1)
-    gradients -= gradients.mean(axis=0)
-    moved = gradients @ inverse
-    sandwich = moved.T @ moved * count / (count - 1) / _true_curvature(system) ** 2
+    moved = np.einsum("nki,nk->ni", system.rows, weighted) @ inverse
+    by_moment = _scatter(moved, block)
+    place = _parts_of_picture(table.first_px)
+    by_place = _scatter(moved, place) - _scatter(moved, block * PLACES**2 + place)
+    # a difference of two may come out negative: places then share nothing
+    places_share = np.sqrt(1 + np.maximum(np.diag(by_place), 0.0) / np.maximum(np.diag(by_moment), 1e-300))
+    sandwich = by_moment * np.outer(places_share, places_share) / _true_curvature(system) ** 2
     prior_part = inverse @ (system.prior[:, None] * inverse)
     total = sandwich + prior_part
     raised = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(total), 1e-300), 1.0))
     return total * np.outer(raised, raised)
+
+
+def _scatter(moved: Array, group: Index) -> Array:
+    """Σ g gᵀ (k, k) of the groups' sums of what each point moves the values by (n, k), about the groups' mean."""
+    dense = np.unique(group, return_inverse=True)[1]
+    sums = np.stack([np.bincount(dense, column) for column in moved.T], axis=-1)
+    sums -= sums.mean(axis=0)
+    return np.asarray(sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
+
+
+def _by_relief(table: TrackTable, system: _System, inverse: Array) -> Array:
+    """What depths that are off by their spread, part by part of the picture in a value's own sense, do to the values.
+
+    A camera that travels to and fro sees the same relief pull one way and the other; one that walks on does not.
+    """
+    along_px = system.prediction.along_px
+    if along_px is None or not inverse.size or system.depth_spread == ANY_DEPTH:
+        return np.zeros(len(inverse))
+    length = np.linalg.norm(along_px, axis=-1)
+    way = along_px / np.maximum(length, 1e-12)[:, None]
+    ratio = length / table.noise_px[table.pair]
+    pull = system.weight / system.scale**2 * ratio / np.sqrt(1 + (system.depth_spread * ratio) ** 2)
+    moved = np.einsum("ni,nik->nk", way, system.rows) @ inverse * pull[:, None]
+    place = _parts_of_picture(table.first_px)
+    points = np.maximum(np.bincount(place), 1)[:, None]
+    together = np.stack([np.bincount(place, column) for column in moved.T], axis=-1)
+    return np.asarray(system.depth_spread * np.sqrt(len(table) * (together**2 / points).sum(axis=0)))
+
+
+def _parts_of_picture(points_px: Array) -> Index:
+    """Number of the part of the picture (n,) that each point lies in: PLACES by PLACES of them."""
+    low, high = points_px.min(axis=0), points_px.max(axis=0)
+    cell = ((points_px - low) / np.maximum(high - low, 1.0) * PLACES).astype(np.intp).clip(0, PLACES - 1)
+    return np.asarray(cell[:, 0] * PLACES + cell[:, 1])
 
 
 def _true_curvature(system: _System) -> float:
