@@ -347,6 +347,11 @@ def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfi
         raise SettingsError(f"{name}: {error.message}", hint=error.hint) from None
 
 
+def require_usable(profile: CameraProfile, name: str = "profile") -> None:
+    """Hold a profile that was built in memory to what a file must keep. Raises SettingsError with the key."""
+    parse_profile(profile_mapping(profile), name)
+
+
 def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
     """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
     first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
@@ -576,7 +581,7 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
             "height_mm": profile.sensor_height_mm,
             "focal_length_mm": profile.focal_length_mm,
         },
-        "scene": {"depth_m": "inf" if depth is not None and math.isinf(depth) else depth},
+        "scene": {"depth_m": "inf" if depth == math.inf else depth},
         "estimates": {n: {"value": e.value, "std": e.std, "source": e.source} for n, e in profile.estimates.items()},
         "extensions": extensions,
     }
