@@ -26,6 +26,8 @@ from virest.errors import SettingsError
 MAX_PROFILE_BYTES = 1_000_000
 MAX_SIDE_PX = 20_000
 MAX_DEPTH = 20
+LARGEST = 1e9
+"""No value of a profile is larger; far beyond, products of a few overflow."""
 MAX_DIGITS = 250
 """No number of so many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
 NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
@@ -126,7 +128,7 @@ def _number(value: Any) -> Any:
             value = float(value)
         except ValueError:
             raise ValueError("is no number") from None
-    if isinstance(value, int) and abs(value) > 10**15:
+    if isinstance(value, int | float) and LARGEST < abs(value) < math.inf:
         raise ValueError("is too large")
     return value
 
@@ -140,6 +142,14 @@ Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _unknown_is_as_absent(cls, values: Any) -> Any:
+        """``null`` under a known key, a block's or a value's, means unknown, as if the key were not there."""
+        if not isinstance(values, dict):
+            return values
+        return {key: value for key, value in values.items() if value is not None or key not in cls.model_fields}
 
 
 class _Image(_Strict):
@@ -227,7 +237,7 @@ class _Scene(_Strict):
 
 
 class _FocalDrift(_Strict):
-    focal_drift_per_s: Number = 0.0
+    focal_drift_per_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0
 
 
 class _Stabilisation(_Strict):
@@ -267,7 +277,7 @@ class _Extensions(_Strict):
 
 
 class _Estimate(_Strict):
-    value: Any
+    value: Any = None
     std: Any = None
     source: str = ""
 
@@ -362,7 +372,8 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
         near = _nearest(path[-1], known)
         hint = f"did you mean '{near}'?" if near else f"known keys: {', '.join(known)}"
         return SettingsError(f"{name}: unknown key '{where[:80]}', {hint}")
-    value = "" if isinstance(first.get("input"), dict) else f", got {str(first.get('input'))[:60]!r}"
+    found = first.get("input")
+    value = "" if isinstance(found, dict) else ", got null" if found is None else f", got {str(found)[:60]!r}"
     message = _printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
     return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see the profile in README")
 
