@@ -305,7 +305,8 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
     """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
     try:
         if not path.is_file():
-            raise SettingsError(f"{path}: no such file", hint="pass a YAML file")
+            what = "is no plain file" if path.exists() else "no such file"
+            raise SettingsError(f"{path}: {what}", hint="pass a YAML file")
         size = path.stat().st_size
         if size > MAX_PROFILE_BYTES:
             raise SettingsError(f"{path.name}: {size} bytes, more than {MAX_PROFILE_BYTES}", hint="is it a profile?")

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from virest.capture.files import TextScan, label, read_small_text, scan_text
 from virest.capture.tables import (
