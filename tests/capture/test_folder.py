@@ -306,6 +306,31 @@ def test_an_accelerometer_without_gravity_is_doubted(writer, row):
     assert codes(read_capture(writer.folder)) == {"accel-implausible"}
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("MOVIE.MOV", "'MOVIE.MOV'? rename it"), ("take.mkv", "'take.mkv'? ffmpeg"), ("a.txt", "its movie")],
+)
+def test_a_movie_of_another_name_is_pointed_at(writer, name, said):
+    """Renamed, or put into another container, by whoever copied it."""
+    folder = writer.write()
+    (folder / "movie.mp4").rename(folder / name)
+    with pytest.raises(VideoError, match="no such file") as caught:
+        read_capture(folder)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("head", "kind"), [(b"\x1a\x45\xdf\xa3", "Matroska"), (b"RIFF\0\0\0\0AVI LIST", "AVI"), (b"text", "moov")]
+)
+def test_another_container_is_named(writer, head, kind):
+    """With the command that puts its stream into an MP4."""
+    folder = writer.write()
+    (folder / "movie.mp4").write_bytes(head + bytes(1000))
+    with pytest.raises(VideoError, match="cannot be opened") as caught:
+        read_capture(folder)
+    assert kind in caught.value.hint
+
+
 def swap(writer: CaptureWriter, one: str, other: str) -> None:
     """Exchange two files' contents."""
     left, right = writer.folder / one, writer.folder / other

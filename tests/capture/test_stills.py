@@ -11,7 +11,7 @@ import pytest
 from capture_writing import CaptureWriter
 
 from virest.capture.folder import read_capture
-from virest.capture.stills import ExifExposure, capture_bracket, read_bracket, read_exif_exposure
+from virest.capture.stills import ExifExposure, capture_bracket, read_bracket, read_exif_exposure, read_exposures
 from virest.errors import CaptureError
 
 
