@@ -449,6 +449,15 @@ def test_files_that_are_too_large_missing_or_folders_are_refused(tmp_path: Path)
         load_yaml_mapping(tmp_path)
 
 
+@pytest.mark.parametrize("twice", ["device: a\ndevice: b\n", "imu: {clock_skew: 0.0, clock_skew: 0.001}\n"])
+def test_a_key_that_stands_twice_is_refused(tmp_path: Path, twice: str) -> None:
+    """Two blocks of one name are a slip: neither is taken in silence."""
+    path = tmp_path / "camera.yaml"
+    path.write_text("virest_profile: 1\nimage: {width: 64, height: 48}\n" + twice)
+    with pytest.raises(SettingsError, match=r"camera\.yaml: line \d: '(device|clock_skew)' is written a second time"):
+        read_profile(path)
+
+
 def test_reading_does_not_change_the_mapping() -> None:
     """The caller's mapping stays as it was."""
     content: dict[str, Any] = yaml.safe_load(CONTRACT_EXAMPLE)

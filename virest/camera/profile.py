@@ -312,6 +312,7 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
             raise SettingsError(f"{path.name}: {size} bytes, more than {MAX_PROFILE_BYTES}", hint="is it a profile?")
         text = path.read_text(encoding="utf-8")
         _require_plain(text, path.name)
+        _require_keys_once(yaml.compose(text, Loader=yaml.SafeLoader), path.name)
         content = yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -344,6 +345,24 @@ def _require_plain(text: str, name: str) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
             raise SettingsError(f"{name}: nested more than {MAX_DEPTH} deep", hint="is it a profile?")
+
+
+def _require_keys_once(node: yaml.Node | None, name: str) -> None:
+    """Refuse a key that stands twice in one block: the last would hold, and nobody would know."""
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _require_keys_once(item, name)
+    if not isinstance(node, yaml.MappingNode):
+        return
+    seen: set[str] = set()
+    for key, value in node.value:
+        if isinstance(key, yaml.ScalarNode):
+            if key.value in seen:
+                shown = _printable(key.value[:60])
+                line = key.start_mark.line + 1
+                raise SettingsError(f"{name}: line {line}: '{shown}' is written a second time", hint="keep one of them")
+            seen.add(key.value)
+        _require_keys_once(value, name)
 
 
 def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfile:
