@@ -1,5 +1,6 @@
 """The program as its users meet it: exit codes, one line for an error, results on standard output only."""
 
+import errno
 import json
 import os
 import re
@@ -376,6 +377,26 @@ def test_a_disk_that_takes_no_more(virest: Virest, tiny: Path, code: str, after:
     undisturbed = [*arguments[:3], str(tiny.parent / "again"), *arguments[4:]]
     assert virest(*undisturbed).returncode == 0
     assert content(tiny.parent / "out/tiny") == content(tiny.parent / "again/tiny")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["process", "{tiny}", "--out", "{long}"], 8),
+        (["process", "{tiny}", "--config", "{long}"], 3),
+        (["simulate", "{long}"], 8),
+        (["calibrate", "{tiny}", "--out", "{long}"], 8),
+        (["diagnose", "{tiny}", "--out", "{long}"], 8),
+        (["export", "{tiny}", "--out", "{long}"], 8),
+        (["report", "{long}"], 4),
+    ],
+)
+def test_names_too_long_for_the_disk_are_no_fault_of_ours(
+    virest: Virest, tiny: Path, arguments: list[str], code: int
+) -> None:
+    """One line and the code of what was named, not a traceback."""
+    filled = [part.format(tiny=tiny, long=tiny.parent / ("a" * 300)) for part in arguments]
+    assert_refused(virest(*filled), code, os.strerror(errno.ENAMETOOLONG))
 
 
 # ── batches ──────────────────────────────────────────────────────────────────────────────────────────────────────

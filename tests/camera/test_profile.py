@@ -234,6 +234,48 @@ def test_null_is_unknown() -> None:
     assert profile.imu_time_s(2.0) == 2.0
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "device:",
+        "intrinsics:",
+        "intrinsics: {distortion: {model: radtan, k1: null}}",
+        "shutter:",
+        "shutter: {readout_direction: null, timestamp: null, exposure_scale: null}",
+        "imu:",
+        "imu: {clock_skew: null, gyro_bias_rad_s: null, gyro_scale: null}",
+        "sensor:",
+        "scene:",
+        "extensions: {focal_drift: null, stabilisation: {fraction: null}, response_gamma: null, gain: null}",
+    ],
+)
+def test_a_null_that_cannot_be_estimated_is_as_if_left_out(text: str) -> None:
+    """A block or a value that is null has the default, as one that is not written at all."""
+    assert _parse(text + "\n") == _parse("")
+
+
+@pytest.mark.parametrize("text", ["scene: {dept_m: null}", "extensions: {gain: [1.0, null]}", "response: {kind: null}"])
+def test_a_null_is_no_excuse(text: str) -> None:
+    """An unknown key, an element of a list and what a block cannot do without are refused, null or not."""
+    with pytest.raises(SettingsError):
+        _parse(text + "\n")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "intrinsics: {cx_px: -1.0e+300}",
+        "intrinsics: {fx_px: 100, distortion: {model: radtan, k1: -1.0e+300}}",
+        "extensions: {focal_drift: {focal_drift_per_s: -100000}}",
+        "extensions: {flicker: {phase_rad: 1.0e+300}}",
+    ],
+)
+def test_numbers_that_overflow_are_refused(text: str) -> None:
+    """Not a fault in the middle of a frame, nor an array without end."""
+    with pytest.raises(SettingsError):
+        _parse(text + "\n")
+
+
 def test_what_is_left_out_has_its_default() -> None:
     """One focal length serves both axes, the lens looks through the picture's middle, Android holds its axes."""
     profile = _parse("intrinsics: {fy_px: 70}\n")
@@ -403,8 +445,17 @@ def test_files_that_are_too_large_missing_or_folders_are_refused(tmp_path: Path)
         read_profile(tmp_path / "large.yaml")
     with pytest.raises(SettingsError, match=r"none\.yaml: no such file"):
         read_profile(tmp_path / "none.yaml")
-    with pytest.raises(SettingsError, match="no such file"):
+    with pytest.raises(SettingsError, match="is no plain file"):
         load_yaml_mapping(tmp_path)
+
+
+@pytest.mark.parametrize("twice", ["device: a\ndevice: b\n", "imu: {clock_skew: 0.0, clock_skew: 0.001}\n"])
+def test_a_key_that_stands_twice_is_refused(tmp_path: Path, twice: str) -> None:
+    """Two blocks of one name are a slip: neither is taken in silence."""
+    path = tmp_path / "camera.yaml"
+    path.write_text("virest_profile: 1\nimage: {width: 64, height: 48}\n" + twice)
+    with pytest.raises(SettingsError, match=r"camera\.yaml: line \d: '(device|clock_skew)' is written a second time"):
+        read_profile(path)
 
 
 def test_reading_does_not_change_the_mapping() -> None:

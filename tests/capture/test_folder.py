@@ -286,6 +286,51 @@ def test_profile_comes_from_config_then_folder_then_metadata(writer, tmp_path):
         resolve_profile(capture, tmp_path / "mine.yaml")
 
 
+def test_a_capture_whose_clock_begins_at_its_first_frame_is_whole(writer):
+    """Stamps that count from 0 join like any others, and no frame moves by one."""
+    shift = min(writer.stamps_ns)
+    for name in ("stamps_ns", "metadata_ns", "imu_ns"):
+        setattr(writer, name, [time - shift for time in getattr(writer, name)])
+    capture = read_capture(writer.write())
+    assert capture.notes == ()
+    assert [frame.timestamp_ns for frame in capture.frames][:2] == [0, PERIOD_NS]
+    assert skipped(capture) == []
+
+
+@pytest.mark.parametrize("row", ["0.1,0.99,0.0", "0,0,0"])
+def test_an_accelerometer_without_gravity_is_doubted(writer, row):
+    """Values in g, without gravity, or of the gyroscope: said, before anything is built on them."""
+    writer.write()
+    lines = (writer.folder / "gyro_accel.csv").read_text().splitlines()
+    writer.text("gyro_accel.csv", [lines[0], *(",".join(line.split(",")[:4]) + f",{row}" for line in lines[1:])])
+    assert codes(read_capture(writer.folder)) == {"accel-implausible"}
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("MOVIE.MOV", "'MOVIE.MOV'? rename it"), ("take.mkv", "'take.mkv'? ffmpeg"), ("a.txt", "its movie")],
+)
+def test_a_movie_of_another_name_is_pointed_at(writer, name, said):
+    """Renamed, or put into another container, by whoever copied it."""
+    folder = writer.write()
+    (folder / "movie.mp4").rename(folder / name)
+    with pytest.raises(VideoError, match="no such file") as caught:
+        read_capture(folder)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("head", "kind"), [(b"\x1a\x45\xdf\xa3", "Matroska"), (b"RIFF\0\0\0\0AVI LIST", "AVI"), (b"text", "moov")]
+)
+def test_another_container_is_named(writer, head, kind):
+    """With the command that puts its stream into an MP4."""
+    folder = writer.write()
+    (folder / "movie.mp4").write_bytes(head + bytes(1000))
+    with pytest.raises(VideoError, match="cannot be opened") as caught:
+        read_capture(folder)
+    assert kind in caught.value.hint
+
+
 def swap(writer: CaptureWriter, one: str, other: str) -> None:
     """Exchange two files' contents."""
     left, right = writer.folder / one, writer.folder / other

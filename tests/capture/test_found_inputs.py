@@ -51,7 +51,7 @@ FOUND_YAML = {
     "tag for a time": (b"x: !!timestamp soon", "of the kind that it is written as"),
     "axes beyond a float's square": (
         PROFILE + b"imu: {T_cam_imu: [[1e+200,1e+200,0,0],[1e+200,-1e+200,0,0],[0,0,1,0]]}",
-        "no rotation",
+        "is too large",
     ),
     "endless picture": (LENS + b"resolution: [.inf, 480]}", "cam0.resolution"),
     "lens of no number": (b"cam0: {resolution: [64, 48], intrinsics: [1, 1, 1, .nan]}", "cam0.intrinsics"),

@@ -29,7 +29,7 @@ def test_dropped_rows_and_skipped_frames_are_explained(writer):
     writer.imu_ns.insert(40, writer.imu_ns[39])
     facts, text, code = inspect_capture(writer.write())
     assert code == 0
-    assert facts["dropped"] == {"gyro_accel.csv": {"time equals its predecessor's": 1}}
+    assert facts["dropped"] == {"gyro_accel.csv": {"row written twice": 1}}
     assert [run["codes"] for run in facts["skipped"]] == [["no-imu"]] * len(facts["skipped"])
     assert {run["first"] for run in facts["skipped"]} <= {0, 1, 2, 3}
     assert "before the first IMU row" in text

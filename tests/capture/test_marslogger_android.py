@@ -70,6 +70,7 @@ def test_gyro_counts_every_dropped_row_with_its_reason(tmp_path):
         GYRO_SPACED,
         f"{T},{row}",
         f"{T},{row}",
+        f"{T},0.1,0.2,0.3,1,2,4",
         f"{T + 5},{row}",
         GYRO_SPACED,
         f"{T + 3},{row}",
@@ -86,6 +87,7 @@ def test_gyro_counts_every_dropped_row_with_its_reason(tmp_path):
     assert table.time_ns.tolist() == [T, T + 5, T + 11]
     assert table.dropped == {
         "header repeated": 1,
+        "row written twice": 1,
         "time equals its predecessor's": 1,
         "time falls or leaps": 1,
         "gyroscope null or NaN": 2,
@@ -94,6 +96,29 @@ def test_gyro_counts_every_dropped_row_with_its_reason(tmp_path):
         "cut or unreadable row": 3,
     }
     assert table.rows == len(table.time_ns) + sum(table.dropped.values())
+
+
+def test_rows_written_twice_are_read_once(tmp_path):
+    """A log in which every row stands twice lost nothing, unlike one whose times alone repeat."""
+    rows = [f"{T + 5_000_000 * k},0.{k},0.2,0.3,null,null,null" for k in range(4)]
+    table = read_gyro_accel(put(tmp_path, "\n".join([GYRO_TIGHT, *(row for row in rows for _ in range(2))]) + "\n"))
+    assert table.time_ns.tolist() == [T + 5_000_000 * k for k in range(4)]
+    assert table.dropped == {"row written twice": 4}
+    coarse = [f"{T + 5_000_000 * (k // 2)},0.{k},0.2,0.3,1,2,3" for k in range(8)]
+    with pytest.raises(ClockError, match="only 4 of 8"):
+        read_gyro_accel(put(tmp_path, "\n".join([GYRO_TIGHT, *coarse]) + "\n"))
+
+
+def test_a_clock_that_begins_at_zero_keeps_its_first_times(tmp_path):
+    """Converted captures count from their first frame: 0 is then a stamp, and the gyroscope begins before it."""
+    stamps = read_frame_timestamps(put(tmp_path, "Frame timestamp[nanosec]\n0\n33333000\n66666000\n"))
+    assert stamps.time_ns.tolist() == [0, 33_333_000, 66_666_000]
+    rows = [f"{5_000_000 * k},0.{k + 3},0.2,0.3,1,2,3" for k in range(-3, 4)]
+    table = read_gyro_accel(put(tmp_path, "\n".join([GYRO_TIGHT, *rows]) + "\n"))
+    assert table.time_ns.tolist() == [5_000_000 * k for k in range(-3, 4)]
+    lost = read_frame_timestamps(put(tmp_path, f"Frame timestamp[nanosec]\n0\n{T}\n{T + 33_333_000}\n"))
+    assert lost.time_ns.tolist() == [T, T + 33_333_000]
+    assert lost.dropped == {"time is zero or negative": 1}
 
 
 def test_last_row_without_its_end_is_not_trusted(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from capture_writing import CaptureWriter
 
 from virest.capture.folder import read_capture
-from virest.capture.stills import ExifExposure, capture_bracket, read_bracket, read_exif_exposure
+from virest.capture.stills import ExifExposure, capture_bracket, read_bracket, read_exif_exposure, read_exposures
 from virest.errors import CaptureError
 
 
@@ -149,6 +149,8 @@ def test_folders_that_are_no_bracket_are_refused(tmp_path: Path) -> None:
     names = write_stills(folder)
     with pytest.raises(CaptureError, match=r"no exposure time.*--exposures"):
         read_bracket(folder)
+    with pytest.raises(CaptureError, match=r"^exposures\.csv: no such file; check the path given to --exposures$"):
+        read_exposures(Path("exposures.csv"), [])
     with pytest.raises(CaptureError, match="no such file"):
         read_bracket(folder, tmp_path / "none.csv")
     table = tmp_path / "t.csv"

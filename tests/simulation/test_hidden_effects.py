@@ -87,7 +87,8 @@ def test_an_effect_changes_its_own_place_in_the_profile_only(name):
 )
 def test_given_values_are_taken_as_they_are(text, place, value):
     """``NAME=VALUE`` sets exactly that value."""
-    assert flat(hide_effects(nominal_camera(360, 640), [text], context())[0])[place] == value
+    frames = 3 if text.startswith("gain_drift") else 20
+    assert flat(hide_effects(nominal_camera(360, 640), [text], context(frames=frames))[0])[place] == value
 
 
 def test_imu_rotation_stands_on_the_left():
@@ -103,6 +104,9 @@ def test_imu_rotation_stands_on_the_left():
         ("gyro_bias=0.1", "takes 3"),
         ("readout_direction=sideways", "top_to_bottom"),
         ("flicker=much", "no number"),
+        ("focal_length=inf", "no finite number"),
+        ("gain_drift=1,1.1,0.9", "3 factors for 20 frames"),
+        ("gain_drift=1e9", "too much"),
     ],
 )
 def test_a_wrong_effect_says_what_is_right(text, part):

@@ -187,6 +187,36 @@ def test_odd_sizes_are_refused(simulate):
         simulate("odd", width=97)
 
 
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"width": -4}, "no picture size"),
+        ({"height": 0}, "no picture size"),
+        ({"rate_rad_s": np.inf}, "rad/s"),
+        ({"noise_levels": np.nan}, "negative rate or noise"),
+        ({"exposure_ms": np.nan}, "not positive"),
+        ({"exposure_ms": 1e300}, "exposure of"),
+        ({"readout_ms": np.nan}, "readout_time_s"),
+        ({"readout_ms": -1.0}, "readout_time_s"),
+        ({"focal_px": 0.0}, "fx_px"),
+        ({"focal_px": 1e-300}, "focal length"),
+        ({"depth_m": 0.0}, "depth_m"),
+        ({"depth_m": -np.inf}, "depth_m"),
+        ({"depth_m": 1e8}, "away"),
+        ({"effects": ["focal_length=0"]}, "fx_px"),
+        ({"effects": ["time_offset=1e5"]}, "time offset"),
+        ({"effects": ["readout_time=-1"]}, "readout_time_s"),
+        ({"effects": ["exposure_time=0"]}, "exposure_scale"),
+        ({"effects": ["frame_lag=-1"]}, "lag_s"),
+        ({"effects": ["defocus=-1"]}, "sigma_px"),
+    ],
+)
+def test_sizes_that_no_camera_has_are_refused_in_one_line(simulate, asked, said):
+    """Neither a fault deep in the renderer, nor a picture of nothing, nor arrays without end."""
+    with pytest.raises(SettingsError, match=said):
+        simulate("impossible", **asked)
+
+
 @pytest.mark.parametrize("scene", ["bright", "board", "text", "photographs"])
 def test_every_scene_can_be_filmed(scene, simulate):
     """Each kind gives pictures with contrast; the bright one clips a few percent."""

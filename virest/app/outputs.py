@@ -48,8 +48,8 @@ Mode = Literal["new", "resume", "overwrite"]
 Found = Literal["nothing", "unfinished", "finished"]
 
 _HINTS = {
-    errno.ENOSPC: "free some space there, then go on with --resume",
-    errno.EDQUOT: "your quota is used up; free some space, then go on with --resume",
+    errno.ENOSPC: "free some space there, then go on (a run with --resume)",
+    errno.EDQUOT: "your quota is used up; free some space, then go on (a run with --resume)",
     errno.EROFS: "choose a folder that can be written with --out",
     errno.EACCES: "choose a folder that you may write with --out",
     errno.EPERM: "choose a folder that you may write with --out",

@@ -95,8 +95,8 @@ def process_captures(paths: list[str], options: ProcessOptions) -> int:
     """
     names = _require_distinct_names(paths)
     _require_out(options.out)
-    if options.config is not None and not options.config.is_file():
-        raise SettingsError(f"{options.config}: no such file", hint="--config takes a camera profile")
+    if options.config is not None:
+        _require_config(options.config)
     outcomes: list[CaptureOutcome] = []
     codes: list[int] = []
     workers = Workers(options.jobs, options.scheduler, verbose=options.verbose)
@@ -135,6 +135,16 @@ def _require_distinct_names(paths: list[str]) -> list[str]:
                 hint="process them with different --out, or rename one",
             )
     return names
+
+
+def _require_config(config: Path) -> None:
+    try:
+        found = config.is_file()
+    except OSError as error:
+        raise SettingsError(f"{config}: {error.strerror}", hint="--config takes a camera profile") from None
+    if not found:
+        what = "is no plain file" if config.exists() else "no such file"
+        raise SettingsError(f"{config}: {what}", hint="--config takes a camera profile")
 
 
 def _require_out(out: Path) -> None:

@@ -233,7 +233,11 @@ def write_report(run_dir: Path, options: ReportOptions) -> ReportOutcome:
 
 
 def _require_dir(run_dir: Path) -> None:
-    if not run_dir.is_dir():
+    try:
+        found = run_dir.is_dir()
+    except OSError as error:
+        raise CaptureError(f"{run_dir}: {error.strerror}", hint="pass OUT/<capture> of a run, or OUT itself") from None
+    if not found:
         what = "is no folder" if run_dir.exists() else "no such folder"
         raise CaptureError(f"{run_dir}: {what}", hint="pass OUT/<capture> of a run, or OUT itself")
 

@@ -26,6 +26,8 @@ from virest.errors import SettingsError
 MAX_PROFILE_BYTES = 1_000_000
 MAX_SIDE_PX = 20_000
 MAX_DEPTH = 20
+LARGEST = 1e9
+"""No value of a profile is larger; far beyond, products of a few overflow."""
 MAX_DIGITS = 250
 """No number of so many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
 NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
@@ -126,7 +128,7 @@ def _number(value: Any) -> Any:
             value = float(value)
         except ValueError:
             raise ValueError("is no number") from None
-    if isinstance(value, int) and abs(value) > 10**15:
+    if isinstance(value, int | float) and LARGEST < abs(value) < math.inf:
         raise ValueError("is too large")
     return value
 
@@ -140,6 +142,14 @@ Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _unknown_is_as_absent(cls, values: Any) -> Any:
+        """``null`` under a known key, a block's or a value's, means unknown, as if the key were not there."""
+        if not isinstance(values, dict):
+            return values
+        return {key: value for key, value in values.items() if value is not None or key not in cls.model_fields}
 
 
 class _Image(_Strict):
@@ -227,7 +237,7 @@ class _Scene(_Strict):
 
 
 class _FocalDrift(_Strict):
-    focal_drift_per_s: Number = 0.0
+    focal_drift_per_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0
 
 
 class _Stabilisation(_Strict):
@@ -267,7 +277,7 @@ class _Extensions(_Strict):
 
 
 class _Estimate(_Strict):
-    value: Any
+    value: Any = None
     std: Any = None
     source: str = ""
 
@@ -295,12 +305,14 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
     """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
     try:
         if not path.is_file():
-            raise SettingsError(f"{path}: no such file", hint="pass a YAML file")
+            what = "is no plain file" if path.exists() else "no such file"
+            raise SettingsError(f"{path}: {what}", hint="pass a YAML file")
         size = path.stat().st_size
         if size > MAX_PROFILE_BYTES:
             raise SettingsError(f"{path.name}: {size} bytes, more than {MAX_PROFILE_BYTES}", hint="is it a profile?")
         text = path.read_text(encoding="utf-8")
         _require_plain(text, path.name)
+        _require_keys_once(yaml.compose(text, Loader=yaml.SafeLoader), path.name)
         content = yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -335,6 +347,24 @@ def _require_plain(text: str, name: str) -> None:
             raise SettingsError(f"{name}: nested more than {MAX_DEPTH} deep", hint="is it a profile?")
 
 
+def _require_keys_once(node: yaml.Node | None, name: str) -> None:
+    """Refuse a key that stands twice in one block: the last would hold, and nobody would know."""
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _require_keys_once(item, name)
+    if not isinstance(node, yaml.MappingNode):
+        return
+    seen: set[str] = set()
+    for key, value in node.value:
+        if isinstance(key, yaml.ScalarNode):
+            if key.value in seen:
+                shown = _printable(key.value[:60])
+                line = key.start_mark.line + 1
+                raise SettingsError(f"{name}: line {line}: '{shown}' is written a second time", hint="keep one of them")
+            seen.add(key.value)
+        _require_keys_once(value, name)
+
+
 def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfile:
     """Build a profile from the YAML's mapping; ``name`` is used in messages."""
     try:
@@ -347,6 +377,11 @@ def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfi
         raise SettingsError(f"{name}: {error.message}", hint=error.hint) from None
 
 
+def require_usable(profile: CameraProfile, name: str = "profile") -> None:
+    """Hold a profile that was built in memory to what a file must keep. Raises SettingsError with the key."""
+    parse_profile(profile_mapping(profile), name)
+
+
 def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
     """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
     first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
@@ -357,7 +392,8 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
         near = _nearest(path[-1], known)
         hint = f"did you mean '{near}'?" if near else f"known keys: {', '.join(known)}"
         return SettingsError(f"{name}: unknown key '{where[:80]}', {hint}")
-    value = "" if isinstance(first.get("input"), dict) else f", got {str(first.get('input'))[:60]!r}"
+    found = first.get("input")
+    value = "" if isinstance(found, dict) else ", got null" if found is None else f", got {str(found)[:60]!r}"
     message = _printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
     return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see the profile in README")
 
@@ -576,7 +612,7 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
             "height_mm": profile.sensor_height_mm,
             "focal_length_mm": profile.focal_length_mm,
         },
-        "scene": {"depth_m": "inf" if depth is not None and math.isinf(depth) else depth},
+        "scene": {"depth_m": "inf" if depth == math.inf else depth},
         "estimates": {n: {"value": e.value, "std": e.std, "source": e.source} for n, e in profile.estimates.items()},
         "extensions": extensions,
     }

@@ -29,7 +29,8 @@ class TextScan:
 
 def label(path: Path) -> str:
     """Name a file in messages: its folder and its name."""
-    return f"{path.parent.name}/{path.name}"
+    folder = path.parent.name
+    return f"{folder}/{path.name}" if folder else path.name
 
 
 def require_regular_file(path: Path, error: type[CaptureError] = CaptureError, hint: str = "") -> int:

@@ -56,6 +56,8 @@ BEARABLE_FOCAL = (0.4, 1.6)
 """Outside, fx counts other pixels than the movie's: those of the sensor's whole array."""
 GUESSED_FOCAL = 0.8
 LARGE_RATE_RAD_S = 35.0
+PLAUSIBLE_ACCEL_M_S2 = (5.0, 20.0)
+"""Median length of the specific force: phones' accelerometers are off by a few percent, and hands shake evenly."""
 """2000 °/s, where phone gyroscopes end."""
 
 
@@ -361,12 +363,25 @@ def _note_imu(imu: ImuSamples, gaps: tuple[tuple[float, float], ...], notes: lis
         notes.append(Note("warning", "imu-gap", text))
     if len(gaps) > 20:
         notes.append(Note("warning", "imu-gap", f"{len(gaps) - 20} more gaps in the IMU rows"))
-    if not imu.has_accelerometer:
+    if imu.has_accelerometer:
+        _note_accelerometer(imu, notes)
+    else:
         notes.append(Note("info", "no-accelerometer", "no accelerometer values: camera velocity cannot be estimated"))
     peak = float(np.abs(imu.gyro_rad_s).max())
     if peak > LARGE_RATE_RAD_S:
         text = f"turning rates up to {peak:.0f} rad/s, beyond what phones measure: are they in degrees?"
         notes.append(Note("warning", "gyro-large", text))
+
+
+def _note_accelerometer(imu: ImuSamples, notes: list[Note]) -> None:
+    """Gravity is most of what a phone's accelerometer reads: without it the values are of another kind or unit."""
+    typical = float(np.nanmedian(np.linalg.norm(imu.accel_m_s2, axis=1)))
+    if not PLAUSIBLE_ACCEL_M_S2[0] <= typical <= PLAUSIBLE_ACCEL_M_S2[1]:
+        text = (
+            f"the accelerometer reads {typical:.2g} m/s^2 in the median, gravity alone is 9.8: is it in g, without "
+            "gravity, or are its columns swapped with the gyroscope's?"
+        )
+        notes.append(Note("warning", "accel-implausible", text))
 
 
 def _note_frames(frames: tuple[Frame, ...], notes: list[Note]) -> None:

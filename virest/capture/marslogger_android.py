@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from virest.capture.files import TextScan, label, read_small_text, scan_text
 from virest.capture.tables import (
@@ -40,6 +41,9 @@ from virest.errors import CaptureError, ClockError, ImuError
 
 MICROSECOND_GAP_LIMIT = 1_000_000
 """Stamps without a header: a median step below this is in microseconds (no camera runs at 1000 frames/s here)."""
+
+CLOCK_STEP_NS = 1_000_000_000
+"""A clock that counts through zero has its next positive time within this."""
 
 GYRO, METADATA, STAMPS, POSITION, IOS_METADATA, IOS_ARKIT, NO_SENSOR, BARE_STAMPS, UNKNOWN = (
     "gyro_accel.csv",
@@ -114,7 +118,7 @@ def _require_kind(scan: TextScan, path: Path, expected: str, error: type[Capture
 def _split_rows(
     chunk: pd.DataFrame, first_column: str, min_fields: int, path: Path, dropped: Counter[str]
 ) -> tuple[pd.DataFrame, Int64]:
-    """Rows that begin with a whole, positive time, and those times; refuses times that lost their precision."""
+    """Rows that begin with a whole time, and those times; refuses times that lost their precision."""
     text = chunk[0].str.strip()
     lowered = text.str.lower().str.replace(r"\s+", "", regex=True).str.replace("[ns]", "[nanosec]", regex=False)
     is_header = (lowered == first_column).to_numpy()
@@ -130,8 +134,7 @@ def _split_rows(
     times[whole] = text[whole].astype("int64").to_numpy()
     dropped["cut or unreadable row"] += int((~is_header & ~is_comment & ~(whole & enough)).sum())
     dropped["header repeated"] += int(is_header.sum())
-    dropped["time is zero or negative"] += int((whole & enough & (times <= 0)).sum())
-    good = whole & enough & (times > 0)
+    good = whole & enough
     return chunk[good], times[good]
 
 
@@ -139,6 +142,21 @@ def _count_rows(times: Int64, dropped: Counter[str]) -> int:
     """Data rows of the file: those read and those dropped; its own header is neither."""
     dropped["header repeated"] = max(dropped["header repeated"] - 1, 0)
     return len(times) + sum(dropped.values())
+
+
+def _keep_times(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.bool_]:
+    """Mask of times that rise strictly.
+
+    A time of zero or below is none, a sensor's first word, unless the clock itself counts through zero: its next
+    positive time is then near.  Raises ClockError where most rows would go.
+    """
+    low = times <= 0
+    if low.any() and not low.all() and times[~low].min() - times[low].max() <= CLOCK_STEP_NS:
+        low = np.zeros(len(times), bool)
+    dropped["time is zero or negative"] += int(low.sum())
+    keep = ~low
+    keep[keep] = keep_rising(times[keep], path, dropped)
+    return keep
 
 
 # ── the files ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -167,12 +185,23 @@ def read_gyro_accel(path: Path) -> GyroTable:
     dropped["cut or unreadable row"] += max(scan.lines - seen, 0)  # rows with too many fields never arrive
     time_ns, samples = np.concatenate(times), np.concatenate(values)
     rows = _count_rows(time_ns, dropped)
-    keep = keep_rising(time_ns, path, dropped)
-    if last_is_good and not scan.ends_with_newline and keep[-1]:
+    twice = _written_twice(time_ns, samples)
+    dropped["row written twice"] += int(twice.sum())
+    time_ns, samples = time_ns[~twice], samples[~twice]
+    keep = _keep_times(time_ns, path, dropped)
+    if last_is_good and not scan.ends_with_newline and len(keep) and keep[-1]:
         keep[-1] = False  # its last number may be cut and still read as one
         dropped["last line without its end"] += 1
     time_ns, samples = time_ns[keep], samples[keep]
     return make_gyro_table(path, time_ns, samples, rows, dict(+dropped))
+
+
+def _written_twice(time_ns: Int64, samples: Float64) -> NDArray[np.bool_]:
+    """Rows that say again what their predecessor says, time and all; equal times alone are lost precision."""
+    again = np.zeros(len(time_ns), bool)
+    same = (samples[1:] == samples[:-1]) | (np.isnan(samples[1:]) & np.isnan(samples[:-1]))
+    again[1:] = (np.diff(time_ns) == 0) & same.all(axis=1)
+    return again
 
 
 def _check_gyro_header(columns: tuple[str, ...], path: Path) -> None:
@@ -220,7 +249,7 @@ def read_movie_metadata(path: Path) -> MetadataTable:
             values[name].append(np.full(len(table), np.nan) if place is None else numbers(table[place]))
     time_ns = np.concatenate(times)
     rows = _count_rows(time_ns, dropped)
-    keep = keep_rising(time_ns, path, dropped)
+    keep = _keep_times(time_ns, path, dropped)
     found = {name: np.concatenate(parts)[keep] for name, parts in values.items()}
     for name in ("exposure_s", "readout_time_s"):
         found[name] = found[name] * 1e-9
@@ -252,7 +281,7 @@ def read_frame_timestamps(path: Path) -> StampTable:
         unix.append(whole_numbers(table[1]) if has_unix else np.zeros(len(table), np.int64))
     time_ns = np.concatenate(times)
     rows = _count_rows(time_ns, dropped)
-    keep = keep_rising(time_ns, path, dropped)
+    keep = _keep_times(time_ns, path, dropped)
     time_ns = time_ns[keep]
     if bare and len(time_ns) > 1 and np.median(np.diff(time_ns)) < MICROSECOND_GAP_LIMIT:
         time_ns = time_ns * 1000

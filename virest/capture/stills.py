@@ -105,6 +105,7 @@ def read_exposures(path: Path, names: list[str]) -> dict[str, float]:
     Raises CaptureError with the line for a missing or unknown column, a file that is not there or comes twice, and an
     exposure that is no positive finite number.
     """
+    require_regular_file(path, hint="check the path given to --exposures")
     text = read_small_text(path)
     if "\0" in text:
         raise CaptureError(f"{label(path)}: has NUL bytes, it is no plain text", hint="write file,exposure_s")

@@ -43,6 +43,13 @@ MAX_BLOCK_BYTES = 1 << 28
 """The largest piece of memory that FFmpeg may ask for: tables of contents promise millions of frames in a few bytes."""
 CONTAINER = "mov"
 """MP4, QuickTime and 3GP. Named, so that no playlist in a movie's clothes makes the reader open other files."""
+OTHER_MOVIES: dict[str, Callable[[bytes], bool]] = {
+    "a Matroska or WebM movie": lambda head: head.startswith(b"\x1a\x45\xdf\xa3"),
+    "an AVI movie": lambda head: head[:4] == b"RIFF" and head[8:12] == b"AVI ",
+}
+"""Containers that are not read, by their first bytes."""
+OWN_SUFFIXES = (".mp4", ".m4v", ".mov", ".3gp")
+MOVIE_SUFFIXES = (*OWN_SUFFIXES, ".mkv", ".webm", ".avi")
 KR_KB = {
     1: (0.2126, 0.0722),  # BT.709
     4: (0.30, 0.11),  # FCC
@@ -111,7 +118,7 @@ def probe_movie(path: Path) -> MovieIndex:
     """
     if is_picture_source(path):
         return index_pictures(path, read_picture_list(path))
-    size = require_regular_file(path, VideoError, "a capture needs its movie.mp4")
+    size = require_regular_file(path, VideoError, _missing_movie_hint(path))
     if size == 0:
         raise VideoError(f"{label(path)}: is empty", hint="the recording was not stopped cleanly, or the copy failed")
     try:
@@ -122,9 +129,37 @@ def probe_movie(path: Path) -> MovieIndex:
             return _index(container, stream, width, height, path)
     except (av.FFmpegError, UnicodeError, ValueError) as fault:
         raise VideoError(
-            f"{label(path)}: cannot be opened as a movie ({_reason(fault)}, {size} bytes)",
-            hint="it has no index (moov) if the recorder was not stopped cleanly; stop it, then copy again",
+            f"{label(path)}: cannot be opened as a movie ({_reason(fault)}, {size} bytes)", hint=_unopened_hint(path)
         ) from None
+
+
+def _unopened_hint(path: Path) -> str:
+    """What to do about a file that is no readable MP4, by its first bytes."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(16)
+    except OSError:
+        head = b""
+    kind = next((name for name, is_it in OTHER_MOVIES.items() if is_it(head)), None)
+    if kind is not None:
+        return f"it is {kind}; put the same stream into an MP4: ffmpeg -i FILE -c copy movie.mp4"
+    return "it has no index (moov) if the recorder was not stopped cleanly; stop it, then copy again"
+
+
+def _missing_movie_hint(path: Path) -> str:
+    """Name a movie of another name that lies where movie.mp4 should."""
+    needs = "a capture needs its movie.mp4"
+    try:
+        if isinstance(path, RemotePath) or path.exists():
+            return needs
+        others = sorted(file.name for file in path.parent.iterdir() if file.suffix.lower() in MOVIE_SUFFIXES)
+    except (OSError, ValueError):
+        return needs
+    if not others:
+        return needs
+    shown = "".join(c if c.isprintable() else "?" for c in others[0][:60])
+    what = "rename it" if Path(others[0]).suffix.lower() in OWN_SUFFIXES else "ffmpeg -i FILE -c copy movie.mp4"
+    return f"{needs}; is it '{shown}'? {what}"
 
 
 def index_pictures(path: Path, found: PictureList) -> MovieIndex:
@@ -267,7 +302,7 @@ def _read(
         base, size = path if path.is_dir() else path.parent, (index.width, index.height)
         yield from read_pictures(base, index.pictures, size, frames, gray=convert is to_gray)
         return
-    require_regular_file(path, VideoError, "a capture needs its movie.mp4")
+    require_regular_file(path, VideoError, _missing_movie_hint(path))
     for run in _runs(index, frames):
         try:
             with _opened(path) as container:

@@ -49,6 +49,8 @@ class Effect:
     """Whether one given number stands for the size of many values that are then drawn (gain_drift)."""
     optional: int = 0
     """How many of the last parameters may be left out of VALUE; they are drawn."""
+    endless: bool = False
+    """Whether infinity is a value (scene_depth: rotation only)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +109,14 @@ def _parse_values(name: str, effect: Effect, text: str, drawn: list[Any], contex
         numbers = [float(part) for part in parts]
     except ValueError:
         raise SettingsError(f"effect {name}: '{text}' is no number", hint="write NAME=0.1 or NAME=0.1,0.2") from None
-    if any(math.isnan(n) for n in numbers):
-        raise SettingsError(f"effect {name}: '{text}' is no number", hint="write NAME=0.1 or NAME=0.1,0.2")
+    if not all(math.isfinite(n) or (n == math.inf and effect.endless) for n in numbers):
+        raise SettingsError(f"effect {name}: '{text}' is no finite number", hint="write NAME=0.1 or NAME=0.1,0.2")
     if effect.spread:
+        if len(numbers) not in (1, context.frames):
+            raise SettingsError(
+                f"effect {name} got {len(numbers)} factors for {context.frames} frames",
+                hint="write one size, or one factor per frame",
+            )
         return _gain_walk(context, numbers[0]) if len(numbers) == 1 else numbers
     wanted = len(drawn)
     if not wanted - effect.optional <= len(numbers) <= wanted:
@@ -182,6 +189,8 @@ def _draw_frame_lag(_: CameraProfile, context: EffectContext) -> list[float]:
 
 def _gain_walk(context: EffectContext, rms: float) -> list[float]:
     """Draw a smooth brightness drift of the given RMS in log light, median 1."""
+    if abs(rms) > 5:
+        raise SettingsError(f"effect gain_drift: {rms:g} in log light is too much", hint="use about 0.1")
     k = np.arange(context.frames)
     drift = sum(
         np.cos(2 * np.pi * k / period + context.rng.uniform(0, 2 * np.pi)) for period in (7.0, 17.0, 41.0)
@@ -258,7 +267,9 @@ EFFECTS: dict[str, Effect] = {
         lambda p, v: _extend(p, stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
         optional=1,
     ),
-    "scene_depth": Effect(("depth_m",), lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0])),
+    "scene_depth": Effect(
+        ("depth_m",), lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0]), endless=True
+    ),
     "frame_lag": Effect(
         ("lag_s", "frames"),
         _draw_frame_lag,

@@ -7,6 +7,7 @@ means the middle or the end lies half or one true exposure after the start.  Row
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile
+from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, require_usable
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
 from virest.errors import SettingsError
@@ -35,6 +36,12 @@ TICKS_PER_S = 90_000
 STAMP_PLACE = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
 DEFAULT_SWAY_M = 0.012
 """RMS sway of the hand where the scene has a depth and no sway is asked for."""
+LONGEST_EXPOSURE_S = 10.0
+LONGEST_OFFSET_S = 600.0
+FASTEST_HAND_RAD_S = 100.0
+NEAREST_M, FARTHEST_M = 0.001, 1e6
+FOCAL_OF_LONG_SIDE = (0.05, 100.0)
+"""What the renderer takes; beyond, arrays outgrow the memory or numbers lose their digits."""
 _IMU_LEAD_S = 0.6
 _SCENE_MARGIN = 1.12
 
@@ -241,19 +248,44 @@ def sample_imu(session: Session) -> ImuLog:
 
 
 def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
+    """Refuse what no camera does and what would never end: a value of the camera, of the times, of the motion."""
+
     def refuse(what: str, hint: str) -> None:
         raise SettingsError(f"simulation: {what}", hint=hint)
 
+    if profile.width <= 0 or profile.height <= 0:
+        refuse(f"{profile.width}x{profile.height} is no picture size", "ask for at least 16x16")
     if profile.width % 2 or profile.height % 2:
         refuse(f"{profile.width}x{profile.height} is odd", "H.264 needs even width and height")
     if settings.frames < 1:
         refuse(f"{settings.frames} frames", "ask for at least 1")
     if not 1 <= settings.fps <= 1000:
         refuse(f"{settings.fps:g} frames per second", "use 1 to 1000")
-    if not settings.exposure_s or min(settings.exposure_s) <= 0:
+    if not settings.exposure_s or not min(settings.exposure_s) > 0:
         refuse("the exposure is not positive", "use about 1 to 20 ms")
-    if settings.imu_rate_hz < 1 or settings.noise_levels < 0 or settings.rate_rad_s < 0:
+    if not max(settings.exposure_s) <= LONGEST_EXPOSURE_S:
+        refuse(f"an exposure of {max(settings.exposure_s):g} s", f"at most {LONGEST_EXPOSURE_S:g} s are rendered")
+    if not (settings.imu_rate_hz >= 1 and settings.noise_levels >= 0 and settings.rate_rad_s >= 0):
         refuse("a negative rate or noise", "use 0 or more")
+    if settings.noise_levels > 255:
+        refuse(f"noise of {settings.noise_levels:g} grey levels", "use 0 to 255, about 1.5 for a phone")
+    if settings.rate_rad_s > FASTEST_HAND_RAD_S:
+        refuse(f"{settings.rate_rad_s:g} rad/s", f"use 0 to {FASTEST_HAND_RAD_S:g}; a hand reaches about 5")
+    require_usable(profile, "simulation")
+    _require_renderable(profile, refuse)
+
+
+def _require_renderable(profile: CameraProfile, refuse: Callable[[str, str], None]) -> None:
+    """Sizes that a profile may have and the renderer cannot."""
+    lens, offset, depth = profile.intrinsics, profile.time_offset_s or 0.0, profile.depth_m
+    if lens is not None:
+        low, high = (times * max(profile.width, profile.height) for times in FOCAL_OF_LONG_SIDE)
+        if not low <= min(lens.fx_px, lens.fy_px) <= max(lens.fx_px, lens.fy_px) <= high:
+            refuse(f"a focal length of {lens.fx_px:g} px", f"use {low:g} to {high:g}; a phone has 0.8 of the long side")
+    if abs(offset) > LONGEST_OFFSET_S:
+        refuse(f"a time offset of {offset:g} s", f"at most {LONGEST_OFFSET_S:g} s, or the inertial log has no end")
+    if depth is not None and depth != np.inf and not NEAREST_M <= depth <= FARTHEST_M:
+        refuse(f"a scene {depth:g} m away", f"use {NEAREST_M:g} to {FARTHEST_M:g} m, or inf")
 
 
 def _stamp_tick(index: int, fps: float) -> int:

@@ -26,6 +26,12 @@ USAGE = 2
 INTERRUPTED = 130
 TERMINATED = 143
 CLOSED_PIPE = 141
+_SYSTEM_HINTS = {
+    errno.ENOSPC: "free some space there",
+    errno.EDQUOT: "your quota is used up; free some space there",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "a link of this path leads back to itself; choose another",
+}
 
 app = typer.Typer(
     add_completion=False,
@@ -79,14 +85,14 @@ def run(arguments: list[str] | None = None) -> int:
         console.silence_stdout()
         return CLOSED_PIPE
     except Exception as error:
-        return console.report_error(_disk_full(error) or error)
+        return console.report_error(_beyond_us(error) or error)
 
 
-def _disk_full(error: Exception) -> OutputError | None:
-    """The error of an output that takes nothing more, wherever it was met."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return OutputError(f"{error.filename or 'output'}: {error.strerror}", hint="free some space there")
-    return None
+def _beyond_us(error: Exception) -> OutputError | None:
+    """What the system says of a path that nobody looked at before: the disk is full, or the path cannot be."""
+    if not isinstance(error, OSError) or error.errno not in _SYSTEM_HINTS:
+        return None
+    return OutputError(f"{error.filename or 'output'}: {error.strerror}", hint=_SYSTEM_HINTS[error.errno])
 
 
 def _report_usage(error: Any) -> None:
