@@ -157,6 +157,19 @@ def test_asking_for_nothing_copies() -> None:
     np.testing.assert_array_equal(_picture(result), picture)
 
 
+def test_a_lens_that_shows_nothing_is_copied() -> None:
+    """Where straightening would leave no recorded pixel, the recorded picture comes back, and the log says why."""
+    turning = camera((0.5, 1.0, 0.2), readout_time_s=0.02)
+    intrinsics = replace(turning.profile.intrinsics, cx_px=-1e5)
+    turning = replace(turning, profile=replace(turning.profile, intrinsics=intrinsics))
+    picture = np.random.default_rng(1).integers(0, 255, (240, 336, 3), dtype=np.uint8)
+    result = _restore(turning, picture)
+    assert (result.status, result.valid_px) == ("copied", (0, 0, 336, 240))
+    np.testing.assert_array_equal(result.picture, picture)
+    assert "leave nothing" in result.warnings[0]
+    assert result.parameters["shutter"]["method"] == result.parameters["deblur"]["method"] == "none"
+
+
 def test_a_copied_frame_says_why() -> None:
     """A frame without motion has all of the log's keys, null where unknown."""
     picture = np.full((48, 64, 3), 7, np.uint8)

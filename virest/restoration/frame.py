@@ -48,6 +48,7 @@ PART_STEP_PX = 80
 """Spacing of the places at which it is looked whether the blur is worth the trouble."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
+NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -100,7 +101,10 @@ def restore_frame(
     source = _source_map(motion, settings, anchor, parameters["deblur"]["method"]) if straighten else None
     valid_px = (0, 0, width, height)
     if source is not None:
-        restored, valid_px = warp(restored, source), valid_rectangle(source)
+        valid_px = valid_rectangle(source)
+        if not any(valid_px):
+            return copied_frame(frame, picture, motion.profile, NOTHING_LEFT, parameters)
+        restored = warp(restored, source)
     elif restored.dtype != np.uint8:
         restored = rounded(restored)
     clock.lap("shutter")
