@@ -126,6 +126,16 @@ def test_widths_add_in_squares_up_to_the_shape_of_a_path() -> None:
     assert fitted_width(np.array([3.0]), 0.0, 0.5)[0] == pytest.approx(fit_steps(ramp[None], 12.0)[1][0], rel=0.03)
 
 
+def test_an_exposure_at_the_end_of_the_range_is_no_estimate(nominal: Observed) -> None:
+    """Pictures that show nothing of the blur that is predicted would want no exposure at all: it stays open."""
+    observations, profile, trajectory = nominal
+    none_seen = replace(observations.ratios, log_ratio=0.0 * observations.ratios.log_ratio)
+    found = fit(replace(observations, ratios=none_seen), profile, trajectory, BOTH)
+    assert found.determined == (False, True)
+    assert np.isinf(found.std[0])
+    assert found.profile.shutter.exposure_scale == profile.shutter.exposure_scale
+
+
 def test_a_nominal_capture_stays_nominal(nominal: Observed) -> None:
     """Neither effect is significant, though both are determined."""
     found = fit(*nominal, BOTH)

@@ -28,6 +28,7 @@ from virest.motion.trajectory import Trajectory
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_EXPOSURE_SCALES = (0.05, 20.0)
 SHIFT_STD_S = 0.004
 """How far the rows' times may be off after the geometry was fitted; a shift is a nuisance of every fit."""
 PATH_STD = 0.03
@@ -56,6 +57,9 @@ class BlurEffect(Protocol):
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Whether the capture can tell the effect at all."""
 
+    def possible(self, values: Array) -> bool:
+        """Whether fitted values are an estimate, and not the end of what they may be."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExposureTime:
@@ -70,7 +74,8 @@ class ExposureTime:
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set shutter.exposure_scale."""
-        return replace(profile, shutter=replace(profile.shutter, exposure_scale=float(np.clip(values[0], 0.05, 20))))
+        scale = float(np.clip(values[0], *_EXPOSURE_SCALES))
+        return replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Enough tiles, in frames that moved unequally."""
@@ -79,6 +84,11 @@ class ExposureTime:
             return False
         own = predicted_ratios(observations.ratios, profile, trajectory)[..., 0][valid]
         return float(np.sqrt(np.mean(own**2))) > MIN_CONTRAST
+
+    def possible(self, values: Array) -> bool:
+        """Paths that would have no length, or any, explain nothing: something else is wrong."""
+        low, high = _EXPOSURE_SCALES
+        return low < float(values[0]) < high
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +111,10 @@ class Defocus:
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Enough isolated steps."""
         return observations.edges_determined
+
+    def possible(self, values: Array) -> bool:
+        """No defocus at all is an estimate too."""
+        return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,11 +149,26 @@ def fit(
 ) -> BlurFit:
     """Robust Gauss-Newton by finite differences for the effects' values and the nuisances, which have priors.
 
-    use: mask over the residuals.  Effects that the capture does not determine keep their values, with infinite
-    deviations.  The covariance is a sandwich over time blocks: what lies in one block shares its errors.
+    use: mask over the residuals.  Effects that the capture does not determine, or whose values run to the end of what
+    they may be, keep their values, with infinite deviations.  The covariance is a sandwich over time blocks: what lies
+    in one block shares its errors.
     """
     use = np.ones(len(observations), bool) if use is None else use
     known = tuple(e.determined(observations, profile, trajectory) for e in effects)
+    found = _fit(observations, profile, trajectory, effects, use, known)
+    inside = tuple(yes and e.possible(v) for e, yes, v in zip(effects, known, found.values, strict=True))
+    return found if inside == known else _fit(observations, profile, trajectory, effects, use, inside)
+
+
+def _fit(
+    observations: BlurObservations,
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    effects: Sequence[BlurEffect],
+    use: Mask,
+    known: tuple[bool, ...],
+) -> BlurFit:
+    """As :func:`fit`, for those effects that are known to be determined."""
     free = [e for e, yes in zip(effects, known, strict=True) if yes]
     problem = _Problem(observations, profile, trajectory, free, use)
     theta = np.concatenate([*(e.starts(observations, profile)[0] for e in free), _NUISANCE])
