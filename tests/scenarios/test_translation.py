@@ -117,7 +117,10 @@ def require_close(found: RestorationPlan, story: Story, velocity: float = 0.1, d
 
 @pytest.mark.parametrize("name", SWAYS)
 def test_velocity_and_depth_are_found_and_restore_as_well_as_the_true_ones(story: Callable[[str], Story], name: str):
-    """Velocity within 10 %, depth within 5 %; 6 dB above rotation alone, and within 1 dB of the true translation."""
+    """Velocity within 10 %, depth within 5 %; 6 dB above rotation alone, and within half a dB of the true translation.
+
+    In the mean: a frame that promises just enough to be deblurred with the one may promise too little with the other.
+    """
     told = story(name)
     plan = told.plan()
     require_close(plan, told)
@@ -126,7 +129,7 @@ def test_velocity_and_depth_are_found_and_restore_as_well_as_the_true_ones(story
     turned, found, true = (told.psnr_db(replace(plan, translations=t)) for t in (None, plan.translations, told.truth))
     assert (found - turned).mean() > 6, found - turned
     assert (found - turned).min() > -0.1
-    assert (true - found).max() < 1
+    assert (true - found).mean() < 0.5
 
 
 def test_an_unknown_offset_is_found_along(story: Callable[[str], Story]):
