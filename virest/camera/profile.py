@@ -26,8 +26,8 @@ from virest.errors import SettingsError
 MAX_PROFILE_BYTES = 1_000_000
 MAX_SIDE_PX = 20_000
 MAX_DEPTH = 20
-LARGEST = 1e9
-"""No value of a profile is larger; far beyond, products of a few overflow."""
+LARGEST = 1e12
+"""No value of a profile is larger: between clocks of different epochs lie 2e9 s.  Far beyond, products overflow."""
 MAX_DIGITS = 250
 """No number of so many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
 NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
