@@ -148,6 +148,13 @@ def luma_of(light: list[Image]) -> Image:
     return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, 1 - LUMA_RED - LUMA_BLUE, 0.0))
 
 
+def as_kept(light: Image, blurred: BlurredPicture) -> Image:
+    """Light as the restored picture has it, with its vignetting."""
+    if blurred.kept is None:
+        return light
+    return cv2.multiply(light, cv2.resize(blurred.kept, light.shape[::-1], interpolation=cv2.INTER_AREA))
+
+
 def reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
     """The luma of a picture so many times smaller, and all that restoring it needs, to its measure; no colour."""
     height, width = blurred.light[0].shape

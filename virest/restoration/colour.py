@@ -10,7 +10,7 @@ import numpy as np
 
 from virest.degradation.blur import Image
 from virest.restoration.bands import LevelsOfRows
-from virest.restoration.blurred import BlurredPicture, luma_of
+from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
 from virest.restoration.encoding import grey_levels
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED
@@ -115,13 +115,6 @@ def _grey_differences(blurred: BlurredPicture, luma: Image, red: Image, blue: Im
         for light in (luma, *(cv2.add(luma, difference) for difference in (red, green, blue)))
     )
     return [grey, *(cv2.subtract(channel, grey) for channel in channels)]
-
-
-def as_kept(light: Image, blurred: BlurredPicture) -> Image:
-    """Light as the restored picture has it, with its vignetting."""
-    if blurred.kept is None:
-        return light
-    return cv2.multiply(light, cv2.resize(blurred.kept, light.shape[::-1], interpolation=cv2.INTER_AREA))
 
 
 def _small_differences(blurred: BlurredPicture, scale: int) -> tuple[Image, list[Image]]:

@@ -20,7 +20,7 @@ from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
 from virest.restoration.bands import LevelsOfRows, bands
-from virest.restoration.blurred import BlurredPicture, blurred_picture, clipped_anywhere
+from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture, clipped_anywhere
 from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
@@ -259,7 +259,9 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
-    recorded = picture if light is None else _relit(picture, curve, light)
+    recorded = picture
+    if light is not None:
+        recorded = encode_picture([as_kept(plane, blurred) for plane in blurred.light], curve)
     sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
     part: NDArray[np.float32] | np.float32 = np.float32(1.0)
     if anchor == 0.5:

@@ -9,9 +9,9 @@ import numpy as np
 
 from virest.degradation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
 from virest.restoration.bands import LevelsOfRows
-from virest.restoration.blurred import BlurredPicture, luma_of
+from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
 from virest.restoration.clipped_light import near_clipped
-from virest.restoration.colour import as_kept, with_colour
+from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import hyper_laplacian, richardson_lucy
 from virest.restoration.encoding import grey_levels
 from virest.restoration.settings import RestorationSettings
