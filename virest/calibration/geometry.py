@@ -61,6 +61,8 @@ TWINS = {"focal": "gyro-scale", "gyro-scale": "focal"}
 """What turns about the picture's axes tell only the product of; turns about the optical axis tell the two apart."""
 TWIN_SIGMA, TWIN_STD = 3.0, 0.01
 """A twin held fixed is said to be wrong from so many deviations on, and to be open above this part of itself."""
+DRIFT_SIGMA, LEAST_DRIFT_S = 6.0, 1e-3
+"""Clocks are said to drift apart from so many deviations on, and from so much over the capture."""
 
 OPTIONAL = {
     "focal": terms_of.FOCAL,
@@ -181,10 +183,34 @@ def calibrate_geometry(
         left_out += (1 - left_out) * astray
         if not astray:
             break
+    if "clock-skew" not in names and _clocks_drift(capture.imu, table, fit, float(np.median(observed.noise_px))):
+        found = calibrate_geometry(capture, profile, pairs, (*extra, "clock-skew"))
+        say("joint")
+        return replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
     found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out)
     found = replace(found, notes=(*found.notes, *_twin_notes(capture.imu, table, fit, names, found.noise_px)))
     say("joint")
     return found if lag is None else _with_lag(found, lag)
+
+
+def _clocks_drift(imu: ImuSamples, table: TrackTable, fit: TrackFit, noise_px: float) -> bool:
+    """Whether the clocks drift apart beyond doubt.
+
+    One offset for all of a capture is then right at one instant only, and looks well known.
+    """
+    term = OPTIONAL["clock-skew"]
+    free = fit_tracks(imu, table, fit.profile, [*fit.terms, term], fit.scene)
+    skew = abs(float(free.value(term.name)[0]))
+    std = float(np.hypot(free.std(term.name)[0], bias_std(free, term.name, noise_px)[0]))
+    return std <= MAX_STD[term.name] and skew > DRIFT_SIGMA * std and skew * float(np.ptp(fit.seconds)) > LEAST_DRIFT_S
+
+
+def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
+    """What is said where the clock's skew was fitted unasked."""
+    std = float(np.max([np.max(np.asarray(v.std, float)) for v in found.values if v.name == "clock_skew"]))
+    span_ms, skew = 1e3 * float(np.ptp(found.fit.seconds)), found.profile.clock_skew - given_skew
+    drift_ms, std_ms = span_ms * skew, span_ms * std
+    return f"the clocks drift apart by {drift_ms:+.1f} ± {std_ms:.1f} ms over the capture: clock-skew was fitted too"
 
 
 def _twin_notes(imu: ImuSamples, table: TrackTable, fit: TrackFit, names: Sequence[str], noise_px: float) -> list[str]:
