@@ -243,7 +243,9 @@ def test_the_readout_of_a_phone_in_a_car_is_found(virest: Any, realdata: Path, t
 
 def test_clocks_that_drift_apart_are_noticed_unasked(virest: Any, turned: Path, tmp_path: Path) -> None:
     """One offset would look well known and be right at one instant only; clocks that keep together stay so."""
-    assert not [v for v in calibrate(virest, turned, tmp_path)["values"] if v["name"] == "clock_skew"]
+    right = calibrate(virest, turned, tmp_path)
+    assert not [v for v in right["values"] if v["name"] == "clock_skew"]
+    assert not [note for note in right["notes"] if "held fixed" in note]
     drifting = tmp_path / "drifting"
     hidden = ["time_offset=0.02", "clock_skew=0.003"]
     simulate_command(drifting, frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=63, **SIZE)
@@ -253,6 +255,18 @@ def test_clocks_that_drift_apart_are_noticed_unasked(virest: Any, turned: Path, 
         assert found["determined"], name
         assert abs(found["value"] - truth) < LARGEST_SIGMA * found["std"], name
     assert "the clocks drift apart by +" in facts["notes"][0]
+
+
+def test_a_lens_that_was_held_fixed_and_is_wrong_is_named(virest: Any, tmp_path: Path) -> None:
+    """Neither is fitted unasked: the points tell both, and how far off they are."""
+    hidden, seed = ["focal_length=0.96", "radial_distortion=0.05"], 64
+    simulate_command(
+        tmp_path / "lens", frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=seed, **SIZE
+    )
+    (note,) = [n for n in calibrate(virest, tmp_path / "lens", tmp_path / "out")["notes"] if "held fixed" in n]
+    assert "--with focal,distortion," in note
+    off = float(note.split("focal (")[1].split("%")[0])
+    assert off == pytest.approx(-4.0, abs=1.5)
 
 
 def test_half_a_second_and_another_clock_rate_are_found(virest: Any, realdata: Path, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.calibration.held_fixed import OPTIONAL, HeldValue, held_notes, held_values
 from virest.calibration.start_up import StartUpLag, fit_start_up_lag
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
@@ -57,22 +58,10 @@ MIN_STRETCHES = 2.5
 """A value that rests on fewer stretches of time is a single moment's, and nothing else bears it out."""
 MANY_OUTLIERS = 0.1
 LARGE_CORRELATION = 0.9
-TWINS = {"focal": "gyro-scale", "gyro-scale": "focal"}
-"""What turns about the picture's axes tell only the product of; turns about the optical axis tell the two apart."""
-TWIN_SIGMA, TWIN_STD = 3.0, 0.01
-"""A twin held fixed is said to be wrong from so many deviations on, and to be open above this part of itself."""
+CONSTANT_EXPOSURE_S = 1e-4
+"""Exposures that differ by no more tell no offset from a scale of theirs, nor from the stamp's meaning."""
 DRIFT_SIGMA, LEAST_DRIFT_S = 6.0, 1e-3
 """Clocks are said to drift apart from so many deviations on, and from so much over the capture."""
-
-OPTIONAL = {
-    "focal": terms_of.FOCAL,
-    "distortion": terms_of.K1,
-    "principal-point": terms_of.PRINCIPAL_POINT,
-    "gyro-scale": terms_of.GYRO_SCALE,
-    "clock-skew": terms_of.CLOCK_SKEW,
-    "exposure-scale": terms_of.EXPOSURE_SCALE,
-}
-"""What ``--with`` adds to the fit of points."""
 FRAME_LAG = "frame-lag"
 """The start-up's lag, which ``--with`` adds too."""
 MAX_STD = {
@@ -183,26 +172,26 @@ def calibrate_geometry(
         left_out += (1 - left_out) * astray
         if not astray:
             break
-    if "clock-skew" not in names and _clocks_drift(capture.imu, table, fit, float(np.median(observed.noise_px))):
+    vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
+    held = held_values(capture.imu, table, fit, float(np.median(observed.noise_px)), vary)
+    if _clocks_drift(held.get("clock-skew"), float(np.ptp(fit.seconds))):
         found = calibrate_geometry(capture, profile, pairs, (*extra, "clock-skew"))
         say("joint")
         return replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
     found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out)
-    found = replace(found, notes=(*found.notes, *_twin_notes(capture.imu, table, fit, names, found.noise_px)))
     say("joint")
+    found = replace(found, notes=(*found.notes, *held_notes(held, names)))
     return found if lag is None else _with_lag(found, lag)
 
 
-def _clocks_drift(imu: ImuSamples, table: TrackTable, fit: TrackFit, noise_px: float) -> bool:
-    """Whether the clocks drift apart beyond doubt.
+def _clocks_drift(skew: HeldValue | None, span_s: float) -> bool:
+    """Whether clocks drift apart beyond doubt, whose skew was held fixed; None: it was not.
 
     One offset for all of a capture is then right at one instant only, and looks well known.
     """
-    term = OPTIONAL["clock-skew"]
-    free = fit_tracks(imu, table, fit.profile, [*fit.terms, term], fit.scene)
-    skew = abs(float(free.value(term.name)[0]))
-    std = float(np.hypot(free.std(term.name)[0], bias_std(free, term.name, noise_px)[0]))
-    return std <= MAX_STD[term.name] and skew > DRIFT_SIGMA * std and skew * float(np.ptp(fit.seconds)) > LEAST_DRIFT_S
+    if skew is None or skew.std[0] > MAX_STD["clock_skew"]:
+        return False
+    return skew.sigma > DRIFT_SIGMA and abs(float(skew.change[0])) * span_s > LEAST_DRIFT_S
 
 
 def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
@@ -211,31 +200,6 @@ def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
     span_ms, skew = 1e3 * float(np.ptp(found.fit.seconds)), found.profile.clock_skew - given_skew
     drift_ms, std_ms = span_ms * skew, span_ms * std
     return f"the clocks drift apart by {drift_ms:+.1f} ± {std_ms:.1f} ms over the capture: clock-skew was fitted too"
-
-
-def _twin_notes(imu: ImuSamples, table: TrackTable, fit: TrackFit, names: Sequence[str], noise_px: float) -> list[str]:
-    """Warnings about a focal length or a gyroscope's scale that was fitted while its twin was held where it was."""
-    notes = []
-    for name in names:
-        twin = TWINS.get(name)
-        if twin is None or twin in names:
-            continue
-        term = OPTIONAL[twin]
-        free = fit_tracks(imu, table, fit.profile, [*fit.terms, term], fit.scene)
-        change = float(free.value(term.name)[0])
-        std = float(np.hypot(free.std(term.name)[0], bias_std(free, term.name, noise_px)[0]))
-        pair = f"--with {','.join([*names, twin])}"
-        if abs(change) > TWIN_SIGMA * std:
-            notes.append(
-                f"{name} makes up for a wrong {twin}: the points want that {change:+.1%} ± {std:.1%} off; "
-                f"fit both, {pair}"
-            )
-        elif std > TWIN_STD:
-            notes.append(
-                f"{name} is only as right as {twin}, which was held fixed: this motion tells it to ± {std:.1%} only; "
-                "turn the phone about its optical axis too"
-            )
-    return notes
 
 
 def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) -> ObservedTracks:
@@ -598,7 +562,7 @@ def _notes(
         notes.append(f"{moving:.0%} of the tracks do not go with the camera (moving objects, or a scene out of plane)")
     if not observed.exposure_known:
         notes.append("exposure times unknown: the offset counts to the middle of the exposure")
-    elif np.ptp(observed.exposure_s) < 1e-4 and determined["time_offset"]:
+    elif np.ptp(observed.exposure_s) < CONSTANT_EXPOSURE_S and determined["time_offset"]:
         notes.append(
             "at constant exposure an offset cannot be told from another meaning of the stamp: "
             f"exposure_end would give {1e3 * float(np.median(observed.exposure_s)):+.2f} ms more"

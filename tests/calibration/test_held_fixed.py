@@ -1,0 +1,50 @@
+"""What is said of values that a calibration held fixed although the points contradict them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from virest.calibration.held_fixed import BELIEVABLE, OPTIONAL, HeldValue, held_notes
+
+
+def held(name: str, change: Any, std: Any) -> dict[str, HeldValue]:
+    """One such value."""
+    return {name: HeldValue(name, np.atleast_1d(np.array(change, float)), np.atleast_1d(np.array(std, float)))}
+
+
+def test_every_optional_value_has_its_bound() -> None:
+    """None can be called wrong without it."""
+    assert set(BELIEVABLE) == set(OPTIONAL)
+
+
+def test_values_that_fit_are_not_mentioned() -> None:
+    """Five and six deviations are not the same."""
+    assert held_notes({**held("focal", 0.01, 0.002), **held("principal-point", [5, 2], [1, 1])}, ()) == []
+
+
+def test_a_wrong_value_is_named_with_its_size_and_what_to_do() -> None:
+    """All that was fitted is asked for again."""
+    values = {**held("focal", np.log(0.97), 0.002), **held("principal-point", [1, -9], [1, 0.5])}
+    (note,) = held_notes(values, ["clock-skew"])
+    assert "focal (-3.0% ± 0.2%)" in note
+    assert "principal-point (+1 ± 1, -9 ± 0.5 px)" in note
+    assert "--with clock-skew,focal,principal-point" in note
+
+
+def test_what_no_phone_can_be_is_a_sign_of_something_else() -> None:
+    """An exposure of next to nothing: the stamps mean another instant."""
+    (note,) = held_notes({**held("exposure-scale", -3.1, 0.1), **held("focal", 0.03, 0.002)}, ())
+    assert "exposure-scale (-95.5%" in note
+    assert "virest diagnose" in note
+    assert "--with" not in note
+
+
+@pytest.mark.parametrize(
+    ("change", "std", "said"),
+    [(0.04, 0.01, "makes up for a wrong gyro-scale"), (0.01, 0.02, "only as right as gyro-scale"), (0.01, 0.005, None)],
+)
+def test_a_fitted_values_twin_is_asked_more_strictly(change: float, std: float, said: str | None) -> None:
+    """Focal length and gyroscope scale make up for each other."""
+    notes = held_notes(held("gyro-scale", change, std), ["focal"])
+    assert [said in note for note in notes] == ([True] if said else [])

@@ -1,0 +1,123 @@
+"""What a calibration held fixed although the points contradict it: told by one more fit, in which nothing is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.capture.imu import ImuSamples
+from virest.motion import profile_terms as terms_of
+from virest.motion.track_fit import TrackFit, fit_tracks
+from virest.motion.track_model import TrackTable
+from virest.motion.tracking_bias import bias_std
+
+OPTIONAL = {
+    "focal": terms_of.FOCAL,
+    "distortion": terms_of.K1,
+    "principal-point": terms_of.PRINCIPAL_POINT,
+    "gyro-scale": terms_of.GYRO_SCALE,
+    "clock-skew": terms_of.CLOCK_SKEW,
+    "exposure-scale": terms_of.EXPOSURE_SCALE,
+}
+"""What ``--with`` adds to the fit of points."""
+TWINS = {"focal": "gyro-scale", "gyro-scale": "focal"}
+"""What turns about the picture's axes tell only the product of; turns about the optical axis tell the two apart."""
+TWIN_SIGMA, TWIN_STD = 3.0, 0.01
+"""A twin held fixed is said to be wrong from so many deviations on, and to be open above this part of itself."""
+WRONG_SIGMA = 6.0
+"""Any other value held fixed is said to be wrong from so many deviations on."""
+BELIEVABLE = {
+    "focal": 0.2,
+    "distortion": 0.3,
+    "principal-point": 100.0,
+    "gyro-scale": 0.15,
+    "clock-skew": 0.02,
+    "exposure-scale": 1.0,
+}
+"""A larger change stands in for something else, such as a stabiliser or stamps of another meaning."""
+_FACTORS = ("focal", "gyro-scale", "exposure-scale")
+"""Values whose terms are natural logarithms of a factor."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldValue:
+    """A value that was not fitted, as the points would have it."""
+
+    name: str
+    """As in OPTIONAL."""
+    change: NDArray[np.float64]
+    """(k,) from where it was held, in its term's units."""
+    std: NDArray[np.float64]
+    """(k,), with tracking's own bias."""
+
+    @property
+    def sigma(self) -> float:
+        """The largest change in units of its deviation."""
+        return float(np.max(np.abs(self.change) / self.std))
+
+    @property
+    def believable(self) -> bool:
+        """Whether a phone can be like that."""
+        return bool(np.all(np.abs(self.change) <= BELIEVABLE[self.name]))
+
+    def __str__(self) -> str:
+        if self.name in _FACTORS:
+            change = np.expm1(self.change)
+            return f"{self.name} ({change[0]:+.1%} ± {(1 + change[0]) * self.std[0]:.1%})"
+        pairs = zip(self.change, self.std, strict=True)
+        unit = " px" if self.name == "principal-point" else ""
+        return f"{self.name} ({', '.join(f'{change:+.3g} ± {std:.2g}' for change, std in pairs)}{unit})"
+
+
+def held_values(
+    imu: ImuSamples, table: TrackTable, fit: TrackFit, noise_px: float, exposures_vary: bool
+) -> dict[str, HeldValue]:
+    """All that a fit held fixed, as a fit that holds nothing finds it; by its name in OPTIONAL.
+
+    noise_px: what tracking alone makes.  exposures_vary: where they do not, an exposure's scale is an offset.
+    """
+    fitted = {term.name for term in fit.terms}
+    wanted = {
+        name: term
+        for name, term in OPTIONAL.items()
+        if term.name not in fitted and (exposures_vary or name != "exposure-scale")
+    }
+    free = fit_tracks(imu, table, fit.profile, [*fit.terms, *wanted.values()], fit.scene)
+    return {
+        name: HeldValue(name, free.value(term.name), np.hypot(free.std(term.name), bias_std(free, term.name, noise_px)))
+        for name, term in wanted.items()
+    }
+
+
+def held_notes(held: dict[str, HeldValue], fitted: Sequence[str]) -> list[str]:
+    """What to say of them; fitted: names of those in OPTIONAL that were fitted."""
+    notes, said = [], set()
+    for name in fitted:
+        twin = held.get(TWINS.get(name, ""))
+        if twin is None:
+            continue
+        said.add(twin.name)
+        if twin.sigma > TWIN_SIGMA:
+            pair = f"--with {','.join([*fitted, twin.name])}"
+            notes.append(f"{name} makes up for a wrong {twin}, which the points contradict: fit both, {pair}")
+        elif twin.std[0] > TWIN_STD:
+            notes.append(
+                f"{name} is only as right as {twin.name}, which was held fixed: this motion tells it to "
+                f"± {twin.std[0]:.1%} only; turn the phone about its optical axis too"
+            )
+    wrong = [value for name, value in held.items() if name not in said and value.sigma > WRONG_SIGMA]
+    if wrong and all(value.believable for value in wrong):
+        names = ",".join([*fitted, *(value.name for value in wrong)])
+        notes.append(
+            f"held fixed, and contradicted by the points: {', '.join(map(str, wrong))}; "
+            f"fit with --with {names}, or ask virest diagnose"
+        )
+    elif wrong:
+        notes.append(
+            "the points do not fit the model: held fixed, but wanted as no phone has it: "
+            f"{', '.join(str(value) for value in wrong if not value.believable)}; ask virest diagnose for the cause"
+        )
+    return notes
