@@ -81,6 +81,7 @@ def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, A
     return {
         "response": _rounded(response_block(fit.curve)),
         "rms_grey_levels": fit.rms_grey_levels,
+        "curve_std_grey_levels": fit.curve_std_grey_levels,
         "covered_exposure": list(fit.covered_exposure),
         "pictures": [
             {

@@ -37,7 +37,7 @@ class Family:
     upper: Array
     build: Callable[[Array], ResponseCurve]
     smoothness: Callable[[Array], Array] | None = None
-    """What a fit adds to its residuals, so that parameters without data stay sane."""
+    """Changes of the curve's local exponent from knot to knot: what a fit holds small where the data say nothing."""
     others: tuple[Array, ...] = ()
     """Further parameters to begin with; the best after a few steps is followed."""
 
@@ -105,7 +105,7 @@ def _table(first: FirstCurve, low: float, high: float, top: float) -> Family:
     middle = 0.5 * (along[1:] + along[:-1])
 
     def smooth(p: Array) -> Array:
-        return 0.5 * np.diff(np.exp(p) / np.diff(along)) / np.diff(middle) * np.diff(along)[1:]
+        return np.diff(np.exp(p) / np.diff(along)) / np.diff(middle) * np.diff(along)[1:]
 
     bounds = np.full(TABLE_KNOTS - 1, 8.0)
     return Family("table", start, -bounds, bounds, lambda p: table_curve(p, greys, top), smooth)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 
 from virest.calibration.bracket_samples import MIN_SHARED, BracketPicture, BracketSamples, sample_bracket
+from virest.calibration.curve_certainty import CurvePosterior, curve_posterior
 from virest.calibration.curve_families import Family, LogLookup, log_lookup, make_family
 from virest.calibration.exposure_check import CONTRADICTS_EV, MIN_PICTURES, FirstCurve, fit_first_curve, outlying
 from virest.camera.response import KINDS, ResponseCurve
@@ -33,6 +34,8 @@ FREE_EV = 4.0
 MIN_RATIO = 2**0.25
 FEW_RATIO = 2**1.5
 STEP = 1e-4
+SMOOTH_WEIGHT = 5.0
+"""Of a table's roughness in the fit, against samples that count as if their errors were independent."""
 MOVED_LEVELS = 8.0
 MAX_MOVED = 0.2
 USUAL_MISSES = 3.0
@@ -86,6 +89,8 @@ class CurveFit:
     curve: ResponseCurve
     rms_grey_levels: float
     """Of the samples' residuals (means over small squares), outliers left out."""
+    curve_std_grey_levels: float
+    """Standard deviation of the curve over the exposures covered, rms (see ``curve_certainty``)."""
     covered_exposure: tuple[float, float]
     """Exposures on the curve's axis between which there are data."""
     pictures: tuple[PictureFit, ...]
@@ -126,8 +131,9 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     trials = _try_kinds(kind, samples.take(~odd), samples.take(odd), first)
     chosen = kind if kind != "auto" else choose_kind(trials)
     final = _refine(trials[chosen], samples)
+    posterior = _posterior(final, samples)
     notes += _criticise(chosen, trials, final, samples)
-    return _result(pictures, seen, final, trials, samples, notes)
+    return _result(pictures, seen, final, trials, samples, notes, posterior)
 
 
 # ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -243,7 +249,7 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
         correction = no_trend @ q[shape:]
         parts = [(_residual(lookup, samples, correction) / samples.sigma).ravel() / 2.0, q[shape:] / belief]
         if family.smoothness:
-            parts.append(family.smoothness(q[:shape]))
+            parts.append(SMOOTH_WEIGHT * family.smoothness(q[:shape]))
         return np.concatenate(parts)
 
     def jacobian(q: Array) -> Array:
@@ -349,6 +355,19 @@ def _refine(trial: _Trial, samples: BracketSamples) -> _Trial:
     return _judge(trial.family, parameters, correction, suspect, samples)
 
 
+def _posterior(trial: _Trial, samples: BracketSamples) -> CurvePosterior:
+    """What the samples leave open of a fit."""
+
+    def residual(curve: ResponseCurve, correction_ev: Array) -> Array:
+        return _residual(log_lookup(curve), samples, correction_ev)
+
+    left = residual(trial.curve, trial.correction_ev)
+    used = samples.measured & (np.abs(left) < 6.0 * np.maximum(samples.sigma, _rms(left[samples.measured])))
+    belief = np.where(trial.suspect, FREE_EV, TRUSTED_EV)
+    return curve_posterior(trial.family, trial.parameters, trial.correction_ev, residual, samples.sigma, samples.grey,
+                           used, belief)  # fmt: skip
+
+
 # ── what the fit says of itself ──────────────────────────────────────────────────────────────────────────────────
 
 
@@ -401,6 +420,7 @@ def _result(
     trials: dict[str, _Trial],
     samples: BracketSamples,
     notes: list[str],
+    posterior: CurvePosterior,
 ) -> CurveFit:
     log_t = np.log(samples.exposure) + LN2 * final.correction_ev
     lookup = log_lookup(final.curve)
@@ -420,6 +440,7 @@ def _result(
     return CurveFit(
         scale_exposure(final.curve, scale),
         _rms(left[use]),
+        posterior.rms_levels,
         (float(np.exp(ends[0]) / scale), float(np.exp(ends[1]) / scale)),
         verdicts,
         tuple(notes),
