@@ -47,6 +47,11 @@ Z_REJECTED = 3.0
 DISTINCT_LEVELS = 0.25
 """Smaller systematic differences between two kinds are left to rounding and compression."""
 STRUCTURE_LEVELS = 0.3
+ESTABLISHED_Z = 3.0
+OPEN_LEVELS = 2.0
+"""A curve that the data hold no better is said to be held loosely."""
+UNDETERMINED_LEVELS = 25.0
+"""A tenth of the greys: no measurement of a curve."""
 LN2 = float(np.log(2.0))
 
 
@@ -90,7 +95,8 @@ class CurveFit:
     rms_grey_levels: float
     """Of the samples' residuals (means over small squares), outliers left out."""
     curve_std_grey_levels: float
-    """Standard deviation of the curve over the exposures covered, rms (see ``curve_certainty``)."""
+    """Standard deviation of the curve over the exposures covered, rms: what the data leave open (``curve_certainty``),
+    where the kind was not given among curves of any kind, and what residuals at one grey share."""
     covered_exposure: tuple[float, float]
     """Exposures on the curve's axis between which there are data."""
     pictures: tuple[PictureFit, ...]
@@ -127,13 +133,51 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     first = fit_first_curve(samples)
     still = _still_rows(samples, first)
     samples = samples.take(still)
+    verdict = _fit_kinds(kind, samples, first, np.ones(len(first.suspect), bool))
+    doubtful = verdict.final.suspect & ~_established(verdict, samples)
+    if doubtful.any():
+        first = replace(first, suspect=first.suspect & ~doubtful)
+        verdict = _fit_kinds(kind, samples, first, ~doubtful)
+    _require_determined(verdict)
+    return _result(pictures, seen, verdict, samples, [*notes, *_criticise(verdict, samples)])
+
+
+@dataclass(frozen=True, slots=True)
+class _Verdict:
+    """The kinds that were fitted, and the one that was chosen."""
+
+    trials: dict[str, _Trial]
+    chosen: str
+    final: _Trial
+    """The chosen kind, fitted to all samples."""
+    posterior: CurvePosterior
+    """Of the table, where the kind was not given: what the data alone leave open."""
+    structure_levels: float
+    """What residuals at one grey share."""
+
+    @property
+    def std_levels(self) -> float:
+        """The curve's deviation: what the data leave open, and what the kind is seen not to follow."""
+        return float(np.hypot(self.posterior.rms_levels, self.structure_levels))
+
+
+def _fit_kinds(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: NDArray[np.bool_]) -> _Verdict:
+    """Fit the kinds, choose one, and judge how far the data hold it."""
     odd = samples.site % 2 == 1
     trials = _try_kinds(kind, samples.take(~odd), samples.take(odd), first)
     chosen = kind if kind != "auto" else choose_kind(trials)
-    final = _refine(trials[chosen], samples)
-    posterior = _posterior(final, samples)
-    notes += _criticise(chosen, trials, final, samples)
-    return _result(pictures, seen, final, trials, samples, notes, posterior)
+    final = _refine(trials[chosen], samples, may_be_wrong)
+    open_kind = replace(trials["table"], suspect=final.suspect) if kind == "auto" else final
+    left = _residual(log_lookup(final.curve), samples, final.correction_ev)
+    use = samples.measured & (np.abs(left) < 6.0 * max(_rms(left[samples.measured]), 0.3))
+    structure = residual_structure(samples.grey[use], left[use])
+    return _Verdict(trials, chosen, final, _posterior(open_kind, samples), structure)
+
+
+def _established(verdict: _Verdict, samples: BracketSamples) -> NDArray[np.bool_]:
+    """(pictures,): whether a wrong exposure is told from another curve, by what a table and the noise leave open."""
+    free = _posterior(replace(verdict.trials["table"], suspect=verdict.final.suspect), samples)
+    return np.abs(verdict.final.correction_ev) > ESTABLISHED_Z * free.exposure_std_ev
 
 
 # ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -169,6 +213,16 @@ def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> N
         text = f"the usable greys of {pictures[lost[0]].file} do not overlap with those of {pictures[numbers[0]].file}"
         raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, at most 3 EV apart")
     return seen
+
+
+def _require_determined(verdict: _Verdict) -> None:
+    """Raises CalibrationError where a kind with free parameters is chosen among curves that the data do not tell apart.
+
+    A kind without any is another matter: it says before all measurement what every picture must show.
+    """
+    if len(verdict.final.parameters) and verdict.std_levels > UNDETERMINED_LEVELS:
+        text = f"the pictures do not determine the curve: it could differ by {verdict.std_levels:.0f} grey levels rms"
+        raise CalibrationError(text, hint="take more exposures, closer together, of a scene with many brightnesses")
 
 
 def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]:
@@ -340,13 +394,13 @@ def _beaten(one: _Trial, other: _Trial) -> bool:
     return bool(gain.mean() > Z_REJECTED * gain.std() / np.sqrt(len(gain)))
 
 
-def _refine(trial: _Trial, samples: BracketSamples) -> _Trial:
-    """Fit again with all samples; a picture whose correction now stands out is set free too."""
+def _refine(trial: _Trial, samples: BracketSamples, may_be_wrong: NDArray[np.bool_]) -> _Trial:
+    """Fit again with all samples; a picture whose correction now stands out is set free too, where it may be."""
     start = np.concatenate([trial.parameters, trial.correction_ev])
     suspect = trial.suspect
     for _ in range(2):
         parameters, correction = _optimise(trial.family, start, samples, suspect, 10)
-        wide = suspect | (outlying(correction) & (np.abs(correction) > 0.6 * CONTRADICTS_EV))
+        wide = suspect | (outlying(correction) & (np.abs(correction) > 0.6 * CONTRADICTS_EV) & may_be_wrong)
         start = np.concatenate([parameters, correction])
         if (wide == suspect).all():
             break
@@ -382,12 +436,9 @@ def residual_structure(grey: Array, residual: Array, bins: int = 16) -> float:
     return float(np.sqrt(max(float(excess.mean()), 0.0))) if good.any() else 0.0
 
 
-def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: BracketSamples) -> list[str]:
+def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
     notes = []
-    left = _residual(log_lookup(final.curve), samples, final.correction_ev)
-    limit = 6.0 * max(_rms(left[samples.measured]), 0.3)
-    use = samples.measured & (np.abs(left) < limit)
-    structure = residual_structure(samples.grey[use], left[use])
+    chosen, trials, final, structure = verdict.chosen, verdict.trials, verdict.final, verdict.structure_levels
     tabulated = trials["table"]
     if chosen != "table" and _beaten(trials[chosen], tabulated):
         before = trials[chosen].held_out_rms
@@ -408,6 +459,11 @@ def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: B
     if samples.exposure.max() / samples.exposure.min() < FEW_RATIO:
         span = np.log2(samples.exposure.max() / samples.exposure.min())
         notes.append(f"exposures span only {span:.1f} EV: the curve is weakly determined")
+    if verdict.std_levels > OPEN_LEVELS:
+        notes.append(
+            f"the pictures hold the curve to {verdict.std_levels:.1f} grey levels rms only"
+            f"{', the rest is the kind' * (chosen != 'table')}: more exposures, closer together, hold it better"
+        )
     if (final.curve.encode(np.array([1.0])) * 255)[0] - samples.top > 25:
         notes.append(f"no grey above {samples.top:.0f} was seen: the curve is extrapolated there")
     return notes
@@ -416,12 +472,11 @@ def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: B
 def _result(
     pictures: Sequence[BracketPicture],
     seen: NDArray[np.bool_],
-    final: _Trial,
-    trials: dict[str, _Trial],
+    verdict: _Verdict,
     samples: BracketSamples,
     notes: list[str],
-    posterior: CurvePosterior,
 ) -> CurveFit:
+    final = verdict.final
     log_t = np.log(samples.exposure) + LN2 * final.correction_ev
     lookup = log_lookup(final.curve)
     left = _residual(lookup, samples, final.correction_ev)
@@ -431,20 +486,20 @@ def _result(
     scale = float(np.exp(ends[1])) if final.family.kind in ("five_segment", "table") else 1.0
     cloud = DataCloud(np.exp(log_light[use]) / scale, samples.grey[use], left[use], np.nonzero(use)[1])
     verdicts = _verdicts(pictures, seen, final)
-    for verdict in verdicts:
-        if verdict.contradicts:
+    for picture in verdicts:
+        if picture.contradicts:
             notes.append(
-                f"{verdict.file}: its listed exposure {verdict.exposure:.6g} contradicts the others by "
-                f"{verdict.exposure_error_ev:+.2f} EV; likely {verdict.likely_exposure:.6g}"
+                f"{picture.file}: its listed exposure {picture.exposure:.6g} contradicts the others by "
+                f"{picture.exposure_error_ev:+.2f} EV; likely {picture.likely_exposure:.6g}"
             )
     return CurveFit(
         scale_exposure(final.curve, scale),
         _rms(left[use]),
-        posterior.rms_levels,
+        verdict.std_levels,
         (float(np.exp(ends[0]) / scale), float(np.exp(ends[1]) / scale)),
         verdicts,
         tuple(notes),
-        {name: trial.held_out_rms for name, trial in trials.items()},
+        {name: trial.held_out_rms for name, trial in verdict.trials.items()},
         cloud,
     )
 
