@@ -48,6 +48,8 @@ DISTINCT_LEVELS = 0.25
 """Smaller systematic differences between two kinds are left to rounding and compression."""
 STRUCTURE_LEVELS = 0.3
 ESTABLISHED_Z = 3.0
+SCATTER_EV = 0.06
+"""Three times what a listed exposure is believed to deviate by."""
 OPEN_LEVELS = 2.0
 """A curve that the data hold no better is said to be held loosely."""
 UNDETERMINED_LEVELS = 25.0
@@ -95,8 +97,8 @@ class CurveFit:
     rms_grey_levels: float
     """Of the samples' residuals (means over small squares), outliers left out."""
     curve_std_grey_levels: float
-    """Standard deviation of the curve over the exposures covered, rms: what the data leave open (``curve_certainty``),
-    where the kind was not given among curves of any kind, and what residuals at one grey share."""
+    """Standard deviation of the curve over the exposures covered, rms: what the data leave open among smooth curves of
+    any kind (``curve_certainty``), and what this kind is seen not to follow."""
     covered_exposure: tuple[float, float]
     """Exposures on the curve's axis between which there are data."""
     pictures: tuple[PictureFit, ...]
@@ -134,7 +136,7 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     still = _still_rows(samples, first)
     samples = samples.take(still)
     verdict = _fit_kinds(kind, samples, first, np.ones(len(first.suspect), bool))
-    doubtful = verdict.final.suspect & ~_established(verdict, samples)
+    doubtful = verdict.final.suspect & ~verdict.established
     if doubtful.any():
         first = replace(first, suspect=first.suspect & ~doubtful)
         verdict = _fit_kinds(kind, samples, first, ~doubtful)
@@ -151,14 +153,23 @@ class _Verdict:
     final: _Trial
     """The chosen kind, fitted to all samples."""
     posterior: CurvePosterior
-    """Of the table, where the kind was not given: what the data alone leave open."""
+    """Of the table: what the data alone leave open."""
     structure_levels: float
     """What residuals at one grey share."""
+    misfit_levels: float
+    """The same; where a kind was asked for, at least its distance from the table."""
+    scatter_ev: float
+    """Of the believed exposures about the table."""
 
     @property
     def std_levels(self) -> float:
         """The curve's deviation: what the data leave open, and what the kind is seen not to follow."""
-        return float(np.hypot(self.posterior.rms_levels, self.structure_levels))
+        return float(np.hypot(self.posterior.rms_levels, self.misfit_levels))
+
+    @property
+    def established(self) -> NDArray[np.bool_]:
+        """(pictures,): whether a wrong exposure is told from another curve, by what a table leaves open."""
+        return np.abs(self.final.correction_ev) > ESTABLISHED_Z * self.posterior.exposure_std_ev
 
 
 def _fit_kinds(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: NDArray[np.bool_]) -> _Verdict:
@@ -167,17 +178,20 @@ def _fit_kinds(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wro
     trials = _try_kinds(kind, samples.take(~odd), samples.take(odd), first)
     chosen = kind if kind != "auto" else choose_kind(trials)
     final = _refine(trials[chosen], samples, may_be_wrong)
-    open_kind = replace(trials["table"], suspect=final.suspect) if kind == "auto" else final
+    table = replace(trials["table"], suspect=final.suspect)
     left = _residual(log_lookup(final.curve), samples, final.correction_ev)
     use = samples.measured & (np.abs(left) < 6.0 * max(_rms(left[samples.measured]), 0.3))
-    structure = residual_structure(samples.grey[use], left[use])
-    return _Verdict(trials, chosen, final, _posterior(open_kind, samples), structure)
+    misfit = structure = residual_structure(samples.grey[use], left[use])
+    if kind not in ("auto", "table"):
+        misfit = max(misfit, curve_distance_levels(table.curve, final.curve, (table.curve.x[1], 1.0)))
+    scatter_ev = _scatter_ev(table)
+    return _Verdict(trials, chosen, final, _posterior(table, samples, scatter_ev), structure, misfit, scatter_ev)
 
 
-def _established(verdict: _Verdict, samples: BracketSamples) -> NDArray[np.bool_]:
-    """(pictures,): whether a wrong exposure is told from another curve, by what a table and the noise leave open."""
-    free = _posterior(replace(verdict.trials["table"], suspect=verdict.final.suspect), samples)
-    return np.abs(verdict.final.correction_ev) > ESTABLISHED_Z * free.exposure_std_ev
+def _scatter_ev(trial: _Trial) -> float:
+    """Standard deviation of the believed corrections; two numbers are taken off them, level and trend."""
+    believed = trial.correction_ev[~trial.suspect]
+    return float(np.sqrt((believed**2).sum() / max(len(believed) - 2, 1)))
 
 
 # ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -220,8 +234,9 @@ def _require_determined(verdict: _Verdict) -> None:
 
     A kind without any is another matter: it says before all measurement what every picture must show.
     """
-    if len(verdict.final.parameters) and verdict.std_levels > UNDETERMINED_LEVELS:
-        text = f"the pictures do not determine the curve: it could differ by {verdict.std_levels:.0f} grey levels rms"
+    open_levels = verdict.posterior.rms_levels
+    if len(verdict.final.parameters) and open_levels > UNDETERMINED_LEVELS:
+        text = f"the pictures do not determine the curve: it could differ by {open_levels:.0f} grey levels rms"
         raise CalibrationError(text, hint="take more exposures, closer together, of a scene with many brightnesses")
 
 
@@ -409,15 +424,15 @@ def _refine(trial: _Trial, samples: BracketSamples, may_be_wrong: NDArray[np.boo
     return _judge(trial.family, parameters, correction, suspect, samples)
 
 
-def _posterior(trial: _Trial, samples: BracketSamples) -> CurvePosterior:
-    """What the samples leave open of a fit."""
+def _posterior(trial: _Trial, samples: BracketSamples, scatter_ev: float) -> CurvePosterior:
+    """What the samples leave open of a fit; exposures are believed no better than they agree."""
 
     def residual(curve: ResponseCurve, correction_ev: Array) -> Array:
         return _residual(log_lookup(curve), samples, correction_ev)
 
     left = residual(trial.curve, trial.correction_ev)
     used = samples.measured & (np.abs(left) < 6.0 * np.maximum(samples.sigma, _rms(left[samples.measured])))
-    belief = np.where(trial.suspect, FREE_EV, TRUSTED_EV)
+    belief = np.where(trial.suspect, FREE_EV, max(TRUSTED_EV, scatter_ev))
     return curve_posterior(trial.family, trial.parameters, trial.correction_ev, residual, samples.sigma, samples.grey,
                            used, belief)  # fmt: skip
 
@@ -454,14 +469,20 @@ def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
         five = trials["five_segment"].held_out_rms
         table = tabulated.held_out_rms
         notes.append(f"no simpler kind follows: held-out rms {five:.2f} with five_segment, {table:.2f} with table")
+    if verdict.scatter_ev > SCATTER_EV:
+        notes.append(
+            f"the listed exposures agree to {verdict.scatter_ev:.2f} EV only: flicker, or several are wrong "
+            "(is ISO counted?) and too few right to tell which"
+        )
     if len(samples.exposure) < MIN_PICTURES:
         notes.append(f"{len(samples.exposure)} pictures are too few to find wrong exposures")
     if samples.exposure.max() / samples.exposure.min() < FEW_RATIO:
         span = np.log2(samples.exposure.max() / samples.exposure.min())
         notes.append(f"exposures span only {span:.1f} EV: the curve is weakly determined")
-    if verdict.std_levels > OPEN_LEVELS:
+    open_levels = verdict.posterior.rms_levels
+    if open_levels > OPEN_LEVELS:
         notes.append(
-            f"the pictures hold the curve to {verdict.std_levels:.1f} grey levels rms only"
+            f"the pictures hold the curve to {open_levels:.1f} grey levels rms only"
             f"{', the rest is the kind' * (chosen != 'table')}: more exposures, closer together, hold it better"
         )
     if (final.curve.encode(np.array([1.0])) * 255)[0] - samples.top > 25:
