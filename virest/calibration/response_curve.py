@@ -303,6 +303,16 @@ class _Trial:
     """(held-out samples,) capped sum of squared normalised residuals."""
     site: NDArray[np.int64]
     held_out_rms: float
+    trend_row: Array
+    """(pictures,) unit pattern of a trend over log exposure."""
+
+    @property
+    def bent(self) -> bool:
+        """Whether the believed exposures need a trend, as they do where the curve wants another power."""
+        believed = self.correction_ev[~self.suspect]
+        trend = float(self.trend_row[~self.suspect] @ believed) ** 2
+        scatter = max(float(believed @ believed) - trend, 0.0) / max(len(believed) - 2, 1)
+        return trend > Z_REJECTED**2 * max(scatter, TRUSTED_EV**2)
 
 
 def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDArray[np.bool_],
@@ -310,7 +320,7 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
     """(curve parameters, corrections in EV) of least cost, the sizes of the residuals held down (soft L1)."""
     shape = len(family.start)
     belief = np.where(suspect, FREE_EV, TRUSTED_EV)
-    rows = _trend_rows(samples.exposure, suspect)
+    rows = _trend_rows(samples.exposure, suspect)[: 1 + family.bends]
     no_trend = np.eye(len(suspect)) - rows.T @ rows
 
     def miss(q: Array) -> Array:
@@ -339,7 +349,8 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
 def _trend_rows(exposure: Array, suspect: NDArray[np.bool_]) -> Array:
     """(2, pictures), orthonormal: level and trend over log exposure of the corrections of believed pictures.
 
-    Both are forbidden: a level is a unit of light, a trend would be a power of the curve in disguise.
+    A level is a unit of light and forbidden.  So is a trend where the curve has a power of its own, for it would be
+    that in disguise; where it has none, the belief in the listed exposures holds the trend.
     """
     believed = (~suspect).astype(float)
     level = believed / np.sqrt(believed.sum())
@@ -375,7 +386,8 @@ def _judge(
     curve = family.build(parameters)
     left = _residual(log_lookup(curve), held, correction_ev)
     score = np.minimum((left / held.sigma) ** 2, SCORE_CAP).sum(axis=1)
-    return _Trial(family, curve, parameters, correction_ev, suspect, score, held.site, _capped_rms(left[held.measured]))
+    rms, trend_row = _capped_rms(left[held.measured]), _trend_rows(held.exposure, suspect)[1]
+    return _Trial(family, curve, parameters, correction_ev, suspect, score, held.site, rms, trend_row)
 
 
 def _rms(residual: Array) -> float:
@@ -393,9 +405,13 @@ def _capped_rms(residual: Array) -> float:
 
 
 def choose_kind(trials: dict[str, _Trial]) -> str:
-    """The first (simplest) kind that no other predicts the held-out places significantly better than."""
+    """The simplest kind that needs no trend of the exposures, and is not significantly worse at held-out places."""
     for name in KINDS:
-        if name in trials and not any(_beaten(trials[name], other) for n, other in trials.items() if n != name):
+        if (
+            name in trials
+            and not trials[name].bent
+            and not any(_beaten(trials[name], other) for n, other in trials.items() if n != name)
+        ):
             return name
     return "table"
 
