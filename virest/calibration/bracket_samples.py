@@ -259,20 +259,25 @@ def _small_green(levels: NDArray[Any], step: int) -> NDArray[Any]:
 
 
 def _shift_between(first: NDArray[Any], second: NDArray[Any], first_name: str, second_name: str) -> Array:
-    """Shift (x, y) of the second picture against the first, in their pixels; zero where there is nothing to see."""
+    """Shift (x, y) of the second picture against the first, in their pixels; zero where there is nothing to see.
+
+    A part moves by itself where a shift of its own explains much of what the common shift leaves there.
+    """
     pair = _common_ranks(first, second)
     if pair is None:
         return np.zeros(2)
     shift, gain = _tested_shift(*pair)
-    parts = [_tested_shift(*(rank[part] for rank in pair)) for part in _quarters(first.shape)]
-    clear = np.array([part for part, part_gain in parts if part_gain > 1.5 * MIN_GAIN])
-    apart_px = float(np.hypot(*np.ptp(clear, axis=0))) if len(clear) > 1 else 0.0
+    shift = shift if gain >= MIN_GAIN else np.zeros(2)
+    aligned = pair[0], _moved(pair[1], shift)
+    parts = [_tested_shift(*(rank[part] for rank in aligned)) for part in _quarters(first.shape)]
+    clear = np.array([np.zeros(2), *(part for part, part_gain in parts if part_gain > 1.5 * MIN_GAIN)])
+    apart_px = float(np.hypot(*np.ptp(clear, axis=0)))
     if apart_px > RIGID_PX:
         raise CalibrationError(
             f"between {first_name} and {second_name} parts of the picture move by {apart_px:.1f} px against each other",
             hint="a turn, a near object or a moving scene; take the bracket of a still scene from a tripod",
         )
-    return shift if gain >= MIN_GAIN else np.zeros(2)
+    return shift
 
 
 def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
@@ -294,14 +299,19 @@ def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] 
     return ranks[0], ranks[1]
 
 
+def _moved(picture: Any, shift: Array) -> Any:
+    """The picture with its content moved back by a shift (x, y); the border is repeated."""
+    return cv2.warpAffine(picture, np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32), picture.shape[::-1],
+                          flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+
+
 def _tested_shift(first: Any, second: Any) -> tuple[Array, float]:
     """Shift (x, y) by phase correlation and the share of the squared difference that it takes away."""
     size = (first.shape[1], first.shape[0])
     (dx, dy), _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow(size, cv2.CV_32F))
     margin = int(min(np.ceil(max(abs(dx), abs(dy))) + 1, min(first.shape) // 3))
     inner = (slice(margin, -margin), slice(margin, -margin))
-    moved = cv2.warpAffine(second, np.array([[1, 0, dx], [0, 1, dy]], np.float32), size,
-                           flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)  # fmt: skip
+    moved = _moved(second, np.array([dx, dy]))
     before = float(np.mean((first - second)[inner] ** 2))
     after = float(np.mean((first - moved)[inner] ** 2))
     return np.array([dx, dy]), 1.0 - after / before if before > 0 else 0.0
