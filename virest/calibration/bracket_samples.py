@@ -25,6 +25,7 @@ MAX_SHIFT_PX = 8.0
 MIN_GAIN = 0.2
 """A shift counts if it takes this share of the difference between two pictures away."""
 RIGID_PX = 1.5
+STEEPEST = 4 / 256
 CANDIDATES = 9000
 SITES = 900
 MIN_SITES = 40
@@ -286,16 +287,25 @@ def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
 
 
 def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] | None:
-    """Both pictures as ranks in [0, 1], held within what neither clips; None where that is next to nothing."""
+    """Both pictures as ranks in [0, 1], held within what neither clips; None where that is next to nothing.
+
+    Ranks spread the noise of a flat area over as much of [0, 1] as the area fills of the picture.  So ranks where a
+    grey level holds more than STEEPEST of the pixels are drawn together.
+    """
     shares = [np.cumsum(np.bincount(p.ravel(), minlength=256)) / p.size for p in (first, second)]
     low = max(share[min(int(np.searchsorted(share, 0.001)) + 4, 255)] for share in shares)
     high = min(share[max(int(np.searchsorted(share, 0.999)) - 6, 0)] for share in shares)
     if high - low < 0.05:
         return None
+    rank = np.linspace(low, high, 512)
+    # one function of rank for both: what lies beyond the limit of steepness in either picture counts less in both
+    crowd = np.max([np.diff(share, prepend=0.0)[np.searchsorted(share, rank).clip(0, 255)] for share in shares], axis=0)
+    value = np.cumsum(np.minimum(1.0, STEEPEST / np.maximum(crowd, 1e-9)))
+    value = (value - value[0]) / (value[-1] - value[0])
     ranks = []
     for picture, share in zip((first, second), shares, strict=True):
         middle = share - 0.5 * np.diff(share, prepend=0.0)
-        ranks.append(((np.clip(middle, low, high) - low) / (high - low)).astype(np.float32)[picture])
+        ranks.append(np.interp(middle, rank, value).astype(np.float32)[picture])
     return ranks[0], ranks[1]
 
 
