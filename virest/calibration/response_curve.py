@@ -136,7 +136,9 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     still = _still_rows(samples, first)
     samples = samples.take(still)
     verdict = _fit_kinds(kind, samples, first, np.ones(len(first.suspect), bool))
-    doubtful = verdict.final.suspect & ~verdict.established
+    # a picture that only the chosen kind finds wrong may as well show where the kind is
+    wrong_for_any = np.abs(first.correction_ev) > 0.5 * CONTRADICTS_EV
+    doubtful = verdict.final.suspect & ~(verdict.established & wrong_for_any)
     if doubtful.any():
         first = replace(first, suspect=first.suspect & ~doubtful)
         verdict = _fit_kinds(kind, samples, first, ~doubtful)
