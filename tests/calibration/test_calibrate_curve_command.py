@@ -48,7 +48,8 @@ def test_a_bracket_becomes_a_block_for_the_profile(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["response"]["kind"] == "five_segment"
-    assert {"rms_grey_levels", "covered_exposure", "pictures", "notes"} <= set(facts)
+    assert {"rms_grey_levels", "curve_std_grey_levels", "covered_exposure", "pictures", "notes"} <= set(facts)
+    assert 0.0 < facts["curve_std_grey_levels"] < 2.0
     assert [p["contradicts"] for p in facts["pictures"]] == [i == 2 for i in range(8)]
     assert facts["pictures"][2]["exposure_error_ev"] == pytest.approx(np.log2(1.5), abs=0.03)
     block = yaml.safe_load((tmp_path / "c.yaml").read_text())
@@ -66,6 +67,7 @@ def test_people_read_a_table(tmp_path: Path) -> None:
     done = virest("calibrate-curve", "bracket", "--exposures", table, "--kind", "srgb", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("srgb\n")
+    assert "\nthe curve is known to ± " in done.stdout
     assert len([line for line in done.stdout.splitlines() if line.startswith("0") and " no" in line]) == 8
     assert (tmp_path / "curve.yaml").is_file()
     assert done.stderr == ""

@@ -159,6 +159,67 @@ def test_a_plateau_below_white_is_seen_through_overshoot(rng: np.random.Generato
     assert curve_distance_levels(fit.curve, FIVE_LOW_TOP, fit.covered_exposure) < 0.8
 
 
+# ── what equal steps of exposure leave open ──────────────────────────────────────────────────────────────────────
+
+LIGHT = 1.2 * np.linspace(0, 1, 800) ** 3
+TONED = (LIGHT * (2.51 * LIGHT + 0.03) / (LIGHT * (2.43 * LIGHT + 0.59) + 0.14)) ** (1 / 2.2)
+FILM = ResponseCurve("table", x=tuple(LIGHT.tolist()), y=tuple(TONED.tolist()))
+
+
+@pytest.mark.parametrize(("count", "span_ev"), [(2, 3.0), (3, 6.0), (4, 5.4)])
+def test_few_pictures_far_apart_give_a_smooth_curve(count: int, span_ev: float, rng: np.random.Generator) -> None:
+    """With a function of the steps' period upon it the curve fits as well: where nothing holds it, it is smooth."""
+    fit = fit_response(make_bracket(FILM, rng, count=count, span_ev=span_ev))
+    assert fit.curve.kind == "table"
+    assert curve_distance_levels(fit.curve, FILM, fit.covered_exposure) < 2.5
+
+
+def test_the_curve_s_deviation_holds_the_error(rng: np.random.Generator) -> None:
+    """Errors lie within two and a half deviations; wide steps leave more open than close ones."""
+    for truth in (FILM, GAMMA, FIVE_LOW_TOP):
+        std = {}
+        for count, span_ev in ((2, 1.5), (4, 5.0), (9, 5.0)):
+            fit = fit_response(make_bracket(truth, rng, count=count, span_ev=span_ev))
+            error = curve_distance_levels(fit.curve, truth, fit.covered_exposure)
+            assert error < 2.5 * fit.curve_std_grey_levels
+            std[count] = fit.curve_std_grey_levels
+        assert std[9] < 0.8 * std[2]
+        assert std[9] < 1.0
+
+
+def test_a_curve_that_any_other_could_replace_is_refused(rng: np.random.Generator) -> None:
+    """Each step as wide as the curve's whole range: every place is seen black, once or twice grey, and white."""
+    narrow = ResponseCurve("five_segment", b=(0.3, 0.1), c=(0.7, 0.6), y_max=0.8)
+    with pytest.raises(CalibrationError, match="do not determine the curve"):
+        fit_response(make_bracket(narrow, rng, count=4, span_ev=6.5))
+    fit = fit_response(make_bracket(narrow, rng, count=14, span_ev=6.5))
+    assert curve_distance_levels(fit.curve, narrow, fit.covered_exposure) < 1.5
+
+
+def test_a_kind_asked_for_that_does_not_follow_is_no_certainty(rng: np.random.Generator) -> None:
+    """Its deviation holds its distance from the truth."""
+    fit = fit_response(make_bracket(GAMMA, rng), "linear")
+    assert curve_distance_levels(fit.curve, GAMMA, fit.covered_exposure) < 2.0 * fit.curve_std_grey_levels
+
+
+def test_a_trend_within_what_lists_are_believed_keeps_the_kind(rng: np.random.Generator) -> None:
+    """Flicker of a per cent has a trend by chance, which a power of the curve would take; a trend of more is one."""
+    for step, kind in ((0.004, "srgb"), (0.03, "table")):
+        bracket = [replace(p, exposure=p.exposure * float(np.exp(step * (i - 3.5))))
+                   for i, p in enumerate(make_bracket(SRGB, rng))]  # fmt: skip
+        assert fit_response(bracket).curve.kind == kind
+
+
+def test_exposures_of_which_half_are_wrong_are_said_to_disagree(rng: np.random.Generator) -> None:
+    """ISO doubled halfway and not listed: none stands out, so the list as a whole is doubted."""
+    bracket = [
+        replace(p, exposure=p.exposure * (2.0 if i > 3 else 1.0)) for i, p in enumerate(make_bracket(GAMMA, rng))
+    ]
+    fit = fit_response(bracket)
+    assert any("the listed exposures agree to" in note for note in fit.notes)
+    assert not any("agree to" in note for note in fit_response(make_bracket(GAMMA, rng)).notes)
+
+
 # ── misalignment ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -180,6 +241,17 @@ def test_small_shifts_are_found_and_corrected(rng: np.random.Generator) -> None:
     fit = fit_response(pictures)
     assert curve_distance_levels(fit.curve, SRGB, fit.covered_exposure) < 1.0
     assert any("aligned" in note for note in fit.notes)
+
+
+def test_shifts_of_a_few_flat_patches_are_found(rng: np.random.Generator) -> None:
+    """Most of the picture is flat, its noise fills most ranks: the edges count all the same."""
+    light = np.full((380, 480, 3), 0.18, np.float32)
+    for i in range(6):
+        y, x = 50 + 150 * (i // 3), 60 + 140 * (i % 3)
+        light[y : y + 100, x : x + 100] = 0.5**i
+    truth = [(0, 0), (2, -1), (3, 1), (-2, 4)]
+    pictures = shifted(cv2.GaussianBlur(light, (0, 0), 0.8), truth, rng)
+    np.testing.assert_allclose(align_pictures(pictures), truth, atol=0.5)
 
 
 def test_large_shifts_and_turns_are_refused(rng: np.random.Generator) -> None:

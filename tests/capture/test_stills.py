@@ -139,6 +139,35 @@ def test_faults_of_the_csv_are_named(tmp_path: Path, text: str, says: str) -> No
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_a_damaged_picture_is_refused_without_the_decoder_s_own_words(
+    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Cut short, and with one bit wrong in the middle of a PNG: the error, and nothing else on standard error."""
+    names = write_stills(tmp_path, 2, suffix)
+    table = tmp_path / "t.csv"
+    table.write_text("file,exposure_s\n" + "".join(f"{n},{i + 1}\n" for i, n in enumerate(names)))
+    whole = (tmp_path / names[0]).read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for data in [whole[: len(whole) // 2], bytes(flipped)][: 2 if suffix == ".png" else 1]:
+        (tmp_path / names[0]).write_bytes(data)
+        with pytest.raises(CaptureError, match=r"damaged|cannot be decoded"):
+            read_bracket(tmp_path, table)
+    assert capfd.readouterr().err == ""
+
+
+def test_hidden_files_are_no_pictures(tmp_path: Path) -> None:
+    """What a Mac leaves beside each picture bears its suffix."""
+    names = write_stills(tmp_path, 2)
+    (tmp_path / f"._{names[0]}").write_bytes(b"\0\5\x16\7")
+    table = tmp_path / "t.csv"
+    table.write_text("file,exposure_s\n" + "".join(f"{n},{i + 1}\n" for i, n in enumerate(names)))
+    stills, notes = read_bracket(tmp_path, table)
+    assert len(stills) == 2
+    assert notes == []
+
+
 def test_folders_that_are_no_bracket_are_refused(tmp_path: Path) -> None:
     """Missing, empty, no EXIF, damaged, of two sizes, and a CSV that is not there."""
     with pytest.raises(CaptureError, match="no such folder"):

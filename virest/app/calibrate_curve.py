@@ -81,6 +81,7 @@ def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, A
     return {
         "response": _rounded(response_block(fit.curve)),
         "rms_grey_levels": fit.rms_grey_levels,
+        "curve_std_grey_levels": fit.curve_std_grey_levels,
         "covered_exposure": list(fit.covered_exposure),
         "pictures": [
             {
@@ -119,6 +120,7 @@ def format_curve(facts: dict[str, Any]) -> str:
     lines = [
         "# Exposure characteristic curve by virest calibrate-curve; put the block into camera.yaml.",
         f"# fit error: {facts['rms_grey_levels']:.3f} grey levels rms; exposures covered: {low:.6g} to {high:.6g}",
+        f"# the curve is known to +- {facts['curve_std_grey_levels']:.3f} grey levels (standard deviation) there",
     ]
     for p in facts["pictures"]:
         error = "left out" if p["exposure_error_ev"] is None else f"{round(p['exposure_error_ev'], 3) + 0.0:+.3f} EV"
@@ -148,6 +150,7 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
     lines = [
         f"{name} {shape}".strip(),
         f"fit error {facts['rms_grey_levels']:.2f} grey levels rms, exposures {low:.4g} to {high:.4g} covered",
+        f"the curve is known to ± {facts['curve_std_grey_levels']:.2f} grey levels there",
         table(["picture", "exposure_s", "error_ev", "contradicts", "likely_s"], rows),
     ]
     lines += [f"note: {_one_line(note)}" for note in facts["notes"]]

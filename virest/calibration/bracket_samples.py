@@ -25,6 +25,7 @@ MAX_SHIFT_PX = 8.0
 MIN_GAIN = 0.2
 """A shift counts if it takes this share of the difference between two pictures away."""
 RIGID_PX = 1.5
+STEEPEST = 4 / 256
 CANDIDATES = 9000
 SITES = 900
 MIN_SITES = 40
@@ -259,20 +260,25 @@ def _small_green(levels: NDArray[Any], step: int) -> NDArray[Any]:
 
 
 def _shift_between(first: NDArray[Any], second: NDArray[Any], first_name: str, second_name: str) -> Array:
-    """Shift (x, y) of the second picture against the first, in their pixels; zero where there is nothing to see."""
+    """Shift (x, y) of the second picture against the first, in their pixels; zero where there is nothing to see.
+
+    A part moves by itself where a shift of its own explains much of what the common shift leaves there.
+    """
     pair = _common_ranks(first, second)
     if pair is None:
         return np.zeros(2)
     shift, gain = _tested_shift(*pair)
-    parts = [_tested_shift(*(rank[part] for rank in pair)) for part in _quarters(first.shape)]
-    clear = np.array([part for part, part_gain in parts if part_gain > 1.5 * MIN_GAIN])
-    apart_px = float(np.hypot(*np.ptp(clear, axis=0))) if len(clear) > 1 else 0.0
+    shift = shift if gain >= MIN_GAIN else np.zeros(2)
+    aligned = pair[0], _moved(pair[1], shift)
+    parts = [_tested_shift(*(rank[part] for rank in aligned)) for part in _quarters(first.shape)]
+    clear = np.array([np.zeros(2), *(part for part, part_gain in parts if part_gain > 1.5 * MIN_GAIN)])
+    apart_px = float(np.hypot(*np.ptp(clear, axis=0)))
     if apart_px > RIGID_PX:
         raise CalibrationError(
             f"between {first_name} and {second_name} parts of the picture move by {apart_px:.1f} px against each other",
             hint="a turn, a near object or a moving scene; take the bracket of a still scene from a tripod",
         )
-    return shift if gain >= MIN_GAIN else np.zeros(2)
+    return shift
 
 
 def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
@@ -281,17 +287,32 @@ def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
 
 
 def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] | None:
-    """Both pictures as ranks in [0, 1], held within what neither clips; None where that is next to nothing."""
+    """Both pictures as ranks in [0, 1], held within what neither clips; None where that is next to nothing.
+
+    Ranks spread the noise of a flat area over as much of [0, 1] as the area fills of the picture.  So ranks where a
+    grey level holds more than STEEPEST of the pixels are drawn together.
+    """
     shares = [np.cumsum(np.bincount(p.ravel(), minlength=256)) / p.size for p in (first, second)]
     low = max(share[min(int(np.searchsorted(share, 0.001)) + 4, 255)] for share in shares)
     high = min(share[max(int(np.searchsorted(share, 0.999)) - 6, 0)] for share in shares)
     if high - low < 0.05:
         return None
+    rank = np.linspace(low, high, 512)
+    # one function of rank for both: what lies beyond the limit of steepness in either picture counts less in both
+    crowd = np.max([np.diff(share, prepend=0.0)[np.searchsorted(share, rank).clip(0, 255)] for share in shares], axis=0)
+    value = np.cumsum(np.minimum(1.0, STEEPEST / np.maximum(crowd, 1e-9)))
+    value = (value - value[0]) / (value[-1] - value[0])
     ranks = []
     for picture, share in zip((first, second), shares, strict=True):
         middle = share - 0.5 * np.diff(share, prepend=0.0)
-        ranks.append(((np.clip(middle, low, high) - low) / (high - low)).astype(np.float32)[picture])
+        ranks.append(np.interp(middle, rank, value).astype(np.float32)[picture])
     return ranks[0], ranks[1]
+
+
+def _moved(picture: Any, shift: Array) -> Any:
+    """The picture with its content moved back by a shift (x, y); the border is repeated."""
+    return cv2.warpAffine(picture, np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32), picture.shape[::-1],
+                          flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
 
 
 def _tested_shift(first: Any, second: Any) -> tuple[Array, float]:
@@ -300,8 +321,7 @@ def _tested_shift(first: Any, second: Any) -> tuple[Array, float]:
     (dx, dy), _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow(size, cv2.CV_32F))
     margin = int(min(np.ceil(max(abs(dx), abs(dy))) + 1, min(first.shape) // 3))
     inner = (slice(margin, -margin), slice(margin, -margin))
-    moved = cv2.warpAffine(second, np.array([[1, 0, dx], [0, 1, dy]], np.float32), size,
-                           flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)  # fmt: skip
+    moved = _moved(second, np.array([dx, dy]))
     before = float(np.mean((first - second)[inner] ** 2))
     after = float(np.mean((first - moved)[inner] ** 2))
     return np.array([dx, dy]), 1.0 - after / before if before > 0 else 0.0

@@ -37,7 +37,9 @@ class Family:
     upper: Array
     build: Callable[[Array], ResponseCurve]
     smoothness: Callable[[Array], Array] | None = None
-    """What a fit adds to its residuals, so that parameters without data stay sane."""
+    """Changes of the curve's local exponent from knot to knot: what a fit holds small where the data say nothing."""
+    bends: bool = False
+    """Whether the parameters can raise the curve to a power, as a trend of the exposures' errors would."""
     others: tuple[Array, ...] = ()
     """Further parameters to begin with; the best after a few steps is followed."""
 
@@ -49,7 +51,7 @@ def make_family(kind: str, first: FirstCurve, low: float, high: float, top: floa
             slope = np.polyfit(np.log(first.grey[3:] / 255), first.log_light[3:], 1)[0]
             start = np.array([np.log(np.clip(slope, 0.3, 6.0))])
             bounds = np.log([[0.11], [9.0]])
-            return Family(kind, start, bounds[0], bounds[1], _gamma_curve)
+            return Family(kind, start, bounds[0], bounds[1], _gamma_curve, bends=True)
         case "five_segment":
             return _five_segment(first, high, top)
         case "table":
@@ -105,10 +107,10 @@ def _table(first: FirstCurve, low: float, high: float, top: float) -> Family:
     middle = 0.5 * (along[1:] + along[:-1])
 
     def smooth(p: Array) -> Array:
-        return 0.5 * np.diff(np.exp(p) / np.diff(along)) / np.diff(middle) * np.diff(along)[1:]
+        return np.diff(np.exp(p) / np.diff(along)) / np.diff(middle) * np.diff(along)[1:]
 
     bounds = np.full(TABLE_KNOTS - 1, 8.0)
-    return Family("table", start, -bounds, bounds, lambda p: table_curve(p, greys, top), smooth)
+    return Family("table", start, -bounds, bounds, lambda p: table_curve(p, greys, top), smooth, bends=True)
 
 
 def table_curve(p: Array, greys: Array, top: float) -> ResponseCurve:

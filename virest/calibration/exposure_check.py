@@ -23,7 +23,13 @@ from virest.calibration.bracket_samples import BracketSamples
 
 Array = NDArray[np.float64]
 KNOTS = 18
-SMOOTHNESS = 0.3
+SMOOTHNESS = 0.03
+"""Weight of the curve's roughness against all of the data.
+
+The noise of the greys draws g to stairs wherever the exposures leave it free, as with equal steps of exposure they
+leave every curve whose logarithm differs by a function with that period.  The draw grows with the number of samples, so
+the roughness must count in proportion to it.  Where exposures lie close, the data outweigh it by far.
+"""
 PASSES = 4
 CONTRADICTS_EV = 0.1
 MIN_PICTURES = 4
@@ -122,7 +128,7 @@ def _side_conditions(greys: Array, log_t: Array, known: Array) -> list[tuple[Arr
         row = np.zeros(knots + count)
         left, right = along[i] - along[i - 1], along[i + 1] - along[i]
         row[i - 1 : i + 2] = np.array([1 / left, -1 / left - 1 / right, 1 / right]) * 0.1
-        conditions.append((row, SMOOTHNESS * 1e-4))
+        conditions.append((row, SMOOTHNESS))
     return conditions
 
 

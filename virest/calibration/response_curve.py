@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 
 from virest.calibration.bracket_samples import MIN_SHARED, BracketPicture, BracketSamples, sample_bracket
+from virest.calibration.curve_certainty import CurvePosterior, curve_posterior
 from virest.calibration.curve_families import Family, LogLookup, log_lookup, make_family
 from virest.calibration.exposure_check import CONTRADICTS_EV, MIN_PICTURES, FirstCurve, fit_first_curve, outlying
 from virest.camera.response import KINDS, ResponseCurve
@@ -33,6 +34,8 @@ FREE_EV = 4.0
 MIN_RATIO = 2**0.25
 FEW_RATIO = 2**1.5
 STEP = 1e-4
+SMOOTH_WEIGHT = 5.0
+"""Of a table's roughness in the fit, against samples that count as if their errors were independent."""
 MOVED_LEVELS = 8.0
 MAX_MOVED = 0.2
 USUAL_MISSES = 3.0
@@ -44,6 +47,13 @@ Z_REJECTED = 3.0
 DISTINCT_LEVELS = 0.25
 """Smaller systematic differences between two kinds are left to rounding and compression."""
 STRUCTURE_LEVELS = 0.3
+ESTABLISHED_Z = 3.0
+SCATTER_EV = 0.06
+"""Three times what a listed exposure is believed to deviate by."""
+OPEN_LEVELS = 2.0
+"""A curve that the data hold no better is said to be held loosely."""
+UNDETERMINED_LEVELS = 25.0
+"""A tenth of the greys: no measurement of a curve."""
 LN2 = float(np.log(2.0))
 
 
@@ -86,6 +96,9 @@ class CurveFit:
     curve: ResponseCurve
     rms_grey_levels: float
     """Of the samples' residuals (means over small squares), outliers left out."""
+    curve_std_grey_levels: float
+    """Standard deviation of the curve over the exposures covered, rms: what the data leave open among smooth curves of
+    any kind (``curve_certainty``), and what this kind is seen not to follow."""
     covered_exposure: tuple[float, float]
     """Exposures on the curve's axis between which there are data."""
     pictures: tuple[PictureFit, ...]
@@ -122,12 +135,65 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     first = fit_first_curve(samples)
     still = _still_rows(samples, first)
     samples = samples.take(still)
+    verdict = _fit_kinds(kind, samples, first, np.ones(len(first.suspect), bool))
+    # a picture that only the chosen kind finds wrong may as well show where the kind is
+    wrong_for_any = np.abs(first.correction_ev) > 0.5 * CONTRADICTS_EV
+    doubtful = verdict.final.suspect & ~(verdict.established & wrong_for_any)
+    if doubtful.any():
+        first = replace(first, suspect=first.suspect & ~doubtful)
+        verdict = _fit_kinds(kind, samples, first, ~doubtful)
+    _require_determined(verdict)
+    return _result(pictures, seen, verdict, samples, [*notes, *_criticise(verdict, samples)])
+
+
+@dataclass(frozen=True, slots=True)
+class _Verdict:
+    """The kinds that were fitted, and the one that was chosen."""
+
+    trials: dict[str, _Trial]
+    chosen: str
+    final: _Trial
+    """The chosen kind, fitted to all samples."""
+    posterior: CurvePosterior
+    """Of the table: what the data alone leave open."""
+    structure_levels: float
+    """What residuals at one grey share."""
+    misfit_levels: float
+    """The same; where a kind was asked for, at least its distance from the table."""
+    scatter_ev: float
+    """Of the believed exposures about the table."""
+
+    @property
+    def std_levels(self) -> float:
+        """The curve's deviation: what the data leave open, and what the kind is seen not to follow."""
+        return float(np.hypot(self.posterior.rms_levels, self.misfit_levels))
+
+    @property
+    def established(self) -> NDArray[np.bool_]:
+        """(pictures,): whether a wrong exposure is told from another curve, by what a table leaves open."""
+        return np.abs(self.final.correction_ev) > ESTABLISHED_Z * self.posterior.exposure_std_ev
+
+
+def _fit_kinds(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: NDArray[np.bool_]) -> _Verdict:
+    """Fit the kinds, choose one, and judge how far the data hold it."""
     odd = samples.site % 2 == 1
     trials = _try_kinds(kind, samples.take(~odd), samples.take(odd), first)
     chosen = kind if kind != "auto" else choose_kind(trials)
-    final = _refine(trials[chosen], samples)
-    notes += _criticise(chosen, trials, final, samples)
-    return _result(pictures, seen, final, trials, samples, notes)
+    final = _refine(trials[chosen], samples, may_be_wrong)
+    table = replace(trials["table"], suspect=final.suspect)
+    left = _residual(log_lookup(final.curve), samples, final.correction_ev)
+    use = samples.measured & (np.abs(left) < 6.0 * max(_rms(left[samples.measured]), 0.3))
+    misfit = structure = residual_structure(samples.grey[use], left[use])
+    if kind not in ("auto", "table"):
+        misfit = max(misfit, curve_distance_levels(table.curve, final.curve, (table.curve.x[1], 1.0)))
+    scatter_ev = _scatter_ev(table)
+    return _Verdict(trials, chosen, final, _posterior(table, samples, scatter_ev), structure, misfit, scatter_ev)
+
+
+def _scatter_ev(trial: _Trial) -> float:
+    """Standard deviation of the believed corrections; two numbers are taken off them, level and trend."""
+    believed = trial.correction_ev[~trial.suspect]
+    return float(np.sqrt((believed**2).sum() / max(len(believed) - 2, 1)))
 
 
 # ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -163,6 +229,17 @@ def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> N
         text = f"the usable greys of {pictures[lost[0]].file} do not overlap with those of {pictures[numbers[0]].file}"
         raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, at most 3 EV apart")
     return seen
+
+
+def _require_determined(verdict: _Verdict) -> None:
+    """Raises CalibrationError where a kind with free parameters is chosen among curves that the data do not tell apart.
+
+    A kind without any is another matter: it says before all measurement what every picture must show.
+    """
+    open_levels = verdict.posterior.rms_levels
+    if len(verdict.final.parameters) and open_levels > UNDETERMINED_LEVELS:
+        text = f"the pictures do not determine the curve: it could differ by {open_levels:.0f} grey levels rms"
+        raise CalibrationError(text, hint="take more exposures, closer together, of a scene with many brightnesses")
 
 
 def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]:
@@ -228,6 +305,16 @@ class _Trial:
     """(held-out samples,) capped sum of squared normalised residuals."""
     site: NDArray[np.int64]
     held_out_rms: float
+    trend_row: Array
+    """(pictures,) unit pattern of a trend over log exposure."""
+
+    @property
+    def bent(self) -> bool:
+        """Whether the believed exposures need a trend, as they do where the curve wants another power."""
+        believed = self.correction_ev[~self.suspect]
+        trend = float(self.trend_row[~self.suspect] @ believed) ** 2
+        scatter = max(float(believed @ believed) - trend, 0.0) / max(len(believed) - 2, 1)
+        return trend > Z_REJECTED**2 * max(scatter, TRUSTED_EV**2)
 
 
 def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDArray[np.bool_],
@@ -235,7 +322,7 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
     """(curve parameters, corrections in EV) of least cost, the sizes of the residuals held down (soft L1)."""
     shape = len(family.start)
     belief = np.where(suspect, FREE_EV, TRUSTED_EV)
-    rows = _trend_rows(samples.exposure, suspect)
+    rows = _trend_rows(samples.exposure, suspect)[: 1 + family.bends]
     no_trend = np.eye(len(suspect)) - rows.T @ rows
 
     def miss(q: Array) -> Array:
@@ -243,7 +330,7 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
         correction = no_trend @ q[shape:]
         parts = [(_residual(lookup, samples, correction) / samples.sigma).ravel() / 2.0, q[shape:] / belief]
         if family.smoothness:
-            parts.append(family.smoothness(q[:shape]))
+            parts.append(SMOOTH_WEIGHT * family.smoothness(q[:shape]))
         return np.concatenate(parts)
 
     def jacobian(q: Array) -> Array:
@@ -264,7 +351,8 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
 def _trend_rows(exposure: Array, suspect: NDArray[np.bool_]) -> Array:
     """(2, pictures), orthonormal: level and trend over log exposure of the corrections of believed pictures.
 
-    Both are forbidden: a level is a unit of light, a trend would be a power of the curve in disguise.
+    A level is a unit of light and forbidden.  So is a trend where the curve has a power of its own, for it would be
+    that in disguise; where it has none, the belief in the listed exposures holds the trend.
     """
     believed = (~suspect).astype(float)
     level = believed / np.sqrt(believed.sum())
@@ -300,7 +388,8 @@ def _judge(
     curve = family.build(parameters)
     left = _residual(log_lookup(curve), held, correction_ev)
     score = np.minimum((left / held.sigma) ** 2, SCORE_CAP).sum(axis=1)
-    return _Trial(family, curve, parameters, correction_ev, suspect, score, held.site, _capped_rms(left[held.measured]))
+    rms, trend_row = _capped_rms(left[held.measured]), _trend_rows(held.exposure, suspect)[1]
+    return _Trial(family, curve, parameters, correction_ev, suspect, score, held.site, rms, trend_row)
 
 
 def _rms(residual: Array) -> float:
@@ -318,9 +407,13 @@ def _capped_rms(residual: Array) -> float:
 
 
 def choose_kind(trials: dict[str, _Trial]) -> str:
-    """The first (simplest) kind that no other predicts the held-out places significantly better than."""
+    """The simplest kind that needs no trend of the exposures, and is not significantly worse at held-out places."""
     for name in KINDS:
-        if name in trials and not any(_beaten(trials[name], other) for n, other in trials.items() if n != name):
+        if (
+            name in trials
+            and not trials[name].bent
+            and not any(_beaten(trials[name], other) for n, other in trials.items() if n != name)
+        ):
             return name
     return "table"
 
@@ -334,19 +427,32 @@ def _beaten(one: _Trial, other: _Trial) -> bool:
     return bool(gain.mean() > Z_REJECTED * gain.std() / np.sqrt(len(gain)))
 
 
-def _refine(trial: _Trial, samples: BracketSamples) -> _Trial:
-    """Fit again with all samples; a picture whose correction now stands out is set free too."""
+def _refine(trial: _Trial, samples: BracketSamples, may_be_wrong: NDArray[np.bool_]) -> _Trial:
+    """Fit again with all samples; a picture whose correction now stands out is set free too, where it may be."""
     start = np.concatenate([trial.parameters, trial.correction_ev])
     suspect = trial.suspect
     for _ in range(2):
         parameters, correction = _optimise(trial.family, start, samples, suspect, 10)
-        wide = suspect | (outlying(correction) & (np.abs(correction) > 0.6 * CONTRADICTS_EV))
+        wide = suspect | (outlying(correction) & (np.abs(correction) > 0.6 * CONTRADICTS_EV) & may_be_wrong)
         start = np.concatenate([parameters, correction])
         if (wide == suspect).all():
             break
         suspect = wide
     suspect = suspect & (np.abs(correction - np.median(correction)) > CONTRADICTS_EV)
     return _judge(trial.family, parameters, correction, suspect, samples)
+
+
+def _posterior(trial: _Trial, samples: BracketSamples, scatter_ev: float) -> CurvePosterior:
+    """What the samples leave open of a fit; exposures are believed no better than they agree."""
+
+    def residual(curve: ResponseCurve, correction_ev: Array) -> Array:
+        return _residual(log_lookup(curve), samples, correction_ev)
+
+    left = residual(trial.curve, trial.correction_ev)
+    used = samples.measured & (np.abs(left) < 6.0 * np.maximum(samples.sigma, _rms(left[samples.measured])))
+    belief = np.where(trial.suspect, FREE_EV, max(TRUSTED_EV, scatter_ev))
+    return curve_posterior(trial.family, trial.parameters, trial.correction_ev, residual, samples.sigma, samples.grey,
+                           used, belief)  # fmt: skip
 
 
 # ── what the fit says of itself ──────────────────────────────────────────────────────────────────────────────────
@@ -363,12 +469,9 @@ def residual_structure(grey: Array, residual: Array, bins: int = 16) -> float:
     return float(np.sqrt(max(float(excess.mean()), 0.0))) if good.any() else 0.0
 
 
-def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: BracketSamples) -> list[str]:
+def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
     notes = []
-    left = _residual(log_lookup(final.curve), samples, final.correction_ev)
-    limit = 6.0 * max(_rms(left[samples.measured]), 0.3)
-    use = samples.measured & (np.abs(left) < limit)
-    structure = residual_structure(samples.grey[use], left[use])
+    chosen, trials, final, structure = verdict.chosen, verdict.trials, verdict.final, verdict.structure_levels
     tabulated = trials["table"]
     if chosen != "table" and _beaten(trials[chosen], tabulated):
         before = trials[chosen].held_out_rms
@@ -384,11 +487,22 @@ def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: B
         five = trials["five_segment"].held_out_rms
         table = tabulated.held_out_rms
         notes.append(f"no simpler kind follows: held-out rms {five:.2f} with five_segment, {table:.2f} with table")
+    if verdict.scatter_ev > SCATTER_EV:
+        notes.append(
+            f"the listed exposures agree to {verdict.scatter_ev:.2f} EV only: flicker, or several are wrong "
+            "(is ISO counted?) and too few right to tell which"
+        )
     if len(samples.exposure) < MIN_PICTURES:
         notes.append(f"{len(samples.exposure)} pictures are too few to find wrong exposures")
     if samples.exposure.max() / samples.exposure.min() < FEW_RATIO:
         span = np.log2(samples.exposure.max() / samples.exposure.min())
         notes.append(f"exposures span only {span:.1f} EV: the curve is weakly determined")
+    open_levels = verdict.posterior.rms_levels
+    if open_levels > OPEN_LEVELS:
+        notes.append(
+            f"the pictures hold the curve to {open_levels:.1f} grey levels rms only"
+            f"{', the rest is the kind' * (chosen != 'table')}: more exposures, closer together, hold it better"
+        )
     if (final.curve.encode(np.array([1.0])) * 255)[0] - samples.top > 25:
         notes.append(f"no grey above {samples.top:.0f} was seen: the curve is extrapolated there")
     return notes
@@ -397,11 +511,11 @@ def _criticise(chosen: str, trials: dict[str, _Trial], final: _Trial, samples: B
 def _result(
     pictures: Sequence[BracketPicture],
     seen: NDArray[np.bool_],
-    final: _Trial,
-    trials: dict[str, _Trial],
+    verdict: _Verdict,
     samples: BracketSamples,
     notes: list[str],
 ) -> CurveFit:
+    final = verdict.final
     log_t = np.log(samples.exposure) + LN2 * final.correction_ev
     lookup = log_lookup(final.curve)
     left = _residual(lookup, samples, final.correction_ev)
@@ -411,19 +525,20 @@ def _result(
     scale = float(np.exp(ends[1])) if final.family.kind in ("five_segment", "table") else 1.0
     cloud = DataCloud(np.exp(log_light[use]) / scale, samples.grey[use], left[use], np.nonzero(use)[1])
     verdicts = _verdicts(pictures, seen, final)
-    for verdict in verdicts:
-        if verdict.contradicts:
+    for picture in verdicts:
+        if picture.contradicts:
             notes.append(
-                f"{verdict.file}: its listed exposure {verdict.exposure:.6g} contradicts the others by "
-                f"{verdict.exposure_error_ev:+.2f} EV; likely {verdict.likely_exposure:.6g}"
+                f"{picture.file}: its listed exposure {picture.exposure:.6g} contradicts the others by "
+                f"{picture.exposure_error_ev:+.2f} EV; likely {picture.likely_exposure:.6g}"
             )
     return CurveFit(
         scale_exposure(final.curve, scale),
         _rms(left[use]),
+        verdict.std_levels,
         (float(np.exp(ends[0]) / scale), float(np.exp(ends[1]) / scale)),
         verdicts,
         tuple(notes),
-        {name: trial.held_out_rms for name, trial in trials.items()},
+        {name: trial.held_out_rms for name, trial in verdict.trials.items()},
         cloud,
     )
 

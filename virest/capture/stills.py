@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ MAX_STILL_BYTES = 400 << 20
 MAX_SAMPLED_PX = 4_000_000
 """Larger pictures are reduced by a whole factor, by means over squares."""
 MAX_CSV_LINE = 4096
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IFD_ENTRIES = 512
 EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO = 0x8769, 0x829A, 0x829D, 0x8827
 MAX_GROUPS = 12
@@ -77,7 +79,7 @@ def read_bracket(folder: Path, exposures_csv: Path | None = None) -> tuple[list[
     if not folder.is_dir():
         reason = "is no folder" if folder.exists() else "no such folder"
         raise CaptureError(f"{folder}: {reason}", hint="pass a folder of bracketed pictures, or a capture")
-    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
+    names = sorted(p.name for p in folder.iterdir() if _is_picture(p))
     if not names:
         raise CaptureError(f"{folder}: holds no PNG, JPEG or TIFF", hint="pass a folder of bracketed pictures")
     notes: list[str] = []
@@ -86,13 +88,19 @@ def read_bracket(folder: Path, exposures_csv: Path | None = None) -> tuple[list[
         listed = read_exposures(exposures_csv, names)
         spare = [name for name in names if name not in listed]
         if spare:
-            notes.append(f"{len(spare)} pictures are not in {exposures_csv.name} and left out ({_some(spare)})")
+            count = f"{len(spare)} picture{'s are' if len(spare) > 1 else ' is'}"
+            notes.append(f"{count} not in {exposures_csv.name} and left out ({_some(spare)})")
         names = [name for name in names if name in listed]
     if len(names) > MAX_STILLS:
         raise CaptureError(f"{folder}: {len(names)} pictures, at most {MAX_STILLS}", hint="list fewer in a CSV")
     stills = [_read_still(folder / name, listed[name] if listed else None) for name in names]
     _require_one_size(stills)
     return _relative_gains(stills, notes), notes
+
+
+def _is_picture(path: Path) -> bool:
+    """By its name; hidden files, such as what a Mac leaves beside each picture, are none."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def _some(names: list[str]) -> str:
@@ -180,11 +188,16 @@ def _read_still(path: Path, exposure_s: float | None) -> Still:
 
 
 def _decode(data: bytes, path: Path) -> NDArray[Any]:
+    if data[:8] == PNG_SIGNATURE and not _whole_png(data):
+        raise CaptureError(f"{label(path)}: is cut short or damaged ({len(data)} bytes)", hint="copy the picture again")
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error:
         picture = None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if picture is None or picture.dtype not in (np.uint8, np.uint16):
         raise CaptureError(f"{label(path)}: cannot be decoded ({len(data)} bytes)", hint="copy the picture again")
     levels = picture[..., ::-1] if picture.dtype == np.uint8 else (picture[..., ::-1] / np.float32(257)).astype("f4")
@@ -234,11 +247,24 @@ def read_exif_exposure(data: bytes) -> ExifExposure:
 def _exif_block(data: bytes) -> bytes | None:
     if data[:4] in (b"II*\0", b"MM\0*"):
         return data
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
+    if data[:8] == PNG_SIGNATURE:
         return next((body for kind, body in _png_chunks(data) if kind == b"eXIf"), None)
     if data[:2] == b"\xff\xd8":
         return next((body[6:] for kind, body in _jpeg_segments(data) if kind == 0xE1 and body[:6] == b"Exif\0\0"), None)
     return None
+
+
+def _whole_png(data: bytes) -> bool:
+    """Whether all chunks up to the end's are there and unharmed: the decoder prints its own complaint of others."""
+    at = 8
+    while at + 12 <= len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        if data[at + 8 + size : at + 12 + size] != zlib.crc32(data[at + 4 : at + 8 + size]).to_bytes(4, "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at += 12 + size
+    return False
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:

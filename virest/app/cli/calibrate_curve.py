@@ -37,6 +37,7 @@ def calibrate_curve(
     $ virest calibrate-curve bracket --exposures bracket/exposures.csv --plot curve.png
     gamma 2.1998
     fit error 0.47 grey levels rms, exposures 0.0009 to 0.92 covered
+    the curve is known to ± 0.24 grey levels there
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     one_thread_each()
