@@ -44,6 +44,8 @@ class FrameTranslation:
     """Where the depth is from: ``triangulated``, ``profile`` or ``none``."""
     relief: Relief | None = None
     """What stands out of the plane, at the reference time; None: nothing is known to."""
+    in_metres: bool = True
+    """False: only velocity over depth is known; lengths are in a common unit that no log may call metres."""
 
     def position_m(self, since_reference_s: Array) -> Array:
         """Centre (..., 3) at times (...) from the reference."""

@@ -3,7 +3,8 @@
 A capture is cut into stretches, each with its own gravity, accelerometer bias and delay; a stretch into windows of a
 few seconds, each with its own velocity and plane.  Within a window the velocity at any instant follows from the
 accelerometer.  Scale comes from accelerations only: whether the motion determines it is judged window by window, and
-a window that fails gives its reason instead of a velocity.
+a window that fails gives its reason instead of a velocity.  What a picture shows is velocity over depth, which needs no
+scale: it is judged for itself, and serves to restore where metres are not known.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ MIN_PAIRS = 8
 MIN_POINTS = 200
 START_INVERSE_DEPTH_PER_M = 0.5
 MAX_RELATIVE_STD = 0.1
-"""Of the scale, and of the velocity over its rms within a window; beyond it rotation alone does as well."""
+"""Of the scale, and of the velocity over its rms within a window; beyond it no metres are said."""
+MAX_FLOW_STD = 0.5
+"""Of velocity over depth, part of its rms: rotation alone errs by all of it, so up to here most of it is undone."""
 MIN_PARALLAX = 1.15
 """Rotation alone must leave this many times what is left with translation."""
 MAX_LEFT = 0.15
@@ -78,9 +81,18 @@ class Window:
     residual: float
     """Robust standard deviation of what is left, in units of the tracking noise."""
     reason: str
-    """Why the window's velocity is not to be used; empty: it is."""
+    """Why the window's velocity is not known in metres; empty: it is."""
     spread: float = 0.0
     """Standard deviation of inverse depths about the plane, part of the plane's."""
+    flow_std: float = 0.0
+    """rms standard deviation of velocity over depth, part of its rms."""
+    over_depth: bool = False
+    """Whether velocity over depth is known although metres are not."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether pictures may be restored by the window's velocity and plane."""
+        return not self.reason or self.over_depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +141,13 @@ class Stretch:
 
     def velocity(self, window: int, time_s: Array) -> tuple[Array, Array]:
         """Velocity (n, 3) of the camera's centre in world axes and its covariance (n, 3, 3), IMU clock (n,)."""
+        velocity, slope = self._velocity(window, time_s)
+        chosen = [*range(7), *range(7 + 6 * window, 10 + 6 * window)]
+        covariance = slope @ self.scene_covariance[np.ix_(chosen, chosen)] @ np.swapaxes(slope, -1, -2)
+        return velocity, covariance + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
+
+    def _velocity(self, window: int, time_s: Array) -> tuple[Array, Array]:
+        """Velocity (n, 3) and its change (n, 3, 10) per gravity, bias, delay and the window's own velocity."""
         moves, scene, origin = self.fit.ground.displacement, self.scene, np.array([self.origin_s(window)])
         assert moves is not None
         since = (time_s - origin)[:, None]
@@ -141,9 +160,22 @@ class Stretch:
         velocity = velocity + self._arm_velocity(time_s)
         each = np.broadcast_to(np.eye(3), (len(time_s), 3, 3))
         slope = np.concatenate([each * since[..., None], -per_bias, per_delay[..., None], each], axis=-1)
-        chosen = [*range(7), *range(7 + 6 * window, 10 + 6 * window)]
+        return velocity, slope
+
+    def flow(self, window: int, time_s: Array) -> tuple[Array, Array]:
+        """Velocity over depth (n, 3) on the optical axis, 1/s, world axes, and its covariance (n, 3, 3).
+
+        A common scale of velocity and depth cancels, however little is known of it.
+        """
+        velocity, slope = self._velocity(window, time_s)
+        axis = self.fit.ground.trajectory.orientation(time_s)[..., 2]
+        plane = self.scene.plane_per_m[window]
+        nearness = np.maximum(axis @ plane, 1e-6)[:, None]
+        slope = np.concatenate([nearness[..., None] * slope, velocity[:, :, None] * axis[:, None, :]], axis=-1)
+        chosen = [*range(7), *range(7 + 6 * window, 13 + 6 * window)]
         covariance = slope @ self.scene_covariance[np.ix_(chosen, chosen)] @ np.swapaxes(slope, -1, -2)
-        return velocity, covariance + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
+        floor = (self.velocity_floor_m_s[window] * nearness[..., None]) ** 2 * np.eye(3)
+        return nearness * velocity, covariance + floor
 
     def _arm_velocity(self, time_s: Array) -> Array:
         """What the IMU's distance from the camera adds: −R (ω × p_cam_imu)."""
@@ -209,6 +241,8 @@ class FrameMotion:
     acceleration_m_s2: Array
     """(3,) mean over the frame, without gravity."""
     depth: FrameDepth
+    unscaled: str = ""
+    """Why only velocity over depth is known, not metres; empty: metres are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,23 +261,26 @@ class VisualInertialAlignment:
     @property
     def trusted(self) -> bool:
         """Whether any window's velocity may be used."""
-        return any(not window.reason for window in self.windows)
+        return any(window.usable for window in self.windows)
 
     @property
     def refused(self) -> str:
         """Why not all windows may be used, the commonest reason first; empty if all may."""
         if self.reason:
             return self.reason
-        reasons = [window.reason for window in self.windows if window.reason]
+        reasons = [window.reason for window in self.windows if not window.usable]
         return max(reasons, key=reasons.count) if reasons else ""
 
-    def find(self, camera_time_s: float) -> tuple[Stretch, int] | str:
-        """The window that an instant (camera clock) belongs to, or why there is none."""
+    def find(self, camera_time_s: float, *, over_depth: bool = False) -> tuple[Stretch, int] | str:
+        """The window that an instant (camera clock) belongs to, or why there is none.
+
+        over_depth: windows that know velocity over depth only will do.
+        """
         at = [(s, k, _distance(w, camera_time_s), w) for s in self.stretches for k, w in enumerate(s.windows)]
         near = [entry for entry in at if entry[2] <= NEAR_WINDOW_S]
         if not near:
             return self.reason or "no tracked points about this frame"
-        good = [entry for entry in near if not entry[3].reason]
+        good = [entry for entry in near if not entry[3].reason or (over_depth and entry[3].over_depth)]
         if not good or min(entry[2] for entry in good) > min(entry[2] for entry in near) + 0.5 * NEAR_WINDOW_S:
             return min(near, key=lambda entry: entry[2])[3].reason
         stretch, window, _, _ = min(good, key=lambda entry: entry[2])
@@ -251,7 +288,9 @@ class VisualInertialAlignment:
 
     def frame(self, reference_s: float, start_s: float, end_s: float) -> FrameMotion | str:
         """Motion over a frame that is taken from start_s to end_s, camera clock; or why it is not known."""
-        found = self.find(0.5 * (start_s + end_s))
+        found, unscaled = self.find(0.5 * (start_s + end_s)), ""
+        if isinstance(found, str):
+            found, unscaled = self.find(0.5 * (start_s + end_s), over_depth=True), found
         if isinstance(found, str):
             return found
         stretch, window = found
@@ -262,11 +301,11 @@ class VisualInertialAlignment:
         std = np.sqrt(np.diag(rotation.T @ covariance[0] @ rotation))
         acceleration = (velocity[2] - velocity[1]) / (time_s[2] - time_s[1])
         depth = stretch.depth(window, float(time_s[0]))
-        return FrameMotion(velocity[0] @ rotation, std, acceleration @ rotation, depth)
+        return FrameMotion(velocity[0] @ rotation, std, acceleration @ rotation, depth, unscaled)
 
     def clock(self) -> tuple[float, float] | None:
         """Time offset and its standard deviation over the trusted stretches; None: there are none."""
-        found = [s for s in self.stretches if any(not w.reason for w in s.windows)]
+        found = [s for s in self.stretches if any(w.usable for w in s.windows)]
         if not found:
             return None
         offset = np.array([s.fit.profile.time_offset_s or 0.0 for s in found])
@@ -276,7 +315,7 @@ class VisualInertialAlignment:
 
     def gyro_bias(self) -> tuple[Array, Array] | None:
         """Gyroscope bias (3,) and its standard deviations over the trusted stretches."""
-        found = [s for s in self.stretches if any(not w.reason for w in s.windows)]
+        found = [s for s in self.stretches if any(w.usable for w in s.windows)]
         if not found:
             return None
         values = np.array([s.fit.profile.gyro_bias_rad_s for s in found])
@@ -409,7 +448,7 @@ def _fit_stretch(
 
 def _relief(stretch: Stretch, sights: Sights, window: int) -> WindowRelief | None:
     """What stands out of a window's planes, if it tells held-out points better."""
-    if stretch.windows[window].reason:
+    if not stretch.windows[window].usable:
         return None
     grid = picture_grid(stretch.fit.ground.lens, stretch.origin_s(window))
 
@@ -460,6 +499,8 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
     part = slice(10 + 6 * window, 13 + 6 * window)
     inverse = max(float(stretch.scene.plane_per_m[window] @ axis), 1e-6)
     scale_std = float(np.sqrt(axis @ stretch.scene_covariance[part, part] @ axis)) / inverse
+    flow, flow_covariance = stretch.flow(window, times)
+    flow_std = np.sqrt(np.trace(flow_covariance, axis1=-2, axis2=-1).mean() / max((flow**2).sum(axis=-1).mean(), 1e-12))
     left, before = _left(fit, mine), _left(still, mine)
     found = Window(
         start_s,
@@ -470,9 +511,13 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
         left,
         "",
         fit.depth_spread_per_m / inverse,
+        float(flow_std),
     )
     gravity = float(np.linalg.norm(stretch.scene.gravity_m_s2))
-    return replace(found, reason=_reason(found, gravity, before))
+    reason = _no_parallax(found) or _no_fit(found, gravity, before)
+    if reason:
+        return replace(found, reason=reason)
+    return replace(found, reason=_no_metres(found), over_depth=found.flow_std < MAX_FLOW_STD)
 
 
 def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
@@ -480,26 +525,31 @@ def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
     return float(np.median(fit.distance[mine])) / RAYLEIGH_MEDIAN
 
 
-def _reason(found: Window, gravity_m_s2: float, before: float) -> str:
+def _no_parallax(found: Window) -> str:
     if found.parallax < MIN_PARALLAX:
         return f"no parallax to speak of: rotation alone leaves {found.parallax:.2f} times what translation does"
+    return ""
+
+
+def _no_fit(found: Window, gravity_m_s2: float, before: float) -> str:
     unexplained = max(found.residual**2 - 1, 0.0) / max(before**2 - 1, 1e-6)
     if unexplained > MAX_LEFT or abs(gravity_m_s2 - GRAVITY_M_S2) > GRAVITY_TOLERANCE_M_S2:
         return (
             f"the accelerometer does not fit the pictures: {unexplained:.0%} of the parallax unexplained, "
             f"gravity {gravity_m_s2:.2f} m/s²"
         )
-    if found.scale_std > MAX_RELATIVE_STD:
-        return f"scale undetermined: ± {min(found.scale_std, 1):.0%}{' or more' if found.scale_std > 1 else ''}"
-    if found.velocity_std > MAX_RELATIVE_STD:
-        return (
-            f"velocity undetermined: ± {min(found.velocity_std, 1):.0%}{' or more' if found.velocity_std > 1 else ''}"
-        )
+    return ""
+
+
+def _no_metres(found: Window) -> str:
+    for name, std in (("scale", found.scale_std), ("velocity", found.velocity_std)):
+        if std > MAX_RELATIVE_STD:
+            return f"{name} undetermined: ± {min(std, 1):.0%}{' or more' if std > 1 else ''}"
     return ""
 
 
 def _with_a_surface(window: Window, relief: WindowRelief | None) -> Window:
     """Depths that spread too far for a plane need a surface."""
-    if window.reason or relief is not None or window.spread <= MAX_SPREAD:
+    if not window.usable or relief is not None or window.spread <= MAX_SPREAD:
         return window
-    return replace(window, reason=f"no common plane: inverse depths spread by {window.spread:.0%}")
+    return replace(window, reason=f"no common plane: inverse depths spread by {window.spread:.0%}", over_depth=False)

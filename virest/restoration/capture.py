@@ -255,10 +255,15 @@ def _with_translations(plan: RestorationPlan, capture: Capture, alignment: Visua
     if open_frames:
         reason = max(map(str, open_frames), key=[str(motion) for motion in open_frames].count)
         warnings = (*warnings, f"{NOT_ESTIMATED} in {len(open_frames)} of {len(motions)} frames ({reason})")
+    unscaled = [motion.unscaled for motion in known.values() if motion.unscaled]
+    if unscaled:
+        reason = max(unscaled, key=unscaled.count)
+        said = f"travel known over depth, not in metres, in {len(unscaled)} of {len(motions)} frames ({reason})"
+        warnings = (*warnings, said)
     translations = {index: _translation(motion, profile.depth_m) for index, motion in known.items()}
-    return replace(
-        plan, warnings=warnings, notes=(*plan.notes, _account(list(known.values()))), translations=translations
-    )
+    scaled = [motion for motion in known.values() if not motion.unscaled]
+    notes = (*plan.notes, _account(scaled)) if scaled else plan.notes
+    return replace(plan, warnings=warnings, notes=notes, translations=translations)
 
 
 def _without_translation(plan: RestorationPlan, reason: str) -> RestorationPlan:
@@ -279,13 +284,15 @@ def _motion(
 def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTranslation:
     """A stated depth is the one logged; the plane is then tilted as the pictures say, at that depth."""
     depth = motion.depth
+    found_m = None if motion.unscaled else depth.depth_m
     return FrameTranslation(
         motion.velocity_m_s,
         motion.acceleration_m_s2,
         depth.plane_per_m,
-        depth.depth_m if stated_depth_m is None else stated_depth_m,
+        found_m if stated_depth_m is None else stated_depth_m,
         "triangulated" if stated_depth_m is None else "profile",
         depth.relief,
+        not motion.unscaled,
     )
 
 

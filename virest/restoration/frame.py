@@ -125,6 +125,8 @@ def _limits(motion: RowMotion) -> tuple[str, ...]:
         return ("camera translation not known: rotation only",)
     if not np.any(motion.translation.inverse_depth_plane):
         return ("depth not known: rotation only",)
+    if not motion.translation.in_metres:
+        return ("travel known over depth, not in metres",)
     return ()
 
 
@@ -135,7 +137,7 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: 
     centre = np.array([[(width - 1) / 2, (height - 1) / 2]])
     row_start_s = float(motion.row_start_s(centre)[0])
     r_end_start, t_end_start = motion.relative_pose(row_start_s, row_start_s + motion.exposure_s)
-    moved_m = None if t_end_start is None else (-r_end_start.T @ t_end_start).tolist()
+    moved_m = None if t_end_start is None or not _in_metres(motion) else (-r_end_start.T @ t_end_start).tolist()
     depth_m, depth_source = _depth(motion)
     grid = tile_grid(height, width, LOG_TILE_PX, LOG_TILE_PX // 4)
     points = np.concatenate([centre, grid.centres_px])
@@ -175,9 +177,13 @@ def _depth(motion: RowMotion) -> tuple[float | None, str]:
     return motion.translation.depth_m, motion.translation.source
 
 
+def _in_metres(motion: RowMotion) -> bool:
+    return motion.translation is not None and motion.translation.in_metres
+
+
 def _velocity_m_s(motion: RowMotion, time_s: float) -> list[float] | None:
     """Velocity of the camera's centre at a time, in its axes at that time (eq 5)."""
-    if motion.translation is None:
+    if motion.translation is None or not motion.translation.in_metres:
         return None
     rotation, _ = motion.pose(time_s)
     return list((rotation @ motion.translation.velocity_at(time_s - motion.reference_s)).tolist())
