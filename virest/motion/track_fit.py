@@ -65,6 +65,45 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True)
+class Doubt:
+    """What the covariance of values, or of anything linear in them, is made of: sandwich H⁻¹ S H⁻¹ and prior.
+
+    A correction along a value must not be carried over to combinations in which values' errors cancel, such as the
+    velocity at an instant (from velocity, gravity and bias): it is asked for anew there.
+    """
+
+    curvature: Array
+    """(k, k) H⁻¹: as if points were independent."""
+    by_moment: Array | None = None
+    """(k, k) scatter of what the blocks of time move the values by; None: too few of them."""
+    by_place: Array | None = None
+    """(k, k) what parts of the picture share beyond moments."""
+    prior: Array | None = None
+    """(k, k) the priors' part."""
+
+    def of(self, slope: Array) -> Array:
+        """Covariance (..., m, m) of what changes by slope (..., m, k) per unit of the values.
+
+        Parts of the picture widen it; along nothing is it below the curvature's.
+        """
+        back = np.swapaxes(slope, -1, -2)
+        least = slope @ self.curvature @ back
+        if self.by_moment is None or self.by_place is None or self.prior is None:
+            return np.asarray(least)
+        sandwich = slope @ self.by_moment @ back
+        # a difference of two may come out negative: places then share nothing
+        places = np.maximum(_diagonal(slope @ self.by_place @ back), 0.0)
+        share = np.sqrt(1 + places / np.maximum(_diagonal(sandwich), 1e-300))
+        total = sandwich * share[..., :, None] * share[..., None, :] + slope @ self.prior @ back
+        raised = np.sqrt(np.maximum(_diagonal(least) / np.maximum(_diagonal(total), 1e-300), 1.0))
+        return np.asarray(total * raised[..., :, None] * raised[..., None, :])
+
+
+def _diagonal(matrix: Array) -> Array:
+    return np.diagonal(matrix, axis1=-2, axis2=-1)
+
+
+@dataclass(frozen=True, slots=True)
 class TrackFit:
     """A fitted profile with what it leaves."""
 
@@ -75,8 +114,8 @@ class TrackFit:
     """(k,) total change of the terms' values from the starting profile."""
     covariance: Array
     """(k + scene, k + scene): the terms first."""
-    curvature: Array
-    """The same from the curvature alone, as if points were independent."""
+    doubt: Doubt
+    """What the covariance is made of, for what is linear in the values."""
     by_relief: Array
     """(k + scene,) by how much values err where the picture's parts lie off the plane by the spread of depths, each in
     the sense that moves the value."""
@@ -132,6 +171,11 @@ class TrackFit:
             return np.zeros(len(self.distance))
         ratio = np.linalg.norm(self.along_px, axis=-1) / self.noise_px
         return np.asarray(0.5 * np.log1p((self.depth_spread_per_m * ratio) ** 2))
+
+    @property
+    def curvature(self) -> Array:
+        """The covariance from the curvature alone, as if points were independent."""
+        return self.doubt.curvature
 
     def std(self, name: str) -> Array:
         """Standard deviations (k,) of a term's values."""
@@ -441,7 +485,7 @@ def _cost(system: _System, scale: float) -> float:
 
 def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system: _System, blocks: int) -> TrackFit:
     inverse = system.inverse()
-    covariance = _block_covariance(table, system, inverse, blocks)
+    doubt = _doubt(table, system, inverse, blocks)
     stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
     difference = system.difference
     if isinstance(state.scene, DirectedMotion):
@@ -451,7 +495,7 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
         slices[term.name] = slice(place, place + len(term))
         place += len(term)
     return TrackFit(
-        state.known.profile, state.scene, terms, state.change, covariance, inverse,
+        state.known.profile, state.scene, terms, state.change, doubt.of(np.eye(len(inverse))), doubt,
         _by_relief(table, system, inverse), system.scale, system.depth_spread,
         difference, system.weight, np.sqrt(system.squared), stretches,
         _cost(system, 1.0), state.known,
@@ -460,28 +504,21 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
     )  # fmt: skip
 
 
-def _block_covariance(table: TrackTable, system: _System, inverse: Array, blocks: int) -> Array:
-    """Sandwich H⁻¹ S H⁻¹, S of the gradients' scatter, not below the curvature's along any parameter.
+def _doubt(table: TrackTable, system: _System, inverse: Array, blocks: int) -> Doubt:
+    """Scatter of the points' pull on the values, by blocks of time and by parts of the picture.
 
     Points of one moment share its errors, and points of one part of the picture share the relief that stands there as
     long as the camera travels on: S counts both (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
     """
     count = min(blocks, table.n_pairs)
     if count < MIN_BLOCKS or not inverse.size:
-        return inverse
+        return Doubt(inverse)
     block = table.pair * count // table.n_pairs
     weighted = system.left * (system.weight / system.scale**2)[:, None]
-    moved = np.einsum("nki,nk->ni", system.rows, weighted) @ inverse
-    by_moment = _scatter(moved, block)
+    moved = np.einsum("nki,nk->ni", system.rows, weighted) @ inverse / _true_curvature(system)
     place = _parts_of_picture(table.first_px)
     by_place = _scatter(moved, place) - _scatter(moved, block * PLACES**2 + place)
-    # a difference of two may come out negative: places then share nothing
-    places_share = np.sqrt(1 + np.maximum(np.diag(by_place), 0.0) / np.maximum(np.diag(by_moment), 1e-300))
-    sandwich = by_moment * np.outer(places_share, places_share) / _true_curvature(system) ** 2
-    prior_part = inverse @ (system.prior[:, None] * inverse)
-    total = sandwich + prior_part
-    raised = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(total), 1e-300), 1.0))
-    return total * np.outer(raised, raised)
+    return Doubt(inverse, _scatter(moved, block), by_place, inverse @ (system.prior[:, None] * inverse))
 
 
 def _scatter(moved: Array, group: Index) -> Array:

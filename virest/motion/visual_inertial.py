@@ -25,7 +25,7 @@ from virest.motion.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT,
 from virest.motion.relief import View, WindowRelief, find_relief, picture_grid
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
-from virest.motion.track_model import TrackTable, centre, ground
+from virest.motion.track_model import Ground, TrackTable, centre, ground, with_profile
 
 Array = NDArray[np.float64]
 STRETCH_S = 14.0
@@ -105,6 +105,8 @@ class Stretch:
     points: TriangulatedPoints
     velocity_floor_m_s: Array
     """(windows,) what tracking's own bias makes of the velocity."""
+    nudged: tuple[Ground, ...]
+    """The fit's ground with each value of its terms one quotient's step further."""
     reliefs: tuple[WindowRelief | None, ...] = ()
     """By window; None: the plane tells held-out points as well as a surface does."""
 
@@ -139,50 +141,81 @@ class Stretch:
         """Middle of a window, IMU clock."""
         return float(self.fit.profile.imu_time_s(self.table.origin_s[window]))
 
-    def velocity(self, window: int, time_s: Array) -> tuple[Array, Array]:
-        """Velocity (n, 3) of the camera's centre in world axes and its covariance (n, 3, 3), IMU clock (n,)."""
-        velocity, slope = self._velocity(window, time_s)
-        chosen = [*range(7), *range(7 + 6 * window, 10 + 6 * window)]
-        covariance = slope @ self.scene_covariance[np.ix_(chosen, chosen)] @ np.swapaxes(slope, -1, -2)
-        return velocity, covariance + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
+    def velocity(self, window: int, time_s: Array) -> Array:
+        """Velocity (n, 3) of the camera's centre in world axes, IMU clock (n,)."""
+        return self._velocity(self.fit.ground, window, time_s)
 
-    def _velocity(self, window: int, time_s: Array) -> tuple[Array, Array]:
-        """Velocity (n, 3) and its change (n, 3, 10) per gravity, bias, delay and the window's own velocity."""
-        moves, scene, origin = self.fit.ground.displacement, self.scene, np.array([self.origin_s(window)])
-        assert moves is not None
-        since = (time_s - origin)[:, None]
-        per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin, 1)).reshape(-1, 3, 3)
-        per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin, 1)
-        velocity = (
-            scene.velocity_m_s[window] + moves.path(time_s, 1) - moves.path(origin, 1) + since * scene.gravity_m_s2
-        )
-        velocity = velocity - per_bias @ scene.accel_bias_m_s2 + per_delay * scene.accel_delay_s
-        velocity = velocity + self._arm_velocity(time_s)
-        each = np.broadcast_to(np.eye(3), (len(time_s), 3, 3))
-        slope = np.concatenate([each * since[..., None], -per_bias, per_delay[..., None], each], axis=-1)
-        return velocity, slope
+    def seen_velocity(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
+        """Velocity (n, 3) in the camera's axes at stamps (n,), camera clock, and its covariance (n, 3, 3)."""
+        velocity, nearness, slope, nearness_slope = self._seen(window, stamp_s)
+        return velocity, self.fit.doubt.of(slope) + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
 
-    def flow(self, window: int, time_s: Array) -> tuple[Array, Array]:
-        """Velocity over depth (n, 3) on the optical axis, 1/s, world axes, and its covariance (n, 3, 3).
+    def flow(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
+        """Velocity over depth (n, 3) on the optical axis, 1/s, camera axes at stamps (n,), and its covariance.
 
         A common scale of velocity and depth cancels, however little is known of it.
         """
-        velocity, slope = self._velocity(window, time_s)
-        axis = self.fit.ground.trajectory.orientation(time_s)[..., 2]
-        plane = self.scene.plane_per_m[window]
-        nearness = np.maximum(axis @ plane, 1e-6)[:, None]
-        slope = np.concatenate([nearness[..., None] * slope, velocity[:, :, None] * axis[:, None, :]], axis=-1)
-        chosen = [*range(7), *range(7 + 6 * window, 13 + 6 * window)]
-        covariance = slope @ self.scene_covariance[np.ix_(chosen, chosen)] @ np.swapaxes(slope, -1, -2)
-        floor = (self.velocity_floor_m_s[window] * nearness[..., None]) ** 2 * np.eye(3)
-        return nearness * velocity, covariance + floor
+        velocity, nearness, slope, nearness_slope = self._seen(window, stamp_s)
+        slope = nearness[:, None, None] * slope + velocity[:, :, None] * nearness_slope[:, None, :]
+        floor = self.velocity_floor_m_s[window] * nearness
+        return nearness[:, None] * velocity, self.fit.doubt.of(slope) + (floor**2)[:, None, None] * np.eye(3)
 
-    def _arm_velocity(self, time_s: Array) -> Array:
-        """What the IMU's distance from the camera adds: −R (ω × p_cam_imu)."""
-        known = self.fit.ground
-        assert known.displacement is not None
-        turning = np.cross(known.trajectory.rate_rad_s(time_s), known.displacement.arm_cam_m)
-        return -np.einsum("nij,nj->ni", known.trajectory.orientation(time_s), turning)
+    def _seen(self, window: int, stamp_s: Array) -> tuple[Array, Array, Array, Array]:
+        """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the optical axis, and their changes per
+        unit of everything that was fitted, (n, 3, k) and (n, k).
+
+        The terms of the profile count too: a turned IMU turns gravity with it, which costs the velocity nothing.
+        """
+        velocity, nearness, rotation = self._seen_from(self.fit.ground, window, stamp_s)
+        slope = np.zeros((len(stamp_s), 3, len(self.fit.covariance)))
+        nearness_slope = np.zeros((len(stamp_s), slope.shape[-1]))
+        quotients = [step for term in self.fit.terms for step in term.quotient]
+        for k, (nudged, quotient) in enumerate(zip(self.nudged, quotients, strict=True)):
+            moved, nearer, _ = self._seen_from(nudged, window, stamp_s)
+            slope[..., k] = (moved - velocity) / quotient
+            nearness_slope[:, k] = (nearer - nearness) / quotient
+        own = len(quotients) + 7 + 6 * window
+        back = np.swapaxes(rotation, -1, -2)
+        slope[..., len(quotients) : len(quotients) + 7] = back @ self._velocity_slope(window, stamp_s)
+        slope[..., own : own + 3] = back
+        nearness_slope[:, own + 3 : own + 6] = rotation[..., 2]
+        return velocity, nearness, slope, nearness_slope
+
+    def _seen_from(self, known: Ground, window: int, stamp_s: Array) -> tuple[Array, Array, Array]:
+        """Velocity in camera axes, inverse depth on the optical axis, and R_world_cam, (n, 3), (n,), (n, 3, 3)."""
+        time_s = np.asarray(known.profile.imu_time_s(stamp_s))
+        rotation = known.trajectory.orientation(time_s)
+        velocity = np.einsum("nji,nj->ni", rotation, self._velocity(known, window, time_s))
+        return velocity, np.maximum(rotation[..., 2] @ self.scene.plane_per_m[window], 1e-6), rotation
+
+    def _velocity(self, known: Ground, window: int, time_s: Array) -> Array:
+        moves, scene = known.displacement, self.scene
+        assert moves is not None
+        origin = np.array([float(known.profile.imu_time_s(self.table.origin_s[window]))])
+        per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin, 1)).reshape(-1, 3, 3)
+        per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin, 1)
+        since = (time_s - origin)[:, None]
+        velocity = scene.velocity_m_s[window] + moves.path(time_s, 1) - moves.path(origin, 1)
+        velocity = velocity + since * scene.gravity_m_s2 - per_bias @ scene.accel_bias_m_s2
+        # the IMU's distance from the camera adds −R (ω × p_cam_imu)
+        turning = np.cross(known.trajectory.rate_rad_s(time_s), moves.arm_cam_m)
+        arm = np.einsum("nij,nj->ni", known.trajectory.orientation(time_s), turning)
+        return np.asarray(velocity + per_delay * scene.accel_delay_s - arm)
+
+    def _velocity_slope(self, window: int, stamp_s: Array) -> Array:
+        """Change (n, 3, 7) of the velocity per unit of gravity, accelerometer bias and delay."""
+        moves = self.fit.ground.displacement
+        assert moves is not None
+        time_s, origin = np.asarray(self.fit.profile.imu_time_s(stamp_s)), np.array([self.origin_s(window)])
+        per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin, 1)).reshape(-1, 3, 3)
+        per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin, 1)
+        since = (time_s - origin)[:, None, None] * np.eye(3)
+        return np.concatenate([since, -per_bias, per_delay[..., None]], axis=-1)
+
+    def plane_std_per_m(self, window: int) -> float:
+        """Standard deviation of the plane's inverse depth along the optical axis at the window's middle."""
+        slope = self._seen(window, self.table.origin_s[[window]])[3]
+        return float(np.sqrt(self.fit.doubt.of(slope[:, None, :])[0, 0, 0]))
 
     def place(self, window: int, time_s: Array) -> Array:
         """Camera's centre (n, 3) from its place at the window's middle, world axes."""
@@ -296,9 +329,9 @@ class VisualInertialAlignment:
         stretch, window = found
         known = stretch.fit.ground
         time_s = np.asarray(known.profile.imu_time_s(np.array([reference_s, start_s, max(end_s, start_s + 1e-3)])))
-        velocity, covariance = stretch.velocity(window, time_s)
+        velocity = stretch.velocity(window, time_s)
         rotation = known.trajectory.orientation(time_s[0])
-        std = np.sqrt(np.diag(rotation.T @ covariance[0] @ rotation))
+        std = np.sqrt(np.diag(stretch.seen_velocity(window, np.array([reference_s]))[1][0]))
         acceleration = (velocity[2] - velocity[1]) / (time_s[2] - time_s[1])
         depth = stretch.depth(window, float(time_s[0]))
         return FrameMotion(velocity[0] @ rotation, std, acceleration @ rotation, depth, unscaled)
@@ -438,7 +471,7 @@ def _fit_stretch(
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
     assert isinstance(fit.scene, InertialMotion)
     points = triangulate(fit.ground, fit.scene, table)
-    stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table))
+    stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table), _nudged(fit, imu))
     stretch = replace(stretch, windows=tuple(_judged(stretch, still, k, depth_m) for k in range(table.n_windows)))
     sights = triangulate_relief(fit.ground, fit.scene, observed.table(observed.tracks))
     reliefs = tuple(_relief(stretch, sights, k) for k in range(table.n_windows))
@@ -456,6 +489,12 @@ def _relief(stretch: Stretch, sights: Sights, window: int) -> WindowRelief | Non
         return stretch.view(window, time_s, stretch.frame_plane(window, time_s).plane_per_m)
 
     return find_relief(sights.chosen(sights.points.window == window), grid, view)
+
+
+def _nudged(fit: TrackFit, imu: ImuSamples) -> tuple[Ground, ...]:
+    """The fit's ground with each value of its terms one quotient's step further."""
+    steps = [(term, np.diag(term.quotient)[k]) for term in fit.terms for k in range(len(term))]
+    return tuple(with_profile(fit.ground, imu, term.change(fit.profile, step)) for term, step in steps)
 
 
 def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
@@ -491,14 +530,13 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
     fit, table = stretch.fit, stretch.table
     mine = table.window == window
     start_s, end_s = float(table.first_stamp_s[mine].min()), float(table.second_stamp_s[mine].max())
-    times = np.asarray(fit.profile.imu_time_s(np.linspace(start_s, end_s, 32)))
-    velocity, covariance = stretch.velocity(window, times)
+    times = np.linspace(start_s, end_s, 32)
+    velocity, covariance = stretch.seen_velocity(window, times)
     spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean())
     speed = max(float(np.sqrt((velocity**2).sum(axis=-1).mean())), 1e-6)
     axis = fit.ground.trajectory.orientation(stretch.origin_s(window))[:, 2]
-    part = slice(10 + 6 * window, 13 + 6 * window)
     inverse = max(float(stretch.scene.plane_per_m[window] @ axis), 1e-6)
-    scale_std = float(np.sqrt(axis @ stretch.scene_covariance[part, part] @ axis)) / inverse
+    scale_std = stretch.plane_std_per_m(window) / inverse
     flow, flow_covariance = stretch.flow(window, times)
     flow_std = np.sqrt(np.trace(flow_covariance, axis1=-2, axis2=-1).mean() / max((flow**2).sum(axis=-1).mean(), 1e-12))
     left, before = _left(fit, mine), _left(still, mine)
