@@ -57,7 +57,7 @@ def test_velocity_and_depth_come_back_within_their_deviations(name: str) -> None
     assert len(seen) == len(camera.stamp_s[::4])
     assert velocity_error(camera, found) < 0.05
     deviation = [(m.velocity_m_s - camera.velocity_cam(s)) / m.std_m_s for s, m in seen]
-    assert np.sqrt(np.mean(np.square(deviation))) < 1.5
+    assert 0.2 < np.sqrt(np.mean(np.square(deviation))) < 1.5
     middle = camera.profile.intrinsics.rays(np.array([239.5, 319.5]))  # type: ignore[union-attr]
     depth = np.array([1 / (camera.plane(s) @ middle) for s, _ in seen])
     np.testing.assert_allclose([m.depth.depth_m for _, m in seen], depth, rtol=0.05)
@@ -112,10 +112,10 @@ def test_a_profile_that_is_a_little_off_does_not_pass_for_parallax() -> None:
 
 
 STILL = {"sway_m": 0.0, "seed": 6}
+STEADY = Sway(**STILL, velocity_m_s=(0.5, -0.2, 0.3))  # type: ignore[arg-type]
 REFUSED: dict[str, tuple[Sway, str]] = {
     "still camera": (Sway(**STILL, rate_rad_s=1e-3), "no parallax"),  # type: ignore[arg-type]
     "pure rotation": (Sway(**STILL), "no parallax"),  # type: ignore[arg-type]
-    "steady travel": (Sway(**STILL, velocity_m_s=(0.5, -0.2, 0.3)), "scale undetermined"),  # type: ignore[arg-type]
     "far away": (Sway(depth_m=150.0), "no parallax"),
     "no accelerometer": (Sway(accelerometer=False), "no accelerometer"),
 }
@@ -144,9 +144,45 @@ def test_an_accelerometer_of_another_time_is_refused(shift: int) -> None:
     assert found.refused
 
 
+def test_steady_travel_is_known_over_depth() -> None:
+    """Metres are refused with the reason; velocity over depth, which pictures show, is right, and so is the clock."""
+    camera, found = recorded(STEADY), aligned(STEADY)
+    assert not found.trusted
+    assert "scale undetermined" in found.refused
+    seen = motions(camera, found)
+    assert len(seen) == len(camera.stamp_s[::4])
+    assert all("scale undetermined" in motion.unscaled for _, motion in seen)
+    ray = np.array([0.1, -0.2, 1.0])
+    flow = np.array([motion.velocity_m_s * (motion.depth.plane_per_m @ ray) for _, motion in seen])
+    truth = np.array([camera.velocity_cam(s) * (camera.plane(s) @ ray) for s, _ in seen])
+    np.testing.assert_allclose(flow, truth, atol=0.05 * np.sqrt(np.mean((truth**2).sum(axis=-1))))
+    clock = found.clock()
+    assert clock is not None
+    assert clock[0] == pytest.approx(STEADY.time_offset_s, abs=3 * clock[1])
+
+
+def test_little_travel_is_known_in_metres() -> None:
+    """What IMU rotation, gravity and bias share must not pass for doubt of the velocity: a slow sway is told well."""
+    slow = Sway(seed=8, sway_m=0.015, depth_m=0.7, rate_rad_s=0.3)
+    found = aligned(slow)
+    assert found.trusted, found.refused
+    assert velocity_error(recorded(slow), found) < 0.1
+    assert all(window.velocity_std < 0.1 for window in found.windows)
+
+
+def test_a_foreign_recording_is_not_bent_until_it_fits() -> None:
+    """Inertial data of another hand make neither metres nor travel over depth."""
+    camera, other = recorded(SWAYS["portrait"]), recorded(replace(STEADY, seed=11))
+    for profile in (camera.profile, replace(camera.profile, time_offset_s=None)):
+        found = align(camera.observed, other.imu, profile)
+        assert not found.trusted
+        assert isinstance(found.frame(1.0, 1.0, 1.03), str)
+        assert found.clock() is None
+
+
 def test_a_stated_depth_gives_steady_travel_its_scale() -> None:
     """Without any acceleration the velocity is then known too."""
-    camera = recorded(REFUSED["steady travel"][0])
+    camera = recorded(STEADY)
     found = align(camera.observed, camera.imu, camera.profile, depth_m=1.8)
     assert found.trusted, found.refused
     assert velocity_error(camera, found) < 0.06

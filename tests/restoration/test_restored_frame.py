@@ -13,7 +13,14 @@ from laws import TurningCamera, phone, psnr_db
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.restoration.frame import RestoredFrame, _most_blurred, copied_frame, restore_frame
+from virest.degradation.row_motion import FrameTranslation, row_motion
+from virest.restoration.frame import (
+    RestoredFrame,
+    _most_blurred,
+    copied_frame,
+    degradation_parameters,
+    restore_frame,
+)
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 
 BALANCED = RestorationSettings()
@@ -315,6 +322,26 @@ def test_the_log_holds_the_contracts_figures() -> None:
     assert result.exposure_s == pytest.approx(0.012)
     assert all(np.isfinite(_numbers(log)))
     assert {"estimate", "deblur", "shutter"} <= set(result.seconds)
+
+
+def test_travel_over_depth_is_undone_and_called_no_metres() -> None:
+    """Blur and straightening are those of the same travel in metres; displacement, velocity and depth are null."""
+    turning = camera((0.0, -2.0, 0.0), 0.02)
+    travel = FrameTranslation(np.array([0.4, 0.1, 0.2]), np.zeros(3), np.array([0.05, 0.0, 0.6]), 1.6, "triangulated")
+    logs = []
+    for known in (travel, replace(travel, depth_m=None, in_metres=False)):
+        motion = row_motion(turning.trajectory, turning.profile, FRAME.time_s, FRAME.exposure_s, translation=known)
+        logs.append(degradation_parameters(motion, turning.trajectory, BALANCED))
+    metres, over_depth = logs
+    assert metres["blur"] == over_depth["blur"]
+    assert metres["shutter"] == over_depth["shutter"]
+    assert (metres["depth_m"], over_depth["depth_m"], over_depth["depth_source"]) == (1.6, None, "none")
+    for key in ("delta_position_m", "velocity_m_s"):
+        assert metres["motion"][key] is not None
+        assert over_depth["motion"][key] is None
+    picture = record(turning).picture
+    said = restore_frame(FRAME, picture, motion, turning.trajectory, BALANCED).warnings
+    assert any("not in metres" in text for text in said)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

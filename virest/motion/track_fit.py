@@ -80,6 +80,19 @@ class Doubt:
     """(k, k) what parts of the picture share beyond moments."""
     prior: Array | None = None
     """(k, k) the priors' part."""
+    relief: Array | None = None
+    """(places, k) what each part of the picture moves the values by if it lies off the plane by the spread of depths;
+    None: no relief is allowed for."""
+
+    def by_relief(self, slope: Array) -> Array:
+        """Covariance (..., m, m), of what changes by slope (..., m, k), from relief that stands in its place.
+
+        A camera that travels to and fro sees the same relief pull one way and the other; one that walks on does not.
+        """
+        if self.relief is None:
+            return np.zeros((*slope.shape[:-1], slope.shape[-2]))
+        pulled = slope @ self.relief.T
+        return np.asarray(pulled @ np.swapaxes(pulled, -1, -2))
 
     def of(self, slope: Array) -> Array:
         """Covariance (..., m, m) of what changes by slope (..., m, k) per unit of the values.
@@ -116,9 +129,6 @@ class TrackFit:
     """(k + scene, k + scene): the terms first."""
     doubt: Doubt
     """What the covariance is made of, for what is linear in the values."""
-    by_relief: Array
-    """(k + scene,) by how much values err where the picture's parts lie off the plane by the spread of depths, each in
-    the sense that moves the value."""
     scale: float
     """Robust standard deviation of the whitened differences; 1 where the model explains all."""
     depth_spread_per_m: float
@@ -176,6 +186,12 @@ class TrackFit:
     def curvature(self) -> Array:
         """The covariance from the curvature alone, as if points were independent."""
         return self.doubt.curvature
+
+    @property
+    def by_relief(self) -> Array:
+        """By how much values err (k + scene,) where the picture's parts lie off the plane by the spread of depths."""
+        each = np.eye(len(self.covariance))[:, None, :]
+        return np.asarray(np.sqrt(self.doubt.by_relief(each)[:, 0, 0]))
 
     def std(self, name: str) -> Array:
         """Standard deviations (k,) of a term's values."""
@@ -485,7 +501,7 @@ def _cost(system: _System, scale: float) -> float:
 
 def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system: _System, blocks: int) -> TrackFit:
     inverse = system.inverse()
-    doubt = _doubt(table, system, inverse, blocks)
+    doubt = replace(_doubt(table, system, inverse, blocks), relief=_relief(table, system, inverse))
     stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
     difference = system.difference
     if isinstance(state.scene, DirectedMotion):
@@ -496,7 +512,7 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
         place += len(term)
     return TrackFit(
         state.known.profile, state.scene, terms, state.change, doubt.of(np.eye(len(inverse))), doubt,
-        _by_relief(table, system, inverse), system.scale, system.depth_spread,
+        system.scale, system.depth_spread,
         difference, system.weight, np.sqrt(system.squared), stretches,
         _cost(system, 1.0), state.known,
         system.prediction.second_s, table.noise_px[table.pair],
@@ -529,14 +545,11 @@ def _scatter(moved: Array, group: Index) -> Array:
     return np.asarray(sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
 
 
-def _by_relief(table: TrackTable, system: _System, inverse: Array) -> Array:
-    """What depths that are off by their spread, part by part of the picture in a value's own sense, do to the values.
-
-    A camera that travels to and fro sees the same relief pull one way and the other; one that walks on does not.
-    """
+def _relief(table: TrackTable, system: _System, inverse: Array) -> Array | None:
+    """What depths that are off by their spread in each part of the picture do to the values (places, k)."""
     along_px = system.prediction.along_px
     if along_px is None or not inverse.size or system.depth_spread == ANY_DEPTH:
-        return np.zeros(len(inverse))
+        return None
     length = np.linalg.norm(along_px, axis=-1)
     way = along_px / np.maximum(length, 1e-12)[:, None]
     ratio = length / table.noise_px[table.pair]
@@ -545,7 +558,7 @@ def _by_relief(table: TrackTable, system: _System, inverse: Array) -> Array:
     place = _parts_of_picture(table.first_px)
     points = np.maximum(np.bincount(place), 1)[:, None]
     together = np.stack([np.bincount(place, column) for column in moved.T], axis=-1)
-    return np.asarray(system.depth_spread * np.sqrt(len(table) * (together**2 / points).sum(axis=0)))
+    return np.asarray(system.depth_spread * np.sqrt(len(table)) * together / np.sqrt(points))
 
 
 def _parts_of_picture(points_px: Array) -> Index:

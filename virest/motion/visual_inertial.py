@@ -26,6 +26,7 @@ from virest.motion.relief import View, WindowRelief, find_relief, picture_grid
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.motion.track_model import Ground, TrackTable, centre, ground, with_profile
+from virest.motion.tracking_bias import SHARED_RELIEF
 
 Array = NDArray[np.float64]
 STRETCH_S = 14.0
@@ -38,8 +39,11 @@ MIN_POINTS = 200
 START_INVERSE_DEPTH_PER_M = 0.5
 MAX_RELATIVE_STD = 0.1
 """Of the scale, and of the velocity over its rms within a window; beyond it no metres are said."""
-MAX_FLOW_STD = 0.5
-"""Of velocity over depth, part of its rms: rotation alone errs by all of it, so up to here most of it is undone."""
+MAX_FLOW_STD = 0.2
+"""Of velocity over depth, part of its rms, where metres are not known: rotation alone errs by all of it.  Inertial data
+of another recording, bent until they fit, leave 0.3 and more; those of the recording itself hardly 0.12."""
+MAX_PRIOR_STD = 3.0
+"""And so many of their priors' standard deviations no term of the profile may have had to give way for it."""
 MIN_PARALLAX = 1.15
 """Rotation alone must leave this many times what is left with translation."""
 MAX_LEFT = 0.15
@@ -59,6 +63,8 @@ TRACKING_BIAS_PX = 0.04
 """Tracking's own bias under blur and codec: a steady error of a step, which is an error of the velocity."""
 OFFSET_FLOOR_S = 3e-5
 """And its error in time."""
+ACCEL_SCALE_STD = 0.01
+"""How far a phone's accelerometer may be off in scale (makers' tolerance of its sensitivity): lengths go with it."""
 IMU_MARGIN_S = 2.5
 """A stretch takes the inertial samples up to this far beyond its tracked points."""
 NEAR_WINDOW_S = 1.5
@@ -91,7 +97,7 @@ class Window:
 
     @property
     def usable(self) -> bool:
-        """Whether pictures may be restored by the window's velocity and plane."""
+        """Whether pictures may be restored by the window's velocity over its depth."""
         return not self.reason or self.over_depth
 
 
@@ -147,8 +153,10 @@ class Stretch:
 
     def seen_velocity(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
         """Velocity (n, 3) in the camera's axes at stamps (n,), camera clock, and its covariance (n, 3, 3)."""
-        velocity, nearness, slope, nearness_slope = self._seen(window, stamp_s)
-        return velocity, self.fit.doubt.of(slope) + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
+        velocity, _, slope, _ = self._seen(window, stamp_s)
+        covariance = self.fit.doubt.of(slope) + SHARED_RELIEF**2 * self.fit.doubt.by_relief(slope)
+        scale = ACCEL_SCALE_STD**2 * velocity[:, :, None] * velocity[:, None, :]
+        return velocity, covariance + scale + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
 
     def flow(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
         """Velocity over depth (n, 3) on the optical axis, 1/s, camera axes at stamps (n,), and its covariance.
@@ -161,10 +169,10 @@ class Stretch:
         return nearness[:, None] * velocity, self.fit.doubt.of(slope) + (floor**2)[:, None, None] * np.eye(3)
 
     def _seen(self, window: int, stamp_s: Array) -> tuple[Array, Array, Array, Array]:
-        """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the optical axis, and their changes per
-        unit of everything that was fitted, (n, 3, k) and (n, k).
+        """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the optical axis, and their slopes.
 
-        The terms of the profile count too: a turned IMU turns gravity with it, which costs the velocity nothing.
+        Slopes (n, 3, k) and (n, k) are per unit of everything that was fitted.  The terms of the profile count too: a
+        turned IMU turns gravity with it, which costs the velocity nothing.
         """
         velocity, nearness, rotation = self._seen_from(self.fit.ground, window, stamp_s)
         slope = np.zeros((len(stamp_s), 3, len(self.fit.covariance)))
@@ -215,7 +223,8 @@ class Stretch:
     def plane_std_per_m(self, window: int) -> float:
         """Standard deviation of the plane's inverse depth along the optical axis at the window's middle."""
         slope = self._seen(window, self.table.origin_s[[window]])[3]
-        return float(np.sqrt(self.fit.doubt.of(slope[:, None, :])[0, 0, 0]))
+        nearness = self._seen_from(self.fit.ground, window, self.table.origin_s[[window]])[1][0]
+        return float(np.hypot(np.sqrt(self.fit.doubt.of(slope[:, None, :])[0, 0, 0]), ACCEL_SCALE_STD * nearness))
 
     def place(self, window: int, time_s: Array) -> Array:
         """Camera's centre (n, 3) from its place at the window's middle, world axes."""
@@ -293,15 +302,15 @@ class VisualInertialAlignment:
 
     @property
     def trusted(self) -> bool:
-        """Whether any window's velocity may be used."""
-        return any(window.usable for window in self.windows)
+        """Whether any window's velocity is known in metres."""
+        return any(not window.reason for window in self.windows)
 
     @property
     def refused(self) -> str:
-        """Why not all windows may be used, the commonest reason first; empty if all may."""
+        """Why not all windows' velocities are known in metres, the commonest reason first; empty if all are."""
         if self.reason:
             return self.reason
-        reasons = [window.reason for window in self.windows if not window.usable]
+        reasons = [window.reason for window in self.windows if window.reason]
         return max(reasons, key=reasons.count) if reasons else ""
 
     def find(self, camera_time_s: float, *, over_depth: bool = False) -> tuple[Stretch, int] | str:
@@ -321,9 +330,10 @@ class VisualInertialAlignment:
 
     def frame(self, reference_s: float, start_s: float, end_s: float) -> FrameMotion | str:
         """Motion over a frame that is taken from start_s to end_s, camera clock; or why it is not known."""
-        found, unscaled = self.find(0.5 * (start_s + end_s)), ""
-        if isinstance(found, str):
-            found, unscaled = self.find(0.5 * (start_s + end_s), over_depth=True), found
+        found = self.find(0.5 * (start_s + end_s))
+        unscaled = found if isinstance(found, str) else ""
+        if unscaled:
+            found = self.find(0.5 * (start_s + end_s), over_depth=True)
         if isinstance(found, str):
             return found
         stretch, window = found
@@ -337,7 +347,7 @@ class VisualInertialAlignment:
         return FrameMotion(velocity[0] @ rotation, std, acceleration @ rotation, depth, unscaled)
 
     def clock(self) -> tuple[float, float] | None:
-        """Time offset and its standard deviation over the trusted stretches; None: there are none."""
+        """Time offset and its standard deviation over the stretches with usable windows; None: there are none."""
         found = [s for s in self.stretches if any(w.usable for w in s.windows)]
         if not found:
             return None
@@ -347,7 +357,7 @@ class VisualInertialAlignment:
         return mean, float(np.hypot(spread, OFFSET_FLOOR_S))
 
     def gyro_bias(self) -> tuple[Array, Array] | None:
-        """Gyroscope bias (3,) and its standard deviations over the trusted stretches."""
+        """Gyroscope bias (3,) and its standard deviations over the stretches with usable windows."""
         found = [s for s in self.stretches if any(w.usable for w in s.windows)]
         if not found:
             return None
@@ -555,12 +565,17 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
     reason = _no_parallax(found) or _no_fit(found, gravity, before)
     if reason:
         return replace(found, reason=reason)
-    return replace(found, reason=_no_metres(found), over_depth=found.flow_std < MAX_FLOW_STD)
+    return replace(found, reason=_no_metres(found), over_depth=found.flow_std < MAX_FLOW_STD and _within_priors(fit))
 
 
 def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
     """Robust standard deviation per coordinate of a window's whitened differences."""
     return float(np.median(fit.distance[mine])) / RAYLEIGH_MEDIAN
+
+
+def _within_priors(fit: TrackFit) -> bool:
+    values = [np.abs(fit.value(term.name)) <= MAX_PRIOR_STD * np.array(term.prior_std) for term in fit.terms]
+    return bool(np.all(np.concatenate(values)))
 
 
 def _no_parallax(found: Window) -> str:

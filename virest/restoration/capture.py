@@ -196,14 +196,17 @@ def _wants_translation(profile: CameraProfile, capture: Capture) -> bool:
 def _aligned(
     filled: CameraProfile, given: CameraProfile, capture: Capture, pairs: list[TrackPair]
 ) -> VisualInertialAlignment:
-    """Fit the translation; where the offset could not be told from turns alone, from where they agree best."""
+    """Fit the translation; where the offset could not be told from turns alone, from where they agree best.
+
+    Pictures that travel and hardly turn agree nowhere: clocks are then taken as common, which a phone's nearly are, and
+    the fit is judged by what it explains.
+    """
     observed = observe_tracks(capture, pairs, filled)
     start = filled
     if given.time_offset_s is None and "time_offset_s" not in filled.estimates and len(observed.pairs):
         coarse = align_coarsely(observed.turns(filled), capture.imu, filled)
-        if coarse is None or coarse.explained < MIN_COARSE_EXPLAINED or coarse.at_end:
-            return VisualInertialAlignment((), "the clocks of pictures and gyroscope are not known")
-        offset_s = coarse.time_offset_s
+        found = coarse is not None and coarse.explained >= MIN_COARSE_EXPLAINED and not coarse.at_end
+        offset_s = coarse.time_offset_s if coarse is not None and found else 0.0
         start = filled.with_estimate("time_offset_s", offset_s, None, "coarse", time_offset_s=offset_s)
     return align(observed, capture.imu, start, given.depth_m)
 
@@ -214,6 +217,8 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     if clock is None or bias is None:
         return plan
     offset_s, std_s = clock
+    if std_s > MAX_OFFSET_STD_S:
+        return plan
     if given.time_offset_s is not None:
         return _with_doubt(plan, given.time_offset_s, offset_s, std_s)
     source = "tracked points against gyroscope and accelerometer"
