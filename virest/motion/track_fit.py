@@ -40,6 +40,7 @@ PLACES = 5
 ON_THE_WAY, AT_THE_END = (1.5, 0.5), (0.1, 0.05)
 """Slopes serve until the points have moved so many pixels (median), or the scene's own values by this part, since."""
 NOT_AT_ALL = (0.0, 0.0)
+ALMOST_NOTHING = 1e-9
 ANY_DEPTH = 1e6
 """Spread of inverse depths that leaves a point free to lie anywhere along its parallax."""
 SPREAD_PASSES, SPREAD_TOLERANCE = 3, 0.2
@@ -108,6 +109,7 @@ class Doubt:
         places = np.maximum(_diagonal(slope @ self.by_place @ back), 0.0)
         share = np.sqrt(1 + places / np.maximum(_diagonal(sandwich), 1e-300))
         total = sandwich * share[..., :, None] * share[..., None, :] + slope @ self.prior @ back
+        total = total + ALMOST_NOTHING * least  # where all cancels there is still something to raise
         raised = np.sqrt(np.maximum(_diagonal(least) / np.maximum(_diagonal(total), 1e-300), 1.0))
         return np.asarray(total * raised[..., :, None] * raised[..., None, :])
 
