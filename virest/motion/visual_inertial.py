@@ -43,7 +43,7 @@ MAX_FLOW_STD = 0.2
 """Of velocity over depth, part of its rms, where metres are not known: rotation alone errs by all of it.  Inertial data
 of another recording, bent until they fit, leave 0.3 and more; those of the recording itself hardly 0.12."""
 MAX_PRIOR_STD = 3.0
-"""And so many of their priors' standard deviations no term of the profile may have had to give way for it."""
+"""So many of its prior's standard deviations no term of the profile may have had to give way for a fit."""
 MIN_PARALLAX = 1.15
 """Rotation alone must leave this many times what is left with translation."""
 MAX_LEFT = 0.15
@@ -57,6 +57,9 @@ STILL_ITERATIONS = 8
 RAYLEIGH_MEDIAN = 1.1774
 OFFSET_PRIOR_S, ROTATION_PRIOR_RAD, READOUT_PRIOR_S = 0.03, 0.03, 0.03
 """How far a profile that states a value may be wrong: these are fitted along so that they do not pass for parallax."""
+BIAS_PRIOR_RAD_S = 0.02
+"""The same of a gyroscope's bias.  Before a tilted wall another travel with another turn shows nearly the same picture
+(a plane's second motion); that turn would have to be a bias that no phone's gyroscope has."""
 STATED_DEPTH_STD = 0.02
 """How far a profile's depth may be off, part of it."""
 TRACKING_BIAS_PX = 0.04
@@ -352,7 +355,7 @@ class VisualInertialAlignment:
         if not found:
             return None
         offset = np.array([s.fit.profile.time_offset_s or 0.0 for s in found])
-        std = np.array([s.fit.std(TIME_OFFSET.name)[0] for s in found])
+        std = np.array([_std_with_relief(s.fit, TIME_OFFSET.name)[0] for s in found])
         mean, spread = _mean(offset, np.maximum(std, 1e-6))
         return mean, float(np.hypot(spread, OFFSET_FLOOR_S))
 
@@ -362,9 +365,14 @@ class VisualInertialAlignment:
         if not found:
             return None
         values = np.array([s.fit.profile.gyro_bias_rad_s for s in found])
-        stds = np.maximum([s.fit.std(GYRO_BIAS.name) for s in found], 1e-7)
+        stds = np.maximum([_std_with_relief(s.fit, GYRO_BIAS.name) for s in found], 1e-7)
         pairs = [_mean(values[:, k], stds[:, k]) for k in range(3)]
         return np.array([value for value, _ in pairs]), np.array([std for _, std in pairs])
+
+
+def _std_with_relief(fit: TrackFit, name: str) -> Array:
+    """Standard deviations (k,) of a term's values, with what relief that stands in its place does to them."""
+    return np.hypot(fit.std(name), SHARED_RELIEF * fit.by_relief[fit.slices[name]])
 
 
 def _distance(window: Window, time_s: float) -> float:
@@ -449,7 +457,8 @@ def nuisance_terms(profile: CameraProfile) -> tuple[Term, ...]:
     """What is fitted beside the scene: everything that could pass for parallax."""
     known = profile.time_offset_s is not None and "time_offset_s" not in profile.estimates
     offset = replace(TIME_OFFSET, prior_std=(OFFSET_PRIOR_S,)) if known else TIME_OFFSET
-    terms = [offset, GYRO_BIAS, replace(IMU_ROTATION, prior_std=(ROTATION_PRIOR_RAD,) * 3)]
+    bias = replace(GYRO_BIAS, prior_std=(BIAS_PRIOR_RAD_S,) * 3)
+    terms = [offset, bias, replace(IMU_ROTATION, prior_std=(ROTATION_PRIOR_RAD,) * 3)]
     if not profile.readout_known:
         terms.append(replace(READOUT, prior_std=(READOUT_PRIOR_S,)))
     focal = profile.estimates.get("fx_px")
@@ -562,20 +571,15 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
         float(flow_std),
     )
     gravity = float(np.linalg.norm(stretch.scene.gravity_m_s2))
-    reason = _no_parallax(found) or _no_fit(found, gravity, before)
+    reason = _no_parallax(found) or _no_fit(found, gravity, before) or _far_from_profile(fit)
     if reason:
         return replace(found, reason=reason)
-    return replace(found, reason=_no_metres(found), over_depth=found.flow_std < MAX_FLOW_STD and _within_priors(fit))
+    return replace(found, reason=_no_metres(found), over_depth=found.flow_std < MAX_FLOW_STD)
 
 
 def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
     """Robust standard deviation per coordinate of a window's whitened differences."""
     return float(np.median(fit.distance[mine])) / RAYLEIGH_MEDIAN
-
-
-def _within_priors(fit: TrackFit) -> bool:
-    values = [np.abs(fit.value(term.name)) <= MAX_PRIOR_STD * np.array(term.prior_std) for term in fit.terms]
-    return bool(np.all(np.concatenate(values)))
 
 
 def _no_parallax(found: Window) -> str:
@@ -591,6 +595,15 @@ def _no_fit(found: Window, gravity_m_s2: float, before: float) -> str:
             f"the accelerometer does not fit the pictures: {unexplained:.0%} of the parallax unexplained, "
             f"gravity {gravity_m_s2:.2f} m/s²"
         )
+    return ""
+
+
+def _far_from_profile(fit: TrackFit) -> str:
+    for term in fit.terms:
+        ratio = float(np.max(np.abs(fit.value(term.name)) / np.array(term.prior_std)))
+        if ratio > MAX_PRIOR_STD:
+            name = term.name.replace("_", " ")
+            return f"pictures and accelerometer fit only with a {name} {ratio:.0f} deviations from the profile's"
     return ""
 
 
