@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import blur_chords, smooth_field
 from virest.degradation.row_motion import RowMotion
+from virest.restoration.blurred import CLIPPED_LEVELS
 from virest.restoration.statistics.ring_fit import ROUNDING_POWER, RingCells
 from virest.restoration.statistics.rings import RINGS, SIDE
 from virest.restoration.statistics.tile_power import MANY_TILES, cut, passed_power, windowed_power
@@ -41,8 +42,10 @@ BELIEVED = 1 / 3
 """Part of all evidence, from the lowest frequency on, that is believed."""
 MODEL_STD = 0.1
 """How far, in the logarithm, right profiles are off: lenses, curves and paths that change over a tile."""
-STARVED_BITS = 0.1
-"""Bits a pixel at which a coder repeats as much of the frames before that the scale is known to MODEL_STD less."""
+STARVED_BITS = 0.05
+"""Bits a pixel at which a coder repeats so much of the frames before that the scale is known half as well."""
+MOST_CLIPPED = 0.002
+"""Tiles with a larger part of clipped light are taken only where there are none better."""
 RESAMPLED = 60
 SURE = 3.0
 """Standard deviations from which on the pictures contradict a profile."""
@@ -85,9 +88,9 @@ def tile_powers(luma: NDArray[np.uint8], curve: ResponseCurve) -> TilePowers | N
         return None
     rows, columns = (np.linspace(0, length - SIDE, -(-length // SIDE)).astype(int) for length in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
-    corners = corners[:: -(-len(corners) // MOST_TILES)]
+    corners = _least_clipped(luma, corners[:: -(-len(corners) // MOST_TILES)], curve)
     power = [windowed_power(_light(cut(luma, (int(top), int(left))), curve)) for top, left in corners]
-    return TilePowers(corners[:, ::-1] + (SIDE - 1) / 2, np.stack(power))
+    return TilePowers(corners[:, ::-1].astype(float) + (SIDE - 1) / 2, np.stack(power))
 
 
 def path_scale(frames: Iterable[tuple[RowMotion, TilePowers]], bits_per_px: float = np.inf) -> PathScale | None:
@@ -104,6 +107,16 @@ def path_scale(frames: Iterable[tuple[RowMotion, TilePowers]], bits_per_px: floa
 
 
 # ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _least_clipped(luma: NDArray[np.uint8], corners: NDArray[np.intp], curve: ResponseCurve) -> NDArray[np.intp]:
+    """The tiles whose light was measured: a lamp's streak has a spectrum of its own."""
+    clipped = curve.clipped_table(CLIPPED_LEVELS)
+    if not clipped[int(luma.max())]:
+        return corners
+    lost = cv2.LUT(luma, clipped.astype(np.uint8))
+    parts = np.array([cut(lost, (int(top), int(left))).mean() for top, left in corners])
+    return corners[parts <= max(MOST_CLIPPED, float(np.quantile(parts, 0.25)))]
 
 
 def _light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
