@@ -17,9 +17,11 @@ Array = NDArray[np.float64]
 
 PLACES = 5
 """Places each way at which two motions are compared."""
-MOST_FOREIGN = 1 / 3
-"""Part of the predicted path beyond the seen one from which on deblurring loses: a path half as long again as the true
-one leaves about as much error as it takes away."""
+MOST_FOREIGN = 0.25
+"""Part of the predicted path beyond the seen one from which on deblurring loses: a path a third as long again as the
+true one leaves about as much error as it takes away."""
+MOST_LEFT = 0.75
+"""Part of the rows' displacement that straightening may leave by the seen motion, which is an estimate itself."""
 OTHER_BLUR = "the pictures put this frame's blur elsewhere than the profile does: not deblurred"
 OTHER_ROWS = "the pictures put this frame's rows elsewhere than the profile does: not straightened"
 
@@ -37,10 +39,10 @@ def deblurring_loses(predicted: RowMotion, seen: RowMotion) -> bool:
 
 
 def straightening_loses(predicted: RowMotion, seen: RowMotion, anchor: float) -> bool:
-    """Whether points would lie further from where the seen motion puts them than they do as recorded."""
+    """Whether points would lie about as far from where the seen motion puts them as they do as recorded, or more."""
     places = _places(predicted)
     true = straightened_points(seen, places, anchor)
-    return _rms(straightened_points(predicted, places, anchor) - true) > _rms(places - true)
+    return _rms(straightened_points(predicted, places, anchor) - true) > MOST_LEFT * _rms(places - true)
 
 
 def _places(motion: RowMotion) -> Array:
