@@ -12,13 +12,14 @@ from blurred_scene import camera, record
 from virest.camera.response import ResponseCurve
 from virest.degradation.row_motion import RowMotion
 from virest.restoration.seen_paths import (
+    BEST_PATH_PX,
     LEAST_FRAMES,
     MOST_FRAMES,
     PathScale,
     TilePowers,
     kept_powers,
     path_scale,
-    spread_evenly,
+    telling,
     tile_powers,
 )
 
@@ -66,7 +67,7 @@ def test_right_paths_are_not_contradicted() -> None:
 def test_a_movie_of_few_bits_is_doubted() -> None:
     """Its coder repeats the blur of frames before."""
     frames = shown(1.5)
-    much, few = path_scale(frames), path_scale(frames, bits_per_px=0.025)
+    much, few = path_scale(frames), path_scale(frames, bits_per_px=0.05)
     assert much is not None
     assert few is not None
     assert few.scale == much.scale
@@ -95,17 +96,23 @@ def test_lamps_are_passed_over() -> None:
 
 
 def test_lumas_pass_through_and_spectra_of_some_are_kept() -> None:
-    """In order and unchanged; a capture's livelier half is looked at, evenly, and not too much of it."""
+    """In order and unchanged."""
     picture = luma(record(camera()).picture)
     kept: dict[int, TilePowers] = {}
     passed = list(kept_powers(((n, picture) for n in range(5)), (1, 3, 9), CURVE, kept))
     assert [n for n, _ in passed] == [0, 1, 2, 3, 4]
     assert all(seen is picture for _, seen in passed)
     assert sorted(kept) == [1, 3]
-    chosen = spread_evenly(range(100), np.arange(100.0))
+
+
+def test_frames_are_looked_at_whose_paths_tell_most() -> None:
+    """Neither those that hardly moved nor those whose paths leave the tiles; evenly, and not too many."""
+    paths = BEST_PATH_PX * np.tile([0.01, 0.9, 30.0, 1.2], 30)
+    chosen = telling(range(120), paths)
     assert len(chosen) <= MOST_FRAMES
-    assert min(chosen) >= 49
-    assert max(chosen) > 90
+    assert {n % 4 for n in chosen} <= {1, 3}
+    assert min(chosen) < 10
+    assert max(chosen) > 105
 
 
 def test_an_account_reads_as_a_number_with_its_deviation() -> None:

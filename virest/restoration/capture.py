@@ -18,6 +18,7 @@ from virest.capture.join import median_period_s, outside_reason
 from virest.degradation.row_motion import FrameTranslation, RowMotion, frame_times_s, row_motion
 from virest.motion.alignment import (
     AGREEMENT_SLACK_S,
+    GUESSED_FOCAL,
     OffsetEstimate,
     check_agreement,
     choose_pairs,
@@ -37,7 +38,7 @@ from virest.restoration.frame import (
     restore_frame,
     unknown_parameters,
 )
-from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, spread_evenly
+from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import RestorationSettings
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
@@ -258,14 +259,16 @@ def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: f
 
 
 def _looked_at(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> tuple[int, ...]:
-    """Lively frames of those chosen, of which blur is to be seen."""
+    """Frames, of those chosen, in which the length of the blur is best seen."""
     frames = [capture.frames[index] for index in sorted(chosen) if capture.frames[index].exposure_s]
     if not frames:
         return ()
     rate_rad_s = np.linalg.norm(capture.imu.gyro_rad_s - profile.gyro_bias_rad_s, axis=1)
     offset_s = profile.time_offset_s or 0.0
-    path = np.interp([f.time_s + offset_s for f in frames], capture.imu.time_s, rate_rad_s)
-    return spread_evenly([f.index for f in frames], path * [f.exposure_s or 0.0 for f in frames])
+    at_frames = np.interp([f.time_s + offset_s for f in frames], capture.imu.time_s, rate_rad_s)
+    exposure_s = np.array([profile.shutter.true_exposure_s(f.exposure_s) for f in frames])
+    focal_px = profile.intrinsics.fx_px if profile.intrinsics else GUESSED_FOCAL * max(profile.width, profile.height)
+    return telling([f.index for f in frames], focal_px * at_frames * exposure_s)
 
 
 def _with_seen_paths(

@@ -37,12 +37,14 @@ MOST_TILES = 24
 """Tiles of a frame of which spectra are kept; the most blurred MANY_TILES of them are used."""
 LEAST_PATH_PX = 1.5
 """Frames whose median path is predicted shorter tell too little."""
+BEST_PATH_PX = SIDE / 5
+"""A path that fits into a tile so often cancels much and is seen whole: frames with about such paths are looked at."""
 LEAST_FRAMES = 4
 BELIEVED = 1 / 3
 """Part of all evidence, from the lowest frequency on, that is believed."""
 MODEL_STD = 0.1
 """How far, in the logarithm, right profiles are off: lenses, curves and paths that change over a tile."""
-STARVED_BITS = 0.05
+STARVED_BITS = 0.1
 """Bits a pixel at which a coder repeats so much of the frames before that the scale is known half as well."""
 MOST_CLIPPED = 0.002
 """Tiles with a larger part of clipped light are taken only where there are none better."""
@@ -184,10 +186,11 @@ def _best(evidence: Array) -> float:
     return float(np.interp(i + step, np.arange(len(SCALES)), np.log(SCALES)))
 
 
-def spread_evenly(numbers: Sequence[int], liveliness: Array) -> tuple[int, ...]:
-    """At most MOST_FRAMES of the livelier half of some frames, evenly over them."""
-    lively = [n for n, power in zip(numbers, liveliness, strict=True) if power >= np.median(liveliness)]
-    return tuple(lively[:: -(-len(lively) // MOST_FRAMES)])
+def telling(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
+    """At most MOST_FRAMES of some frames, evenly over the half of them whose paths are nearest to BEST_PATH_PX."""
+    off = np.abs(np.log(np.maximum(path_px, 1e-3) / BEST_PATH_PX))
+    near = [n for n, distance in zip(numbers, off, strict=True) if distance <= np.median(off)]
+    return tuple(near[:: -(-len(near) // MOST_FRAMES)])
 
 
 def kept_powers(
