@@ -276,9 +276,11 @@ def _with_seen_paths(
 ) -> RestorationPlan:
     """Say where the pictures show blur paths of another length than predicted, and take no step that then loses.
 
-    Tracked points see the middle of the exposures, and an offset found with them, or agreeing with them, holds for it.
+    Tracked points see the middle of the exposures, and an offset found with them holds for it.  A stated one that they
+    do not contradict, or only since the exposures are so much shorter or longer, stays.
     """
     profile = plan.contradicted or plan.profile
+    found_by_points = plan.contradicted is not None or given.time_offset_s is None
     if not powers or profile.intrinsics is None:
         return plan
     trajectory = integrate_gyro(capture.imu, profile)
@@ -293,13 +295,16 @@ def _with_seen_paths(
         return plan
     said = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
     shutter = profile.shutter
-    logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
-    to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
-    offset_s = (profile.time_offset_s or 0.0) + (1 - found.scale) * to_middle_s
+    offset_s, warnings = profile.time_offset_s or 0.0, plan.warnings
+    if found_by_points:
+        logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
+        to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
+        offset_s += (1 - found.scale) * to_middle_s
+        doubt_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
+        if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < doubt_s:
+            offset_s = given.time_offset_s
+            warnings = tuple(text for text in warnings if not text.startswith(OTHER_OFFSET))
     shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
-    warnings = plan.warnings
-    if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < OFFSET_DOUBT_S:
-        warnings = tuple(text for text in warnings if not text.startswith(OTHER_OFFSET))
     contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
     return replace(plan, warnings=(*warnings, said), contradicted=contradicted)
 
