@@ -18,6 +18,7 @@ from virest.capture.join import median_period_s, outside_reason
 from virest.degradation.row_motion import FrameTranslation, RowMotion, frame_times_s, row_motion
 from virest.motion.alignment import (
     AGREEMENT_SLACK_S,
+    COARSE_STEP_S,
     GUESSED_FOCAL,
     OffsetEstimate,
     check_agreement,
@@ -195,9 +196,10 @@ def plan_restoration(
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
             estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
+            offset_s, std_s = agreement.best_offset_s, COARSE_STEP_S
             if estimate.determined:
-                offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
-                plan = _with_doubt(plan, profile.time_offset_s, offset_s, estimate.std_s)
+                offset_s, std_s = estimate.at_readout(plan.profile.shutter.readout_time_s), estimate.std_s
+            plan = _with_doubt(plan, profile.time_offset_s, offset_s, std_s)
     if plan.copy_reason is not None:
         return plan
     if alignment is not None:
