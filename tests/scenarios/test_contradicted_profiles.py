@@ -25,22 +25,22 @@ def reasons(result: Result) -> set[str]:
 
 def test_an_exposure_stated_twice_too_long_deblurs_nothing(virest, work: Path):
     """Deblurring would ring in every frame; rows are still straightened, and the warning says what to run."""
-    capture = simulate(virest, work / "long", *OPTIONS.split(), 23, "--effect", "exposure_time=0.5")
-    result = process(virest, capture, work / "long-run", "--preset", "fast")
+    capture = simulate(virest, work / "stated-long", *OPTIONS.split(), 23, "--effect", "exposure_time=0.5")
+    result = process(virest, capture, work / "stated-long-run", "--preset", "fast")
     (warning,) = said(result, "blur paths")
     assert "exposure-scale" in warning
     assert {line["deblur"]["method"] for line in result.lines} == {"none"}
     assert any("blur elsewhere" in reason for reason in reasons(result))
-    recorded = process(virest, capture, work / "long-raw", "--deblur", "none", "--shutter", "none")
+    recorded = process(virest, capture, work / "stated-long-raw", "--deblur", "none", "--shutter", "none")
     assert np.all(psnrs_db(result, result, capture) > psnrs_db(recorded, result, capture))
 
 
 def test_an_offset_stated_wrong_makes_no_frame_worse(virest, work: Path):
     """Where the camera turns back within the error, frames are left as they are; elsewhere they still gain."""
-    capture = simulate(virest, work / "late", *OPTIONS.split(), 24, "--effect", "time_offset=-0.02")
-    result = process(virest, capture, work / "late-run", "--preset", "fast")
+    capture = simulate(virest, work / "stated-late", *OPTIONS.split(), 24, "--effect", "time_offset=-0.02")
+    result = process(virest, capture, work / "stated-late-run", "--preset", "fast")
     assert said(result, "time offset")
-    recorded = process(virest, capture, work / "late-raw", "--deblur", "none", "--shutter", "none")
+    recorded = process(virest, capture, work / "stated-late-raw", "--deblur", "none", "--shutter", "none")
     gain = psnrs_db(result, result, capture) - psnrs_db(recorded, result, capture)
     assert gain.min() > -0.2
     assert gain.mean() > 0.5
@@ -50,7 +50,7 @@ def test_an_offset_stated_wrong_makes_no_frame_worse(virest, work: Path):
 @pytest.mark.parametrize(("scene", "seed"), [("text", 25), ("bright", 26), ("photographs", 27)])
 def test_a_right_profile_is_not_contradicted(virest, work: Path, scene: str, seed: int):
     """Nothing is said of clock or blur, and no frame is left alone for it."""
-    capture = simulate(virest, work / f"right-{scene}", *OPTIONS.split(), seed, "--scene", scene)
-    result = process(virest, capture, work / "right-run", "--preset", "fast")
+    capture = simulate(virest, work / f"stated-right-{scene}", *OPTIONS.split(), seed, "--scene", scene)
+    result = process(virest, capture, work / "stated-right-run", "--preset", "fast")
     assert not said(result, "the pictures")
     assert not any("elsewhere" in reason for reason in reasons(result))
