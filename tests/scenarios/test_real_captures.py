@@ -1,5 +1,6 @@
 """Real phones and cameras: what can be said of their pictures is said, and nothing is damaged with confidence."""
 
+import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,17 @@ def test_captures_with_much_unknown_are_processed_with_reasons(virest, realdata:
     assert all(line["warnings"] for line in copied)
     assert_unchanged(result, realdata / name, copied)
     assert_undamaged(result, realdata / name)
+
+
+def test_a_stabiliser_and_a_slow_clock_that_hide_each_other_are_named(virest, realdata: Path, tmp_path: Path):
+    """A hand-shaken phone of which next to nothing is known: its clock was measured from two more of its clips."""
+    done = virest("diagnose", realdata / "nexus5_162941", "--json", "--out", tmp_path, timeout=300)
+    assert done.returncode == 0, done.stderr
+    found = {cause["name"]: cause["parameters"] for cause in json.loads(done.stdout)["causes"]}
+    assert {"clock_skew", "stabilisation"} <= set(found)
+    assert "time_offset" not in found
+    assert found["clock_skew"]["clock_skew"]["estimate"] == pytest.approx(0.005, abs=0.001)
+    assert 0.6 < found["stabilisation"]["fraction"]["estimate"] < 1.0
 
 
 def test_pictures_that_the_camera_stabilised_are_copied(virest, realdata: Path, tmp_path: Path):

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 SCREEN_POINTS = 1500
 """Points that a first look at a cause is fitted to."""
 CLOCKS = ("time_offset", "clock_skew")
+FURTHER_OFF = 1.1
+"""A far start of the clocks is tried unless points are off there by more than so many times as much."""
 CONSTANT_EXPOSURE = 0.03
 """Exposures within this part of their median are one."""
 
@@ -57,7 +59,10 @@ class Candidate:
 
 
 def worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate]) -> list[Candidate]:
-    """Without far starts of the clocks that are further off than where the model stands: a fit would only come back."""
+    """Without far starts of the clocks that are well further off than where the model stands: a fit would come back.
+
+    Those a little further off stay, for all else that is fitted was settled where the model stands.
+    """
     table = evidence.table(model, SCREEN_POINTS)
     here = _off_px(evidence, model, table)
     return [
@@ -65,7 +70,7 @@ def worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate
         for candidate in candidates
         if candidate.name not in CLOCKS
         or candidate.model.profile == model.profile
-        or _off_px(evidence, candidate.model, table) < here
+        or _off_px(evidence, candidate.model, table) < FURTHER_OFF * here
     ]
 
 

@@ -254,7 +254,8 @@ def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: Rest
             if picture is not None:
                 yield index, picture
 
-    return dataclasses.replace(plan_restoration(capture, profile, settings, decodable), copy_reason=None)
+    plan = plan_restoration(capture, profile, settings, decodable)
+    return dataclasses.replace(plan, copy_reason=None, contradicted=None)
 
 
 def _tracked(first: int, pictures: tuple[Picture, Picture], valid_px: tuple[Rectangle, Rectangle]) -> _Pair:

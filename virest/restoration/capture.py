@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s, outside_reason
-from virest.degradation.row_motion import FrameTranslation, frame_times_s, row_motion
+from virest.degradation.row_motion import FrameTranslation, RowMotion, frame_times_s, row_motion
 from virest.motion.alignment import (
     AGREEMENT_SLACK_S,
+    COARSE_STEP_S,
+    GUESSED_FOCAL,
     OffsetEstimate,
     check_agreement,
     choose_pairs,
@@ -25,6 +30,7 @@ from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
+from virest.motion.trajectory import Trajectory
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.frame import (
     RestoredFrame,
@@ -33,6 +39,7 @@ from virest.restoration.frame import (
     restore_frame,
     unknown_parameters,
 )
+from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import RestorationSettings
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
@@ -45,6 +52,8 @@ MIN_COARSE_EXPLAINED = 0.5
 """Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
 OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
 """A stated offset this far from the pictures' is warned of; a bias below three of this may be tracking's own."""
+OTHER_OFFSET = "the pictures put the time offset at"
+OTHER_PATHS = "the pictures show blur paths"
 NOT_ESTIMATED = "translation and depth not estimated: rotation only"
 FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
 
@@ -66,6 +75,9 @@ class RestorationPlan:
     """What the profile adds to the nominal model and is applied."""
     translations: Mapping[int, FrameTranslation] | None = None
     """By movie index, at the reference time that the settings name; None or missing: rotation only."""
+    contradicted: CameraProfile | None = None
+    """The profile as the pictures have it, where they contradict a stated value: no step is taken that would be a loss
+    by it; None: they do not."""
 
     def of(self, frames: Iterable[Frame]) -> RestorationPlan:
         """The plan as a worker needs it who has these frames only."""
@@ -89,15 +101,8 @@ def restore_frames(
         if trajectory is None:
             yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN)
             continue
-        motion = row_motion(
-            trajectory,
-            profile,
-            frame.time_s,
-            frame.exposure_s,
-            plan.settings.reference,
-            translations.get(frame.index),
-            lens,
-        )
+        moved = partial(_moved, trajectory, lens, frame, plan.settings.reference, translations.get(frame.index))
+        motion = moved(profile)
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, imu.time_s, plan.imu_gaps_s)
         if outside:
@@ -107,7 +112,19 @@ def restore_frames(
             said = degradation_parameters(motion, trajectory, plan.settings)
             yield copied_frame(frame, picture, profile, plan.copy_reason, said)
             continue
-        yield restore_frame(frame, picture, motion, trajectory, plan.settings)
+        seen = None if plan.contradicted is None else moved(plan.contradicted)
+        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen)
+
+
+def _moved(
+    trajectory: Trajectory,
+    lens: MovingLens | None,
+    frame: Frame,
+    reference: str,
+    translation: FrameTranslation | None,
+    profile: CameraProfile,
+) -> RowMotion:
+    return row_motion(trajectory, profile, frame.time_s, frame.exposure_s, reference, translation, lens)
 
 
 def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequence[int] = ()) -> tuple[Frame, ...]:
@@ -161,7 +178,10 @@ def plan_restoration(
         plan = _without_translation(plan, "no accelerometer")
     chosen = set(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0))
     runs = choose_runs(frames) if _wants_translation(profile, capture) else []
-    all_pairs = track_pairs(read_gray(sorted(chosen.union(runs))))
+    powers: dict[int, TilePowers] = {}
+    curve = profile.response or ResponseCurve("srgb")
+    looked_at = _looked_at(capture, profile, chosen) if settings.deblur != "none" else ()
+    all_pairs = track_pairs(kept_powers(read_gray(sorted(chosen.union(runs))), looked_at, curve, powers))
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
         plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))
@@ -176,12 +196,15 @@ def plan_restoration(
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
             estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
+            offset_s, std_s = agreement.best_offset_s, COARSE_STEP_S
             if estimate.determined:
-                offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
-                plan = _with_doubt(plan, profile.time_offset_s, offset_s, estimate.std_s)
-    if alignment is None or plan.copy_reason is not None:
+                offset_s, std_s = estimate.at_readout(plan.profile.shutter.readout_time_s), estimate.std_s
+            plan = _with_doubt(plan, profile.time_offset_s, offset_s, std_s)
+    if plan.copy_reason is not None:
         return plan
-    return _with_translations(plan, capture, alignment)
+    if alignment is not None:
+        plan = _with_translations(plan, capture, alignment)
+    return _with_seen_paths(plan, profile, capture, powers)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
@@ -237,8 +260,60 @@ def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: f
     """Say where the pictures put the clocks far from where the profile does."""
     if abs(offset_s - given_s) < max(OFFSET_DOUBT_S, 3 * std_s):
         return plan
-    said = f"the pictures put the time offset at {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
-    return replace(plan, warnings=(*plan.warnings, said))
+    said = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
+    contradicted = replace(plan.profile, time_offset_s=offset_s)
+    return replace(plan, warnings=(*plan.warnings, said), contradicted=contradicted)
+
+
+def _looked_at(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> tuple[int, ...]:
+    """Frames, of those chosen, in which the length of the blur is best seen."""
+    frames = [capture.frames[index] for index in sorted(chosen) if capture.frames[index].exposure_s]
+    if not frames:
+        return ()
+    rate_rad_s = np.linalg.norm(capture.imu.gyro_rad_s - profile.gyro_bias_rad_s, axis=1)
+    offset_s = profile.time_offset_s or 0.0
+    at_frames = np.interp([f.time_s + offset_s for f in frames], capture.imu.time_s, rate_rad_s)
+    exposure_s = np.array([profile.shutter.true_exposure_s(f.exposure_s) for f in frames])
+    focal_px = profile.intrinsics.fx_px if profile.intrinsics else GUESSED_FOCAL * max(profile.width, profile.height)
+    return telling([f.index for f in frames], focal_px * at_frames * exposure_s)
+
+
+def _with_seen_paths(
+    plan: RestorationPlan, given: CameraProfile, capture: Capture, powers: Mapping[int, TilePowers]
+) -> RestorationPlan:
+    """Say where the pictures show blur paths of another length than predicted, and take no step that then loses.
+
+    Tracked points see the middle of the exposures, and an offset found with them holds for it.  A stated one that they
+    do not contradict, or only since the exposures are so much shorter or longer, stays.
+    """
+    profile = plan.contradicted or plan.profile
+    found_by_points = plan.contradicted is not None or given.time_offset_s is None
+    if not powers or profile.intrinsics is None:
+        return plan
+    trajectory = integrate_gyro(capture.imu, profile)
+    lens, known = moving_lens(trajectory, profile), plan.translations or {}
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    shown = [
+        (_moved(trajectory, lens, frames[index], plan.settings.reference, known.get(index), profile), powers[index])
+        for index in sorted(powers)
+    ]
+    found = path_scale(shown, capture.bits_per_px)
+    if found is None or not found.contradicts:
+        return plan
+    said = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
+    shutter = profile.shutter
+    offset_s, warnings = profile.time_offset_s or 0.0, plan.warnings
+    if found_by_points:
+        logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
+        to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
+        offset_s += (1 - found.scale) * to_middle_s
+        doubt_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
+        if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < doubt_s:
+            offset_s = given.time_offset_s
+            warnings = tuple(text for text in warnings if not text.startswith(OTHER_OFFSET))
+    shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
+    contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
+    return replace(plan, warnings=(*warnings, said), contradicted=contradicted)
 
 
 def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:

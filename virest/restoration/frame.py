@@ -22,6 +22,7 @@ from virest.motion.trajectory import Trajectory, quaternion_wxyz
 from virest.restoration.bands import LevelsOfRows, bands
 from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture, clipped_anywhere
 from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept
+from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
@@ -74,11 +75,17 @@ class RestoredFrame:
 
 
 def restore_frame(
-    frame: Frame, picture: NDArray[np.uint8], motion: RowMotion, trajectory: Trajectory, settings: RestorationSettings
+    frame: Frame,
+    picture: NDArray[np.uint8],
+    motion: RowMotion,
+    trajectory: Trajectory,
+    settings: RestorationSettings,
+    seen: RowMotion | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
-    picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.
+    picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
+    pictures' own account, where that contradicts the profile's.
     """
     clock = _Clock()
     height, width = picture.shape[:2]
@@ -87,6 +94,8 @@ def restore_frame(
     longest_px = max(tile["length_px"] for tile in parameters["blur"]["tiles"])
     longest_px = float(equivalent_length_px(motion.profile, longest_px))
     method, why_not = _deblur_method(motion, settings, longest_px)
+    if seen is not None and method != "none" and deblurring_loses(motion, seen):
+        method, why_not = "none", (OTHER_BLUR,)
     straighten = settings.shutter != "none"
     anchor = 0.5 if straighten or settings.reference == "frame-middle" or method == "none" else 0.0
     light = frame_light(motion, anchor, straighten and motion.profile.readout_known)
@@ -99,6 +108,8 @@ def restore_frame(
         restored = _relit(picture, curve, light)
     clock.lap("deblur")
     source = _source_map(motion, settings, anchor, parameters["deblur"]["method"]) if straighten else None
+    if seen is not None and source is not None and straightening_loses(motion, seen, anchor):
+        source, why_not = None, (*why_not, OTHER_ROWS)
     valid_px = (0, 0, width, height)
     if source is not None:
         valid_px = valid_rectangle(source)

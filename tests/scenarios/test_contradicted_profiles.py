@@ -1,0 +1,56 @@
+"""A profile that is wrong in an ordinary way: what the pictures contradict is said, and not done to them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from story import Result, process, psnrs_db, simulate
+
+pytestmark = pytest.mark.scenario
+
+OPTIONS = "--width 480 --height 360 --frames 14 --rate 1.5 --exposure-ms 14 --seed"
+
+
+def said(result: Result, text: str) -> list[str]:
+    """Warnings about the whole capture that hold a text."""
+    return [warning for warning in result.account["warnings"] if text in warning]
+
+
+def reasons(result: Result) -> set[str]:
+    """All warnings of the frames."""
+    return {warning for line in result.lines for warning in line["warnings"]}
+
+
+def test_an_exposure_stated_twice_too_long_deblurs_nothing(virest, work: Path):
+    """Deblurring would ring in every frame; rows are still straightened, and the warning says what to run."""
+    capture = simulate(virest, work / "stated-long", *OPTIONS.split(), 23, "--effect", "exposure_time=0.5")
+    result = process(virest, capture, work / "stated-long-run", "--preset", "fast")
+    (warning,) = said(result, "blur paths")
+    assert "exposure-scale" in warning
+    assert {line["deblur"]["method"] for line in result.lines} == {"none"}
+    assert any("blur elsewhere" in reason for reason in reasons(result))
+    recorded = process(virest, capture, work / "stated-long-raw", "--deblur", "none", "--shutter", "none")
+    assert np.all(psnrs_db(result, result, capture) > psnrs_db(recorded, result, capture))
+
+
+def test_an_offset_stated_wrong_makes_no_frame_worse(virest, work: Path):
+    """Where the camera turns back within the error, frames are left as they are; elsewhere they still gain."""
+    capture = simulate(virest, work / "stated-late", *OPTIONS.split(), 24, "--effect", "time_offset=-0.02")
+    result = process(virest, capture, work / "stated-late-run", "--preset", "fast")
+    assert said(result, "time offset")
+    recorded = process(virest, capture, work / "stated-late-raw", "--deblur", "none", "--shutter", "none")
+    gain = psnrs_db(result, result, capture) - psnrs_db(recorded, result, capture)
+    assert gain.min() > -0.2
+    assert gain.mean() > 0.5
+    assert any("rows elsewhere" in reason for reason in reasons(result))
+
+
+@pytest.mark.parametrize(("scene", "seed"), [("text", 25), ("bright", 26), ("photographs", 27)])
+def test_a_right_profile_is_not_contradicted(virest, work: Path, scene: str, seed: int):
+    """Nothing is said of clock or blur, and no frame is left alone for it."""
+    capture = simulate(virest, work / f"stated-right-{scene}", *OPTIONS.split(), seed, "--scene", scene)
+    result = process(virest, capture, work / "stated-right-run", "--preset", "fast")
+    assert not said(result, "the pictures")
+    assert not any("elsewhere" in reason for reason in reasons(result))
