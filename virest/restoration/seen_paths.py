@@ -29,8 +29,10 @@ from virest.restoration.statistics.tile_power import MANY_TILES, cut, passed_pow
 
 Array = NDArray[np.float64]
 
-SCALES = np.geomspace(0.25, 2.0, 13)
+SCALES = np.geomspace(2**-2, 2**1.5, 15)
 """Path lengths over the predicted ones that are tried."""
+LONGEST = 2.2
+"""Longer ones are no estimate: a picture with little detail, or such as no lens gives, goes on to the last one tried."""
 MOST_FRAMES = 16
 """So many frames are looked at."""
 MOST_TILES = 24
@@ -77,7 +79,7 @@ class PathScale:
     @property
     def contradicts(self) -> bool:
         """Whether the predicted lengths are beyond doubt not what the pictures show."""
-        return abs(np.log(self.scale)) > SURE * self.std
+        return abs(np.log(self.scale)) > SURE * self.std and self.scale < LONGEST
 
     def __str__(self) -> str:
         return f"{self.scale:.2f} ± {self.scale * self.std:.2f}"
