@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 SCALES = np.geomspace(2**-2, 2**1.5, 15)
 """Path lengths over the predicted ones that are tried."""
 LONGEST = 2.2
-"""Longer ones are no estimate: a picture with little detail, or such as no lens gives, goes on to the last one tried."""
+"""Longer ones are no estimate: pictures with little detail, or such as no lens gives, go on to the last one tried."""
 MOST_FRAMES = 16
 """So many frames are looked at."""
 MOST_TILES = 24
