@@ -56,7 +56,8 @@ def test_velocity_and_depth_come_back_within_their_deviations(name: str) -> None
     seen = motions(camera, found)
     assert len(seen) == len(camera.stamp_s[::4])
     assert velocity_error(camera, found) < 0.05
-    deviation = [(m.velocity_m_s - camera.velocity_cam(s)) / m.std_m_s for s, m in seen]
+    std_m_s = found.velocity_std_m_s(np.array([m.reference_s for _, m in seen]))
+    deviation = np.array([m.velocity_m_s - camera.velocity_cam(s) for s, m in seen]) / std_m_s
     assert 0.2 < np.sqrt(np.mean(np.square(deviation))) < 1.5
     middle = camera.profile.intrinsics.rays(np.array([239.5, 319.5]))  # type: ignore[union-attr]
     depth = np.array([1 / (camera.plane(s) @ middle) for s, _ in seen])

@@ -12,7 +12,8 @@ from virest.camera.profile import CameraProfile, Extensions
 from virest.capture.records import NO_IMU, STARTUP, Frame
 from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.motion.optics import moving_lens
-from virest.restoration.capture import RestorationPlan, applied_extensions, at_true_times, resting_points
+from virest.restoration.capture import RestorationPlan, at_true_times
+from virest.restoration.planning import applied_extensions, resting_points
 from virest.restoration.settings import RestorationSettings
 
 

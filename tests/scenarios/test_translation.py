@@ -25,8 +25,9 @@ from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_frames, read_gray
 from virest.degradation.row_motion import FrameTranslation, frame_times_s
 from virest.evaluation.fidelity import psnr_db
-from virest.restoration.capture import RestorationPlan, plan_restoration, restore_frames
+from virest.restoration.capture import RestorationPlan, restore_frames
 from virest.restoration.frame import RestoredFrame
+from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import PRESETS
 
 pytestmark = pytest.mark.scenario
@@ -83,8 +84,12 @@ class Story:
 
     def psnr_db(self, plan: RestorationPlan, chosen: range = CHOSEN) -> np.ndarray[Any, Any]:
         """Of chosen frames, against truth, away from the edges."""
+        return self.psnrs_db(self.restored(plan, chosen))
+
+    def psnrs_db(self, frames: list[RestoredFrame]) -> np.ndarray[Any, Any]:
+        """Of restored frames, likewise."""
         found = []
-        for restored in self.restored(plan, chosen):
+        for restored in frames:
             truth = truth_picture(self.capture.folder, restored.frame.index)
             assert restored.picture is not None
             found.append(psnr_db(restored.picture, truth, (30, 30, truth.shape[1] - 30, truth.shape[0] - 30)))
@@ -130,11 +135,11 @@ def test_velocity_and_depth_are_found_and_restore_as_well_as_the_true_ones(story
     require_close(plan, told)
     assert {t.source for t in (plan.translations or {}).values()} == {"triangulated"}
     assert not any("rotation only" in warning for warning in plan.warnings)
-    plans = [replace(plan, translations=t) for t in (None, plan.translations, told.truth)]
-    turned, found, true = (told.psnr_db(p) for p in plans)
+    frames = [told.restored(replace(plan, translations=t)) for t in (None, plan.translations, told.truth)]
+    turned, found, true = map(told.psnrs_db, frames)
     assert (found - turned).mean() > 6, found - turned
     assert (found - turned).min() > -0.1
-    methods = [[frame.parameters["deblur"]["method"] for frame in told.restored(p)] for p in plans[1:]]
+    methods = [[frame.parameters["deblur"]["method"] for frame in way] for way in frames[1:]]
     alike = np.array([one == other for one, other in zip(*methods, strict=True)])
     assert np.count_nonzero(alike) >= len(alike) - 1
     assert (true - found)[alike].max() < 0.2

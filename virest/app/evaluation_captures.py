@@ -20,8 +20,9 @@ from virest.capture.video import MovieIndex, probe_movie, read_frames, read_gray
 from virest.degradation.row_motion import RowMotion, row_motion
 from virest.errors import CaptureError, OutputError
 from virest.motion.integration import integrate_gyro
-from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration, restore_frames
+from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
+from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import RestorationSettings
 
 Picture = NDArray[np.uint8]

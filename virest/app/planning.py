@@ -25,7 +25,8 @@ from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, VirestError
-from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration
+from virest.restoration.capture import RestorationPlan, at_true_times
+from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import RestorationSettings
 
 log = logging.getLogger(__name__)

@@ -34,8 +34,9 @@ from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.trajectory import Trajectory
-from virest.restoration.capture import RestorationPlan, at_true_times, plan_restoration, restore_frames
+from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
+from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import PRESETS, RestorationSettings
 
 Array = NDArray[np.float64]

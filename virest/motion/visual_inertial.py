@@ -19,6 +19,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.motion.depth import FrameDepth, Sights, TriangulatedPoints, frame_depth, triangulate, triangulate_relief
+from virest.motion.displacement import Displacement
 from virest.motion.observed_tracks import WINDOW_S, ObservedTracks
 from virest.motion.optics import settling_time_s
 from virest.motion.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT, TIME_OFFSET
@@ -187,7 +188,10 @@ class Stretch:
             nearness_slope[:, k] = (nearer - nearness) / quotient
         own = len(quotients) + 7 + 6 * window
         back = np.swapaxes(rotation, -1, -2)
-        slope[..., len(quotients) : len(quotients) + 7] = back @ self._velocity_slope(window, stamp_s)
+        time_s = np.asarray(self.fit.profile.imu_time_s(stamp_s))
+        moves, origin = self.fit.ground.displacement, np.array([self.origin_s(window)])
+        assert moves is not None
+        slope[..., len(quotients) : len(quotients) + 7] = back @ _velocity_slope(moves, time_s, origin)
         slope[..., own : own + 3] = back
         nearness_slope[:, own + 3 : own + 6] = rotation[..., 2]
         return velocity, nearness, slope, nearness_slope
@@ -203,31 +207,18 @@ class Stretch:
         moves, scene = known.displacement, self.scene
         assert moves is not None
         origin = np.array([float(known.profile.imu_time_s(self.table.origin_s[window]))])
-        per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin, 1)).reshape(-1, 3, 3)
-        per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin, 1)
-        since = (time_s - origin)[:, None]
+        slope = _velocity_slope(moves, time_s, origin)
+        own = np.concatenate([scene.gravity_m_s2, scene.accel_bias_m_s2, [scene.accel_delay_s]])
         velocity = scene.velocity_m_s[window] + moves.path(time_s, 1) - moves.path(origin, 1)
-        velocity = velocity + since * scene.gravity_m_s2 - per_bias @ scene.accel_bias_m_s2
         # the IMU's distance from the camera adds −R (ω × p_cam_imu)
         turning = np.cross(known.trajectory.rate_rad_s(time_s), moves.arm_cam_m)
         arm = np.einsum("nij,nj->ni", known.trajectory.orientation(time_s), turning)
-        return np.asarray(velocity + per_delay * scene.accel_delay_s - arm)
-
-    def _velocity_slope(self, window: int, stamp_s: Array) -> Array:
-        """Change (n, 3, 7) of the velocity per unit of gravity, accelerometer bias and delay."""
-        moves = self.fit.ground.displacement
-        assert moves is not None
-        time_s, origin = np.asarray(self.fit.profile.imu_time_s(stamp_s)), np.array([self.origin_s(window)])
-        per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin, 1)).reshape(-1, 3, 3)
-        per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin, 1)
-        since = (time_s - origin)[:, None, None] * np.eye(3)
-        return np.concatenate([since, -per_bias, per_delay[..., None]], axis=-1)
+        return np.asarray(velocity + slope @ own - arm)
 
     def plane_std_per_m(self, window: int) -> float:
         """Standard deviation of the plane's inverse depth along the optical axis at the window's middle."""
-        slope = self._seen(window, self.table.origin_s[[window]])[3]
-        nearness = self._seen_from(self.fit.ground, window, self.table.origin_s[[window]])[1][0]
-        return float(np.hypot(np.sqrt(self.fit.doubt.of(slope[:, None, :])[0, 0, 0]), ACCEL_SCALE_STD * nearness))
+        _, nearness, _, slope = self._seen(window, self.table.origin_s[[window]])
+        return float(np.hypot(np.sqrt(self.fit.doubt.of(slope[:, None, :])[0, 0, 0]), ACCEL_SCALE_STD * nearness[0]))
 
     def place(self, window: int, time_s: Array) -> Array:
         """Camera's centre (n, 3) from its place at the window's middle, world axes."""
@@ -275,14 +266,22 @@ class Stretch:
         return View(time_s, self.fit.ground.trajectory.orientation(time_s), place, plane_per_m)
 
 
+def _velocity_slope(moves: Displacement, time_s: Array, origin_s: Array) -> Array:
+    """Change (n, 3, 7) of the velocity since an origin (1,) per unit of gravity, accelerometer bias and delay."""
+    per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin_s, 1)).reshape(-1, 3, 3)
+    per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin_s, 1)
+    since = (time_s - origin_s)[:, None, None] * np.eye(3)
+    return np.concatenate([since, -per_bias, per_delay[..., None]], axis=-1)
+
+
 @dataclass(frozen=True, slots=True)
 class FrameMotion:
     """The camera's centre over one frame, and what it looked at; camera axes at the frame's reference time."""
 
     velocity_m_s: Array
     """(3,) at the reference time."""
-    std_m_s: Array
-    """(3,) standard deviations of the velocity."""
+    reference_s: float
+    """Camera clock."""
     acceleration_m_s2: Array
     """(3,) mean over the frame, without gravity."""
     depth: FrameDepth
@@ -344,10 +343,25 @@ class VisualInertialAlignment:
         time_s = np.asarray(known.profile.imu_time_s(np.array([reference_s, start_s, max(end_s, start_s + 1e-3)])))
         velocity = stretch.velocity(window, time_s)
         rotation = known.trajectory.orientation(time_s[0])
-        std = np.sqrt(np.diag(stretch.seen_velocity(window, np.array([reference_s]))[1][0]))
         acceleration = (velocity[2] - velocity[1]) / (time_s[2] - time_s[1])
         depth = stretch.depth(window, float(time_s[0]))
-        return FrameMotion(velocity[0] @ rotation, std, acceleration @ rotation, depth, unscaled)
+        return FrameMotion(velocity[0] @ rotation, reference_s, acceleration @ rotation, depth, unscaled)
+
+    def velocity_std_m_s(self, camera_time_s: Array) -> Array:
+        """Standard deviations (n, 3) of the velocity in camera axes at times (n,); NaN where metres are not known.
+
+        Each takes the velocity a dozen times, all of a window's at once: for one frame after the other that is slow.
+        """
+        places = [self.find(float(time_s)) for time_s in camera_time_s]
+        known = [(None, -1) if isinstance(place, str) else place for place in places]
+        found = np.full((len(places), 3), np.nan)
+        for stretch in self.stretches:
+            for window in range(len(stretch.windows)):
+                here = np.array([one is stretch and number == window for one, number in known])
+                if here.any():
+                    covariance = stretch.seen_velocity(window, camera_time_s[here])[1]
+                    found[here] = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        return found
 
     def clock(self) -> tuple[float, float] | None:
         """Time offset and its standard deviation over the stretches with usable windows; None: there are none."""

@@ -25,7 +25,7 @@ from virest.degradation.row_motion import RowMotion
 from virest.restoration.blurred import CLIPPED_LEVELS
 from virest.restoration.statistics.ring_fit import ROUNDING_POWER, RingCells
 from virest.restoration.statistics.rings import RINGS, SIDE
-from virest.restoration.statistics.tile_power import MANY_TILES, cut, passed_power, windowed_power
+from virest.restoration.statistics.tile_power import MANY_TILES, cut, evenly_steep, passed_power, windowed_power
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,8 @@ def tile_powers(luma: NDArray[np.uint8], curve: ResponseCurve) -> TilePowers | N
     rows, columns = (np.linspace(0, length - SIDE, -(-length // SIDE)).astype(int) for length in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
     corners = _least_clipped(luma, corners[:: -(-len(corners) // MOST_TILES)], curve)
-    power = [windowed_power(_light(cut(luma, (int(top), int(left))), curve)) for top, left in corners]
+    tiles = (cut(luma, (int(top), int(left))) for top, left in corners)
+    power = [windowed_power(evenly_steep(cv2.LUT(tile, curve.linear_table()), curve)) for tile in tiles]
     return TilePowers(corners[:, ::-1].astype(float) + (SIDE - 1) / 2, np.stack(power))
 
 
@@ -121,13 +122,6 @@ def _least_clipped(luma: NDArray[np.uint8], corners: NDArray[np.intp], curve: Re
     lost = cv2.LUT(luma, clipped.astype(np.uint8))
     parts = np.array([cut(lost, (int(top), int(left))).mean() for top, left in corners])
     return corners[parts <= max(MOST_CLIPPED, float(np.quantile(parts, 0.25)))]
-
-
-def _light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
-    """Light of a luma tile as grey levels of the straight curve through its mean."""
-    light = cv2.LUT(tile, curve.linear_table())
-    level = 255 * float(curve.encode(np.array(light.mean())))
-    return np.asarray(light * np.interp(level, np.arange(256), curve.slope_table()), np.float32)
 
 
 def _evidence(motion: RowMotion, tiles: TilePowers) -> Array | None:

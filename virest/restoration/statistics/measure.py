@@ -17,6 +17,7 @@ from virest.restoration.statistics.rings import SIDE
 from virest.restoration.statistics.tile_power import (
     MANY_TILES,
     cut,
+    evenly_steep,
     known_part,
     passed_power,
     white_noise,
@@ -56,7 +57,9 @@ def measure_picture(
         return np.stack([windowed_power(part[plane], seen) for part, seen in tiles])
 
     tiles = zip(chosen, known, strict=True)
-    light = np.stack([windowed_power(_evenly_steep(cut(picture, corners[i]), curve), seen) for i, seen in tiles])
+    light = np.stack(
+        [windowed_power(evenly_steep(_luma_light(cut(picture, corners[i]), curve), curve), seen) for i, seen in tiles]
+    )
     colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
     luma, red, _ = cv2.split(cv2.cvtColor(_some_rows(picture), cv2.COLOR_RGB2YCrCb))
     cells, white_levels = RingCells(passed), white_noise(luma)
@@ -80,12 +83,10 @@ def _some_rows(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return picture[: height - height % 8].reshape(-1, 8, width, channels)[:, :4].reshape(-1, width, channels)
 
 
-def _evenly_steep(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
-    """Light of a tile (height, width, 3) as grey levels (height, width) of the straight curve through its mean."""
+def _luma_light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
+    """Luma of the light of a tile (height, width, 3), (height, width)."""
     weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
-    light = cv2.transform(cv2.LUT(tile, curve.linear_table()), weights)
-    mean_level = 255 * float(curve.encode(np.array(light.mean())))
-    return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
+    return np.asarray(cv2.transform(cv2.LUT(tile, curve.linear_table()), weights), np.float32)
 
 
 def _least_clipped(

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.response import ResponseCurve
 from virest.restoration.statistics.rings import SIDE
 
 _WINDOW = np.outer(np.hanning(SIDE + 2)[1:-1], np.hanning(SIDE + 2)[1:-1]).astype(np.float32)
@@ -21,6 +22,12 @@ _FILLING_PX = (5, 15, 45, 135)
 def cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]:
     """The tile of a plane or picture whose top and left these are."""
     return plane[corner[0] : corner[0] + SIDE, corner[1] : corner[1] + SIDE]
+
+
+def evenly_steep(light: NDArray[np.float32], curve: ResponseCurve) -> NDArray[np.float32]:
+    """Light of a tile (height, width) as grey levels of the straight curve through its mean."""
+    mean_level = 255 * float(curve.encode(np.array(light.mean())))
+    return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
 
 
 def known_part(

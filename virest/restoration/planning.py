@@ -1,0 +1,402 @@
+"""What is asked of a capture once, before its frames are restored: what the profile leaves open, and if it is right.
+
+Unknown values are filled in from tracked points; clocks and blur paths that the profile states are compared with what
+the pictures show; the camera's travel and the scene's depth are found where the capture tells them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import STAMP_FRACTION
+from virest.capture.folder import Capture, Frame
+from virest.degradation.row_motion import FrameTranslation, frame_times_s
+from virest.motion.alignment import (
+    AGREEMENT_SLACK_S,
+    COARSE_STEP_S,
+    GUESSED_FOCAL,
+    OffsetEstimate,
+    check_agreement,
+    choose_pairs,
+    estimate_time_offset,
+)
+from virest.motion.coarse_alignment import align_coarsely
+from virest.motion.integration import integrate_gyro
+from virest.motion.observed_tracks import observe_tracks
+from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.tracking import TrackPair, track_pairs
+from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
+from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
+from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
+from virest.restoration.settings import RestorationSettings
+
+GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
+MAX_OFFSET_STD_S = 0.003
+"""An estimated offset known no better than this restores nothing: at a hand's 30 rad/s² the rates, and so the blur
+paths, would be off by 0.1 rad/s."""
+MAX_FOCAL_SPREAD = 0.05
+"""An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
+MIN_COARSE_EXPLAINED = 0.5
+"""Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
+OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
+"""A stated offset this far from the pictures' is warned of; a bias below three of this may be tracking's own."""
+OTHER_OFFSET = "the pictures put the time offset at"
+OTHER_PATHS = "the pictures show blur paths"
+NOT_ESTIMATED = "translation and depth not estimated: rotation only"
+
+
+def plan_restoration(
+    capture: Capture,
+    profile: CameraProfile,
+    settings: RestorationSettings,
+    read_gray: GrayReader,
+) -> RestorationPlan:
+    """Fill what the profile leaves open from a few dozen frames, and ask whether pictures and gyroscope agree at all.
+
+    read_gray: gives (index, luma) of the frames asked for, in order.  The cost does not grow with the movie.
+    """
+    plan = RestorationPlan(
+        profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
+    )
+    frames = tuple(
+        replace(f, skip_reason=None) if settings.keep_start_up and f.only_startup else f
+        for f in capture.frames[profile.extensions.frame_lag_frames :]
+    )
+    if not any(f.skip_reason is None for f in frames):
+        return plan
+    if profile.depth_m is None and not capture.imu.has_accelerometer:
+        plan = _without_translation(plan, "no accelerometer")
+    chosen = set(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0))
+    runs = choose_runs(frames) if _wants_translation(profile, capture) else []
+    powers: dict[int, TilePowers] = {}
+    curve = profile.response or ResponseCurve("srgb")
+    looked_at = _looked_at(capture, profile, chosen) if settings.deblur != "none" else ()
+    all_pairs = track_pairs(kept_powers(read_gray(sorted(chosen.union(runs))), looked_at, curve, powers))
+    tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
+    if profile.time_offset_s is None or profile.intrinsics is None:
+        plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))
+    alignment = None
+    if runs and plan.profile.intrinsics is not None:
+        alignment = _aligned(plan.profile, profile, capture, all_pairs)
+        plan = _with_clock(plan, profile, alignment)
+    if plan.copy_reason is None and not _clock_agrees(alignment, plan.profile):
+        pairs = _through_resting_lens(tracked, capture, plan.profile)
+        agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
+        if not agreement.agrees:
+            plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
+        elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
+            estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
+            offset_s, std_s = agreement.best_offset_s, COARSE_STEP_S
+            if estimate.determined:
+                offset_s, std_s = estimate.at_readout(plan.profile.shutter.readout_time_s), estimate.std_s
+            plan = _with_doubt(plan, profile.time_offset_s, offset_s, std_s)
+    if plan.copy_reason is not None:
+        return plan
+    if alignment is not None:
+        plan = _with_translations(plan, capture, alignment)
+    return _with_seen_paths(plan, profile, capture, powers)
+
+
+# ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _wants_translation(profile: CameraProfile, capture: Capture) -> bool:
+    """A scene at infinity has no parallax; without an accelerometer there is no displacement in metres."""
+    far = profile.depth_m is not None and np.isinf(profile.depth_m)
+    return not far and capture.imu.has_accelerometer
+
+
+def _aligned(
+    filled: CameraProfile, given: CameraProfile, capture: Capture, pairs: list[TrackPair]
+) -> VisualInertialAlignment:
+    """Fit the translation; where the offset could not be told from turns alone, from where they agree best.
+
+    Pictures that travel and hardly turn agree nowhere: clocks are then taken as common, which a phone's nearly are, and
+    the fit is judged by what it explains.
+    """
+    observed = observe_tracks(capture, pairs, filled)
+    start = filled
+    if given.time_offset_s is None and "time_offset_s" not in filled.estimates and len(observed.pairs):
+        coarse = align_coarsely(observed.turns(filled), capture.imu, filled)
+        found = coarse is not None and coarse.explained >= MIN_COARSE_EXPLAINED and not coarse.at_end
+        offset_s = coarse.time_offset_s if coarse is not None and found else 0.0
+        start = filled.with_estimate("time_offset_s", offset_s, None, "coarse", time_offset_s=offset_s)
+    return align(observed, capture.imu, start, given.depth_m)
+
+
+def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualInertialAlignment) -> RestorationPlan:
+    """Take the joint fit's offset and bias over where the profile has none; say where it contradicts a stated one."""
+    clock, bias = alignment.clock(), alignment.gyro_bias()
+    if clock is None or bias is None:
+        return plan
+    offset_s, std_s = clock
+    if std_s > MAX_OFFSET_STD_S:
+        return plan
+    if given.time_offset_s is not None:
+        return _with_doubt(plan, given.time_offset_s, offset_s, std_s)
+    source = "tracked points against gyroscope and accelerometer"
+    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
+    values, spread = bias[0], np.hypot(bias[1], BIAS_FLOOR_RAD_S)
+    if np.any(np.abs(values) > 3 * spread):
+        held = tuple(float(value) for value in values)
+        profile = profile.with_estimate("gyro_bias_rad_s", list(held), spread.tolist(), source, gyro_bias_rad_s=held)
+    warnings = tuple(text for text in plan.warnings if not text.startswith("time offset"))
+    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
+    copy = None if plan.copy_reason and plan.copy_reason.startswith("time offset") else plan.copy_reason
+    return replace(plan, profile=profile, warnings=(*warnings, said), copy_reason=copy)
+
+
+def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
+    """Say where the pictures put the clocks far from where the profile does."""
+    if abs(offset_s - given_s) < max(OFFSET_DOUBT_S, 3 * std_s):
+        return plan
+    said = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
+    contradicted = replace(plan.profile, time_offset_s=offset_s)
+    return replace(plan, warnings=(*plan.warnings, said), contradicted=contradicted)
+
+
+def _looked_at(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> tuple[int, ...]:
+    """Frames, of those chosen, in which the length of the blur is best seen."""
+    frames = [capture.frames[index] for index in sorted(chosen) if capture.frames[index].exposure_s]
+    if not frames:
+        return ()
+    rate_rad_s = np.linalg.norm(capture.imu.gyro_rad_s - profile.gyro_bias_rad_s, axis=1)
+    offset_s = profile.time_offset_s or 0.0
+    at_frames = np.interp([f.time_s + offset_s for f in frames], capture.imu.time_s, rate_rad_s)
+    exposure_s = np.array([profile.shutter.true_exposure_s(f.exposure_s) for f in frames])
+    focal_px = profile.intrinsics.fx_px if profile.intrinsics else GUESSED_FOCAL * max(profile.width, profile.height)
+    return telling([f.index for f in frames], focal_px * at_frames * exposure_s)
+
+
+def _with_seen_paths(
+    plan: RestorationPlan, given: CameraProfile, capture: Capture, powers: Mapping[int, TilePowers]
+) -> RestorationPlan:
+    """Say where the pictures show blur paths of another length than predicted, and take no step that then loses.
+
+    Tracked points see the middle of the exposures, and an offset found with them holds for it.  A stated one that they
+    do not contradict, or only since the exposures are so much shorter or longer, stays.
+    """
+    profile = plan.contradicted or plan.profile
+    found_by_points = plan.contradicted is not None or given.time_offset_s is None
+    if not powers or profile.intrinsics is None:
+        return plan
+    trajectory = integrate_gyro(capture.imu, profile)
+    lens, known = moving_lens(trajectory, profile), plan.translations or {}
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    shown = [
+        (
+            moved_over_frame(trajectory, lens, frames[index], plan.settings.reference, known.get(index), profile),
+            powers[index],
+        )
+        for index in sorted(powers)
+    ]
+    found = path_scale(shown, capture.bits_per_px)
+    if found is None or not found.contradicts:
+        return plan
+    said = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
+    shutter = profile.shutter
+    offset_s, warnings = profile.time_offset_s or 0.0, plan.warnings
+    if found_by_points:
+        logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
+        to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
+        offset_s += (1 - found.scale) * to_middle_s
+        doubt_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
+        if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < doubt_s:
+            offset_s = given.time_offset_s
+            warnings = tuple(text for text in warnings if not text.startswith(OTHER_OFFSET))
+    shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
+    contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
+    return replace(plan, warnings=(*warnings, said), contradicted=contradicted)
+
+
+def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:
+    """Whether a trusted joint fit already shows that pictures and gyroscope belong together."""
+    clock = None if alignment is None else alignment.clock()
+    return clock is not None and abs(clock[0] - (profile.time_offset_s or 0.0)) < AGREEMENT_SLACK_S
+
+
+def _with_translations(plan: RestorationPlan, capture: Capture, alignment: VisualInertialAlignment) -> RestorationPlan:
+    """Velocity, acceleration and plane of every frame that has them, and an account of both kinds."""
+    profile, reference = plan.profile, plan.settings.reference
+    frames = [f for f in at_true_times(capture.frames, profile, capture.repeats) if np.isfinite(f.time_s)]
+    motions = {frame.index: _motion(alignment, profile, frame, reference) for frame in frames}
+    known = {index: motion for index, motion in motions.items() if isinstance(motion, FrameMotion)}
+    if not known:
+        return _without_translation(plan, alignment.refused or "no frames")
+    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
+    open_frames = [motion for index, motion in motions.items() if index not in known]
+    if open_frames:
+        reason = max(map(str, open_frames), key=[str(motion) for motion in open_frames].count)
+        warnings = (*warnings, f"{NOT_ESTIMATED} in {len(open_frames)} of {len(motions)} frames ({reason})")
+    unscaled = [motion.unscaled for motion in known.values() if motion.unscaled]
+    if unscaled:
+        reason = max(unscaled, key=unscaled.count)
+        said = f"travel known over depth, not in metres, in {len(unscaled)} of {len(motions)} frames ({reason})"
+        warnings = (*warnings, said)
+    translations = {index: _translation(motion, profile.depth_m) for index, motion in known.items()}
+    scaled = [motion for motion in known.values() if not motion.unscaled]
+    notes = (*plan.notes, _account(scaled, alignment)) if scaled else plan.notes
+    return replace(plan, warnings=warnings, notes=notes, translations=translations)
+
+
+def _without_translation(plan: RestorationPlan, reason: str) -> RestorationPlan:
+    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
+    return replace(plan, warnings=(*warnings, f"{NOT_ESTIMATED} ({reason})"))
+
+
+def _motion(
+    alignment: VisualInertialAlignment, profile: CameraProfile, frame: Frame, reference: str
+) -> FrameMotion | str:
+    """Motion over the frame's exposure and readout, at the instants that the alignment's own clock gives them."""
+    start_s, reference_s = frame_times_s(profile, frame.time_s, frame.exposure_s, reference)
+    last_s = start_s + profile.shutter.readout_time_s + profile.shutter.true_exposure_s(frame.exposure_s or 0.0)
+    camera = [(t - (profile.time_offset_s or 0.0)) / (1 + profile.clock_skew) for t in (reference_s, start_s, last_s)]
+    return alignment.frame(*camera)
+
+
+def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTranslation:
+    """A stated depth is the one logged; the plane is then tilted as the pictures say, at that depth."""
+    depth = motion.depth
+    found_m = None if motion.unscaled else depth.depth_m
+    return FrameTranslation(
+        motion.velocity_m_s,
+        motion.acceleration_m_s2,
+        depth.plane_per_m,
+        found_m if stated_depth_m is None else stated_depth_m,
+        "triangulated" if stated_depth_m is None else "profile",
+        depth.relief,
+        not motion.unscaled,
+    )
+
+
+def _account(known: list[FrameMotion], alignment: VisualInertialAlignment) -> str:
+    depth, std = (np.median([getattr(m.depth, name) for m in known]) for name in ("depth_m", "std_m"))
+    speed = np.sqrt(np.mean([(m.velocity_m_s**2).sum() for m in known]))
+    std_m_s = alignment.velocity_std_m_s(np.array([m.reference_s for m in known]))
+    spread = np.sqrt(np.nanmean((std_m_s**2).sum(axis=1)))
+    points = int(np.median([m.depth.points for m in known]))
+    return (
+        f"translation of {len(known)} frames from pictures and accelerometer: velocity {speed:.3f} ± {spread:.3f} m/s "
+        f"rms, depth {depth:.2f} ± {std:.2f} m in the middle, from some {points} points a frame"
+    )
+
+
+def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
+    """What the profile adds to the nominal model, one line each, and what becomes of it."""
+    ext = profile.extensions
+    lines = {
+        f"focal drift of {ext.focal_drift_per_s:+g} a second: followed": ext.focal_drift_per_s,
+        f"stabiliser cancelling {ext.stabilisation_fraction:g} above {ext.stabilisation_cutoff_hz:g} Hz: followed": (
+            ext.stabilisation_fraction
+        ),
+        f"frame lag of {ext.frame_lag_s:g} s at the start: first {ext.frame_lag_frames} frames at their true times": (
+            ext.frame_lag_frames
+        ),
+        f"vignetting of {ext.vignetting_corner_loss:g}: moved with the picture's place": ext.vignetting_corner_loss,
+        f"flicker of {ext.flicker_amplitude:g} at {ext.flicker_frequency_hz:g} Hz: undone": ext.flicker_amplitude,
+        f"gain of {len(ext.gain)} frames: kept, it is common to a whole frame": len(ext.gain),
+        f"defocus of {ext.defocus_sigma_px:g} px: undone with the blur": ext.defocus_sigma_px,
+    }
+    return tuple(line for line, size in lines.items() if size)
+
+
+def _through_resting_lens(pairs: list[TrackPair], capture: Capture, profile: CameraProfile) -> list[TrackPair]:
+    """Tracks as the profile's lens would show them at stamp_0 and with its stabiliser at rest.
+
+    Where clocks or focal length are not known yet, the lens's path is not either, and tracks stay as they are.
+    """
+    ext = profile.extensions
+    moves = ext.focal_drift_per_s or ext.stabilisation_fraction
+    if not moves or profile.intrinsics is None or profile.time_offset_s is None:
+        return pairs
+    lens = moving_lens(integrate_gyro(capture.imu, profile), profile)
+
+    def resting(index: int, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        return resting_points(lens, profile, capture.frames[index], points_px)
+
+    return [
+        replace(
+            pair,
+            points_first_px=resting(pair.first, pair.points_first_px),
+            points_second_px=resting(pair.second, pair.points_second_px),
+        )
+        for pair in pairs
+    ]
+
+
+def resting_points(
+    lens: MovingLens, profile: CameraProfile, frame: Frame, points_px: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points (n, 2) of a frame, each seen in the middle of its row's exposure, through the lens at rest."""
+    shutter, logged = profile.shutter, frame.exposure_s or 0.0
+    start_s = profile.imu_time_s(shutter.first_row_start_s(frame.time_s, logged))
+    rows_s = shutter.readout_fraction(points_px, profile.width, profile.height) * shutter.readout_time_s
+    time_s = start_s + rows_s + 0.5 * shutter.true_exposure_s(logged)
+    return lens.lens.project(lens.rays(points_px, time_s))
+
+
+def _times(capture: Capture) -> tuple[list[float], list[float | None]]:
+    return [f.time_s for f in capture.frames], [f.exposure_s for f in capture.frames]
+
+
+def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[str, ...]:
+    """A warning for each value that a documented default stands in for."""
+    warnings = []
+    if profile.response is None:
+        warnings.append("response curve unknown: srgb taken")
+    if not profile.readout_known:
+        warnings.append("readout time unknown: 0 taken, rows are not straightened")
+    if all(frame.exposure_s is None for frame in capture.frames):
+        warnings.append("exposure times unknown: frames are not deblurred")
+    if profile.depth_m is None:
+        warnings.append(NOT_ESTIMATED)
+    return tuple(warnings)
+
+
+def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> RestorationPlan:
+    """The plan with time offset, gyroscope bias and focal length as far as the pictures determine them."""
+    estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
+    plan = _with_focal(plan, estimate)
+    if plan.profile.time_offset_s is not None:
+        return plan
+    if not estimate.determined:
+        warning = f"time offset not determined ({estimate.reason}): 0 taken"
+        return replace(plan, profile=replace(plan.profile, time_offset_s=0.0), warnings=(*plan.warnings, warning))
+    offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
+    profile = plan.profile.with_estimate(
+        "time_offset_s", offset_s, estimate.std_s, "tracked points against the gyroscope", time_offset_s=offset_s
+    )
+    profile = _with_bias(profile, estimate)
+    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {estimate.std_s * 1e3:.2f} ms"
+    plan = replace(plan, profile=profile, warnings=(*plan.warnings, said))
+    if estimate.std_s > MAX_OFFSET_STD_S and plan.copy_reason is None:
+        return replace(plan, copy_reason=f"time offset only known to ± {estimate.std_s * 1e3:.1f} ms")
+    return plan
+
+
+def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfile:
+    """Take the gyroscope's bias over where it is significant and no parallax can have faked it."""
+    bias, std = np.array(estimate.bias_rad_s), np.array(estimate.bias_std_rad_s)
+    if estimate.translation != "rotation" or not np.all(np.isfinite(std)) or np.all(np.abs(bias) < 3 * std):
+        return profile
+    source = "tracked points against the gyroscope"
+    values = tuple(float(b) for b in bias)
+    return profile.with_estimate("gyro_bias_rad_s", list(values), std.tolist(), source, gyro_bias_rad_s=values)
+
+
+def _with_focal(plan: RestorationPlan, estimate: OffsetEstimate) -> RestorationPlan:
+    """Take the focal length over where the profile has none and the pictures determine it well enough."""
+    profile = plan.profile
+    if profile.intrinsics is not None:
+        return plan
+    focal, std = estimate.focal_px, estimate.focal_std_px
+    if focal is None or std is None or std > MAX_FOCAL_SPREAD * focal:
+        known = "" if focal is None or std is None else f" (about {focal:.0f} ± {std:.0f} px)"
+        return replace(plan, copy_reason=FOCAL_UNKNOWN + known)
+    return replace(plan, profile=profile.with_focal(focal, std, "tracked points against the gyroscope"))
