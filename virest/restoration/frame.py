@@ -50,6 +50,8 @@ PART_STEP_PX = 80
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
+_LEAST_FALL = 2.0
+"""The power of pictures falls with frequency at least so steeply: f⁻² is that of edges alone, without texture."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -326,19 +328,28 @@ def _measured(
 
 
 def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics:
-    """Spectra of the picture before a Gaussian came over it; where that left less than the noise, S falls as f⁻³."""
+    """Spectra of the picture before a Gaussian came over it.
+
+    The Gaussian leaves next to nothing of high frequencies, and what is recorded there divided by next to nothing is no
+    picture: no scene's power falls slower than f⁻².  So S is held to that law ring by ring, and what was recorded
+    beyond it counts as noise; where less than the noise is left, S falls as f⁻³.
+    """
     if not sigma_px or not defocused.measured:
         return defocused
     frequency = defocused.frequency
     left = np.exp(-((2 * np.pi * sigma_px * frequency) ** 2))
-    signal = defocused.signal / left
-    drowned = np.flatnonzero(defocused.passed * defocused.signal < defocused.noise)
+    through = defocused.passed * defocused.signal
+    rise, signal = frequency**_LEAST_FALL, defocused.signal / left
+    signal[1:] = np.minimum.accumulate((signal * rise)[1:]) / rise[1:]
+    passed = defocused.passed * left
+    noise = np.maximum(defocused.noise, through - passed * signal)
+    drowned = np.flatnonzero(passed * signal < noise)
     drowned = drowned[drowned > 0]
     if len(drowned):
         last = drowned[0] - 1
-        signal[last + 1 :] = falling_power(frequency, signal, last)[last + 1 :]
+        signal[last + 1 :] = np.minimum(signal, falling_power(frequency, signal, last))[last + 1 :]
     places = defocused.places and defocused.places.after(left)
-    return replace(defocused, signal=signal, passed=defocused.passed * left, places=places)
+    return replace(defocused, signal=signal, noise=noise, passed=passed, places=places)
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
