@@ -22,6 +22,9 @@ from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+STEP_RAD = 1e-5
+"""Of numerical slopes: a hundredth of a pixel."""
+
 
 @dataclass(frozen=True, slots=True)
 class NeighbourView:
@@ -38,6 +41,17 @@ class NeighbourView:
         """Where the neighbour recorded what the frame's anchored picture shows at pixels (..., 2)."""
         seen_s = self.frame.row_start_s(points_px) + self.anchor * self.frame.exposure_s
         return seen_by_rows(self.neighbour, points_px, seen_s, self.anchor, None, PIXELS_WITHIN_PX)
+
+    def apart_s(self, points_px: Array) -> Array:
+        """(n,) time from the frame's to the neighbour's view of what the frame shows at pixels (n, 2)."""
+        seen_s, places = self.frame.row_start_s(points_px), self.places_px(points_px)
+        later = self.anchor * (self.neighbour.exposure_s - self.frame.exposure_s)
+        return np.asarray(self.neighbour.row_start_s(places) - seen_s + later)
+
+    def middles_s(self) -> tuple[float, float]:
+        """Middles of both frames' exposures, IMU clock."""
+        first, second = (m.start_s + 0.5 * (m.readout_time_s + m.exposure_s) for m in (self.frame, self.neighbour))
+        return first, second
 
     def map_px(self) -> NDArray[np.float32]:
         """:meth:`places_px` of every pixel, (height, width, 2), as cv2.remap takes it."""
@@ -63,3 +77,11 @@ def neighbour_view(
     """Look from one frame at another; lens: of the whole trajectory."""
     both = covering_both(frame, neighbour, trajectory, lens)
     return NeighbourView(both, with_row_clock_of(both, neighbour), anchor)
+
+
+def turn_jacobian_px(motion: RowMotion, points_px: Array) -> Array:
+    """Pixels per radian, (n, 2, 3), by which points (n, 2) move as the camera's axes turn: x' = exp(angle) x."""
+    rays = motion.optics.rays(points_px, motion.reference_s)
+    turned = [rays + STEP_RAD * np.cross(axis, rays) for axis in np.eye(3)]
+    here = motion.optics.project(rays, motion.reference_s)
+    return np.stack([(motion.optics.project(t, motion.reference_s) - here) / STEP_RAD for t in turned], -1)

@@ -141,6 +141,19 @@ class RowMotion:
             nearness = at_reference / np.maximum(ahead, _LEAST_DISTANCE)
         return nearness
 
+    def turned(self, rate_rad_s: Array, slope_rad_s2: Array) -> RowMotion:
+        """The motion with a further turn of the camera: x' = exp(rate τ + ½ slope τ²) x, τ from the reference time.
+
+        rate_rad_s, slope_rad_s2: (3,), camera axes.  Travel stays as it is.
+        """
+        since_s = (self.time_s - self.reference_s)[:, None]
+        further = rotation_from_vector(since_s * (rate_rad_s + 0.5 * since_s * slope_rad_s2))
+        turned = further @ rotation_from_vector(self.rotation_vector)
+        shift = self.translation_m
+        if shift is not None:
+            shift = np.squeeze(further @ shift[..., None], -1)
+        return replace(self, rotation_vector=vector_from_rotation(turned), translation_m=shift)
+
     @property
     def _step_s(self) -> float:
         return float(self.time_s[1] - self.time_s[0])
