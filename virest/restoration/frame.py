@@ -25,6 +25,7 @@ from virest.restoration.clipped_light import measured_share, near_clipped, unsee
 from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
+from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics.measure import measure_picture
@@ -83,13 +84,17 @@ def restore_frame(
     trajectory: Trajectory,
     settings: RestorationSettings,
     seen: RowMotion | None = None,
+    refined: RefinedMotion | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
     picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
-    pictures' own account, where that contradicts the profile's.
+    pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
+    is then taken.
     """
     clock = _Clock()
+    if refined is not None:
+        motion = refined.motion
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     parameters = degradation_parameters(motion, trajectory, settings)
