@@ -15,6 +15,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
 from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
+from virest.degradation.kernel_spread import kernel_spread
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
@@ -30,6 +31,7 @@ from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.records import PictureStatistics, falling_power
+from virest.restoration.statistics.rings import SIDE
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
 
 LOG_TILE_PX = 128
@@ -110,7 +112,10 @@ def restore_frame(
     restored: NDArray[Any] = picture
     parameters["deblur"] = {"method": "none"}
     if method != "none":
-        restored, parameters["deblur"], why_not = _deblurred(picture, motion, settings, anchor, longest_px, light)
+        covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
+        restored, parameters["deblur"], why_not = _deblurred(
+            picture, motion, settings, anchor, longest_px, light, covariance_px2
+        )
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
     clock.lap("deblur")
@@ -268,6 +273,7 @@ def _deblurred(
     anchor: float,
     longest_px: float,
     light: FrameLight | None,
+    covariance_px2: NDArray[np.float64],
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
@@ -276,11 +282,14 @@ def _deblurred(
     tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
     field = smooth_field(motion, anchor)
     luma, chroma = _measured(picture, field(centres_px), curve, tiles)
-    share = 1.0 if anchor != 0.5 else _trusted_share(luma)
-    why_not = _too_little_to_gain(luma)
+    spread = kernel_spread(field, width, height, covariance_px2)
+    luma_model = luma if spread is None else luma.doubted(spread.variance(SIDE))
+    share = 1.0 if anchor != 0.5 else _trusted_share(luma_model)
+    why_not = _too_little_to_gain(luma_model)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
+    blurred = replace(blurred, spread=spread)
     if light is not None:
         blurred = _evened(blurred, light)
     recorded = picture
@@ -301,7 +310,8 @@ def _deblurred(
         "strength": settings.strength,
         "tile_px": settings.tile_px,
         "noise_grey_levels": luma.noise_levels,
-        "expected_gain_db": luma.expected_gain_db,
+        "expected_gain_db": luma_model.expected_gain_db,
+        "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
