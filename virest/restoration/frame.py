@@ -53,6 +53,11 @@ PART_STEP_PX = 80
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
+CURVE_SLOPE_STD = 0.1
+"""One standard deviation of the real tone curve's slope over the profile's, from one brightness to another.
+
+No phone keeps to a curve that nobody measured on it.  A slope that differs by ε makes an error of ε times the picture's
+own detail wherever brightness changes, blurred or not: ε² S beside the noise."""
 _LEAST_FALL = 2.0
 """The power of pictures falls with frequency at least so steeply: f⁻² is that of edges alone, without texture."""
 MIN_RELIGHT = 0.002
@@ -339,7 +344,8 @@ def _measured(
     luma, chroma = measure_picture(
         picture, replace(field, defocus_sigma_px=0.0), curve, clipped_anywhere(picture, curve), most_tiles
     )
-    return _focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px)
+    focused = (_focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px))
+    return focused[0].with_error_share(CURVE_SLOPE_STD**2), focused[1].with_error_share(CURVE_SLOPE_STD**2)
 
 
 def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics:
@@ -364,7 +370,16 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
         last = drowned[0] - 1
         signal[last + 1 :] = np.minimum(signal, falling_power(frequency, signal, last))[last + 1 :]
     places = defocused.places and defocused.places.after(left)
-    return replace(defocused, signal=signal, noise=noise, passed=passed, places=places)
+    real, cells = defocused.real, defocused.cells
+    return replace(
+        defocused,
+        signal=signal,
+        noise=noise,
+        passed=passed,
+        places=places,
+        real=None if real is None else real * np.sqrt(left),
+        cells=None if cells is None else (cells[0], cells[1] * left[:, None]),
+    )
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
