@@ -197,9 +197,7 @@ def _with_neighbours(
     frames = at_true_times(capture.frames, profile, capture.repeats)
     sights = {}
     for number, luma in lumas.items():
-        motion = moved_over_frame(
-            trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile
-        )
+        motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
@@ -214,7 +212,12 @@ def _with_neighbours(
         return plan
     quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
     confirmed = survey_gain(
-        runs, sights, missing, trajectory, lens, lambda luma, motion, refined: deblurred_luma(luma, motion, quick, refined)
+        runs,
+        sights,
+        missing,
+        trajectory,
+        lens,
+        lambda luma, motion, refined: deblurred_luma(luma, motion, quick, refined),
     )
     return replace(plan, confirmed=confirmed)
 
