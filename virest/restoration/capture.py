@@ -131,9 +131,7 @@ def restore_frames(
         if neighbours is not None:
             refined = neighbours.refined(before, here, after)
             pictures = partial(neighbours.pictures, plan.joined(before, after), here, refined)
-        yield restore_frame(
-            frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures
-        )
+        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures)
 
 
 def moved_over_frame(

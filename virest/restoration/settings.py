@@ -50,7 +50,9 @@ class RestorationSettings:
 
 PRESETS: dict[str, RestorationSettings] = {
     "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=176, strength=0.8),
-    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=1),
+    "balanced": RestorationSettings(
+        "balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=1
+    ),
     "best": RestorationSettings(
         "best", "hyper-laplacian-global", iterations=8, inner_iterations=6, tile_px=104, strength=1.0, neighbours=2
     ),

@@ -158,7 +158,12 @@ def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Ima
 
 def _tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
     """(n, 2) top and left of at most so many tiles, evenly over a picture."""
-    tops, lefts = (np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(np.intp) for length in (height, width))
+    tops, lefts = (
+        np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(
+            np.intp
+        )
+        for length in (height, width)
+    )
     corners = np.stack(np.meshgrid(tops, lefts, indexing="ij"), -1).reshape(-1, 2)
     chosen = np.unique(np.linspace(0, len(corners) - 1, min(len(corners), most)).round().astype(np.intp))
     return np.asarray(corners[chosen])
