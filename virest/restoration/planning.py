@@ -33,13 +33,11 @@ from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
+from virest.restoration.conflict_plan import MAX_OFFSET_STD_S, explains_points, settle
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import RestorationSettings
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
-MAX_OFFSET_STD_S = 0.003
-"""An estimated offset known no better than this restores nothing: at a hand's 30 rad/s² the rates, and so the blur
-paths, would be off by 0.1 rad/s."""
 MAX_FOCAL_SPREAD = 0.05
 """An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
 MIN_COARSE_EXPLAINED = 0.5
@@ -85,6 +83,12 @@ def plan_restoration(
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
         plan = _with_clock(plan, profile, alignment)
+    if alignment is None or not explains_points(alignment):
+        settled = settle(plan, profile, capture, tracked)
+        if settled.profile is not plan.profile and runs:
+            alignment = _aligned(settled.profile, profile, capture, all_pairs)
+            settled = _with_clock(settled, profile, alignment)
+        plan = settled
     if plan.copy_reason is None and not _clock_agrees(alignment, plan.profile):
         pairs = _through_resting_lens(tracked, capture, plan.profile)
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)

@@ -1,0 +1,99 @@
+"""A plan whose profile tracked points contradict: what is taken in its place, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture
+from virest.motion.coarse_alignment import SKEWS
+from virest.motion.integration import integrate_gyro
+from virest.motion.observed_tracks import ObservedTracks, observe_tracks
+from virest.motion.tracking import TrackPair
+from virest.motion.turns import scan_offsets
+from virest.motion.visual_inertial import VisualInertialAlignment
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.profile_conflict import CONTRADICTED, MIN_PAIRS, Settled, settle_conflict
+
+OFFSET_SOURCE = "tracked points against the gyroscope"
+MAX_OFFSET_STD_S = 0.003
+"""An estimated offset known no better than this restores nothing: at a hand's 30 rad/s² the rates, and so the blur
+paths, would be off by 0.1 rad/s."""
+SEARCH_S, STEP_S = 1.0, 0.004
+LEAST_EXPLAINED = 0.5
+"""Part of the turns that must be explained for a fit to begin there."""
+
+
+def explains_points(alignment: VisualInertialAlignment) -> bool:
+    """Whether turning and travelling, by the profile, put all points where they were tracked."""
+    scales = [stretch.fit.scale for stretch in alignment.stretches]
+    return bool(scales) and max(scales) < CONTRADICTED
+
+
+def settle(
+    plan: RestorationPlan, given: CameraProfile, capture: Capture, pairs: Sequence[TrackPair]
+) -> RestorationPlan:
+    """The plan with what tracked points put in the place of values that they contradict, and a warning for each."""
+    profile = plan.profile
+    if profile.intrinsics is None:
+        return plan
+    observed = observe_tracks(capture, pairs, profile)
+    offset_known = given.time_offset_s is not None
+    found = settle_conflict(observed, capture.imu, profile, offset_known=offset_known)
+    if found.contradicted and not found.taken and not offset_known:
+        begun = _begun(observed, capture, profile)
+        again = found if begun is None else settle_conflict(observed, capture.imu, begun, offset_known=False)
+        found = again if again.after_px < found.after_px else found
+        if not found.contradicted:
+            return _with_offset(plan, found)
+    if not found.contradicted:
+        return plan
+    if not found.taken:
+        return replace(plan, warnings=(*plan.warnings, _unexplained(found)))
+    plan = replace(plan, profile=found.profile, warnings=(*plan.warnings, *found.taken), copy_reason=None)
+    return plan if offset_known else _with_offset(plan, found)
+
+
+def _with_offset(plan: RestorationPlan, found: Settled) -> RestorationPlan:
+    """Take over an offset that the profile leaves open, as it was fitted beside the causes."""
+    if found.offset is None:
+        return plan
+    offset_s, std_s = found.offset
+    warnings = tuple(text for text in plan.warnings if not text.startswith("time offset"))
+    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
+    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
+    copy = f"time offset only known to ± {std_s * 1e3:.1f} ms" if std_s > MAX_OFFSET_STD_S else None
+    return replace(plan, profile=profile, warnings=(*warnings, said), copy_reason=copy)
+
+
+def _unexplained(found: Settled) -> str:
+    return (
+        f"tracked points lie {found.before_px:.2f} px from where the profile puts them (tracking noise "
+        f"{found.noise_px:.2f} px), and no focal length, clock skew or stabiliser explains that: virest diagnose"
+    )
+
+
+def _begun(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
+    """The profile at the offset at which the turns of pictures and gyroscope agree best, at any focal length.
+
+    Several clock rates are tried, each with its offset as it is in the middle of the pairs.  None where turns agree
+    nowhere, or only at the end of the search.
+    """
+    observed = observed.covered(capture.imu, profile)
+    if len(observed.pairs) < MIN_PAIRS:
+        return None
+    turns, trajectory = observed.turns(profile), integrate_gyro(capture.imu, profile)
+    steps = int(np.ceil(SEARCH_S / STEP_S))
+    offsets = STEP_S * np.arange(-steps, steps + 1, dtype=float)
+    least, begun = 1 - LEAST_EXPLAINED, None
+    for skew in (0.0, *SKEWS):
+        scan = scan_offsets(turns, trajectory, profile.clock_skew + skew, offsets, free_gain=True)
+        best = int(np.argmax(scan.explained))
+        left = 1 - float(scan.explained[best])
+        if left < least and 0 < best < len(offsets) - 1:
+            least = left
+            begun = float(offsets[best] + skew * turns.middle_s.mean())
+    return None if begun is None else replace(profile, time_offset_s=begun)
