@@ -21,6 +21,8 @@ FOCAL_REACH, FOCAL_STEPS = 0.95, 20
 """Logarithms of the focal scales tried: factors of 0.39 to 2.6."""
 FRACTIONS, CUTOFF_STEPS = (0.25, 0.5, 0.8), (-1.2, 0.0, 1.2)
 """Stabilisers tried; cutoffs as logarithms of factors on the profile's."""
+MOST_STABILISED = 0.95
+"""A lens that takes all of the shake is none: such pictures were cropped and turned by software."""
 CUTOFF_HZ = (0.03, 15.0)
 """Cutoffs that an optical stabiliser may have."""
 
@@ -88,7 +90,9 @@ def _with_stabiliser(profile: CameraProfile, found: CameraProfile, std: Array) -
 
 def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
     ext = found.extensions
-    return 0 < ext.stabilisation_fraction <= 1.1 and CUTOFF_HZ[0] < ext.stabilisation_cutoff_hz < CUTOFF_HZ[1]
+    return (
+        0 < ext.stabilisation_fraction < MOST_STABILISED and CUTOFF_HZ[0] < ext.stabilisation_cutoff_hz < CUTOFF_HZ[1]
+    )
 
 
 CAUSES = (

@@ -11,7 +11,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.motion.coarse_alignment import SKEWS
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import ObservedTracks, observe_tracks
+from virest.motion.observed_tracks import ObservedTracks, guessed_lens, observe_tracks
 from virest.motion.tracking import TrackPair
 from virest.motion.turns import scan_offsets
 from virest.motion.visual_inertial import VisualInertialAlignment
@@ -22,6 +22,8 @@ OFFSET_SOURCE = "tracked points against the gyroscope"
 MAX_OFFSET_STD_S = 0.003
 """An estimated offset known no better than this restores nothing: at a hand's 30 rad/s² the rates, and so the blur
 paths, would be off by 0.1 rad/s."""
+MAX_FOCAL_SPREAD = 0.05
+"""An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
 SEARCH_S, STEP_S = 1.0, 0.004
 LEAST_EXPLAINED = 0.5
 """Part of the turns that must be explained for a fit to begin there."""
@@ -37,15 +39,14 @@ def settle(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, pairs: Sequence[TrackPair]
 ) -> RestorationPlan:
     """The plan with what tracked points put in the place of values that they contradict, and a warning for each."""
-    profile = plan.profile
-    if profile.intrinsics is None:
-        return plan
+    offset_known, focal_known = given.time_offset_s is not None, plan.profile.intrinsics is not None
+    profile = plan.profile if focal_known else replace(plan.profile, intrinsics=guessed_lens(plan.profile))
     observed = observe_tracks(capture, pairs, profile)
-    offset_known = given.time_offset_s is not None
-    found = settle_conflict(observed, capture.imu, profile, offset_known=offset_known)
+    known = {"offset_known": offset_known, "focal_known": focal_known}
+    found = settle_conflict(observed, capture.imu, profile, **known)
     if found.contradicted and not found.taken and not offset_known:
         begun = _begun(observed, capture, profile)
-        again = found if begun is None else settle_conflict(observed, capture.imu, begun, offset_known=False)
+        again = found if begun is None else settle_conflict(observed, capture.imu, begun, **known)
         found = again if again.after_px < found.after_px else found
         if not found.contradicted:
             return _with_offset(plan, found)
@@ -53,8 +54,17 @@ def settle(
         return plan
     if not found.taken:
         return replace(plan, warnings=(*plan.warnings, _unexplained(found)))
-    plan = replace(plan, profile=found.profile, warnings=(*plan.warnings, *found.taken), copy_reason=None)
-    return plan if offset_known else _with_offset(plan, found)
+    warnings = (
+        *plan.warnings,
+        *found.taken,
+        *([_rest(found)] if found.after_px > CONTRADICTED * found.noise_px else []),
+    )
+    settled = replace(plan, profile=found.profile, warnings=warnings, copy_reason=None)
+    if found.focal is not None:
+        if found.focal[1] > MAX_FOCAL_SPREAD * found.focal[0]:
+            return plan
+        settled = replace(settled, profile=found.profile.with_focal(*found.focal, OFFSET_SOURCE))
+    return settled if offset_known else _with_offset(settled, found)
 
 
 def _with_offset(plan: RestorationPlan, found: Settled) -> RestorationPlan:
@@ -74,6 +84,11 @@ def _unexplained(found: Settled) -> str:
         f"tracked points lie {found.before_px:.2f} px from where the profile puts them (tracking noise "
         f"{found.noise_px:.2f} px), and no focal length, clock skew or stabiliser explains that: virest diagnose"
     )
+
+
+def _rest(found: Settled) -> str:
+    left = f"{found.after_px:.2f} px off (tracking noise {found.noise_px:.2f} px)"
+    return f"tracked points still lie {left}: virest diagnose may find why"
 
 
 def _begun(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
