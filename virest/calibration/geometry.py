@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.calibration.held_fixed import OPTIONAL, HeldValue, held_notes, held_values
-from virest.calibration.start_up import StartUpLag, fit_start_up_lag
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -26,6 +25,7 @@ from virest.motion import profile_terms as terms_of
 from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
 from virest.motion.displacement import drift_std_m
 from virest.motion.observed_tracks import ObservedTracks, observe_tracks
+from virest.motion.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
 from virest.motion.track_model import TrackTable, ground

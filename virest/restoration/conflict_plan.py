@@ -25,8 +25,10 @@ paths, would be off by 0.1 rad/s."""
 MAX_FOCAL_SPREAD = 0.05
 """An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
 SEARCH_S, STEP_S = 1.0, 0.004
-LEAST_EXPLAINED = 0.5
-"""Part of the turns that must be explained for a fit to begin there."""
+FOLLOWED = 0.95
+"""Part of the points' motion that must be explained for a residual to be a matter of the scene, not of the clocks."""
+LEAST_EXPLAINED = 0.3
+"""Part of the turns that must be explained for a fit to begin there; the points judge where it ends."""
 
 
 def explains_points(alignment: VisualInertialAlignment) -> bool:
@@ -37,8 +39,11 @@ def explains_points(alignment: VisualInertialAlignment) -> bool:
 
 def settle(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, pairs: Sequence[TrackPair]
-) -> RestorationPlan:
-    """The plan with what tracked points put in the place of values that they contradict, and a warning for each."""
+) -> tuple[RestorationPlan, bool]:
+    """The plan with what tracked points put in the place of values that they contradict, and a warning for each.
+
+    The second: whether the points follow the gyroscope beyond doubt, however the turns of whole frames compare.
+    """
     offset_known, focal_known = given.time_offset_s is not None, plan.profile.intrinsics is not None
     profile = plan.profile if focal_known else replace(plan.profile, intrinsics=guessed_lens(plan.profile))
     observed = observe_tracks(capture, pairs, profile)
@@ -49,11 +54,13 @@ def settle(
         again = found if begun is None else settle_conflict(observed, capture.imu, begun, **known)
         found = again if again.after_px < found.after_px else found
         if not found.contradicted:
-            return _with_offset(plan, found)
+            return _with_offset(plan, found), True
     if not found.contradicted:
-        return plan
+        return plan, found.explained > FOLLOWED
+    if not found.taken and not offset_known and found.explained > FOLLOWED:
+        return _with_offset(replace(plan, warnings=(*plan.warnings, _rest(found))), found), True
     if not found.taken:
-        return replace(plan, warnings=(*plan.warnings, _unexplained(found)))
+        return replace(plan, warnings=(*plan.warnings, _unexplained(found))), False
     warnings = (
         *plan.warnings,
         *found.taken,
@@ -62,9 +69,9 @@ def settle(
     settled = replace(plan, profile=found.profile, warnings=warnings, copy_reason=None)
     if found.focal is not None:
         if found.focal[1] > MAX_FOCAL_SPREAD * found.focal[0]:
-            return plan
+            return plan, False
         settled = replace(settled, profile=found.profile.with_focal(*found.focal, OFFSET_SOURCE))
-    return settled if offset_known else _with_offset(settled, found)
+    return settled if offset_known else _with_offset(settled, found), found.explained > FOLLOWED
 
 
 def _with_offset(plan: RestorationPlan, found: Settled) -> RestorationPlan:

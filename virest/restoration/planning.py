@@ -6,7 +6,7 @@ the pictures show; the camera's travel and the scene's depth are found where the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -34,10 +34,10 @@ from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.conflict_plan import MAX_FOCAL_SPREAD, MAX_OFFSET_STD_S, explains_points, settle
+from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import RestorationSettings
 
-GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
 MIN_COARSE_EXPLAINED = 0.5
 """Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
 OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
@@ -57,6 +57,15 @@ def plan_restoration(
 
     read_gray: gives (index, luma) of the frames asked for, in order.  The cost does not grow with the movie.
     """
+    lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
+    if lag is None:
+        return _planned(capture, profile, settings, read_gray)
+    return with_lag(_planned(at_lag(capture, profile, lag), profile, settings, read_gray), lag)
+
+
+def _planned(
+    capture: Capture, profile: CameraProfile, settings: RestorationSettings, read_gray: GrayReader
+) -> RestorationPlan:
     plan = RestorationPlan(
         profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
     )
@@ -77,12 +86,12 @@ def plan_restoration(
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
         plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))
-    alignment = None
+    alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
         plan = _with_clock(plan, profile, alignment)
     if alignment is None or not explains_points(alignment):
-        settled = settle(plan, profile, capture, tracked)
+        settled, followed = settle(plan, profile, capture, tracked)
         if settled.profile is not plan.profile and runs:
             alignment = _aligned(settled.profile, profile, capture, all_pairs)
             settled = _with_clock(settled, profile, alignment)
@@ -90,7 +99,7 @@ def plan_restoration(
     if plan.copy_reason is None and not _clock_agrees(alignment, plan.profile):
         pairs = _through_resting_lens(tracked, capture, plan.profile)
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
-        if not agreement.agrees:
+        if not agreement.agrees and not followed:
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
             estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)

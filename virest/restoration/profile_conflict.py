@@ -21,7 +21,7 @@ from virest.motion import profile_terms as terms_of
 from virest.motion.observed_tracks import ObservedTracks
 from virest.motion.profile_terms import CLOCK_SKEW, shift_offset
 from virest.motion.scene_motion import DirectedMotion, Motion
-from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
+from virest.motion.track_fit import RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.motion.track_model import TrackTable, ground
 from virest.motion.tracking_bias import bias_std
 from virest.restoration.conflict_causes import CAUSES, Cause
@@ -77,8 +77,15 @@ class Settled:
     """Typical noise of a tracked step."""
     offset: tuple[float, float] | None = None
     """Clock offset at the profile's readout, and its standard deviation, s, as fitted beside all else."""
+    motion_px: float = 0.0
+    """Typical way of a point from frame to frame, on the scale of the residuals."""
     focal: tuple[float, float] | None = None
     """Focal length and its standard deviation, px, where that was unknown."""
+
+    @property
+    def explained(self) -> float:
+        """Part of the points' motion, as a variance, that the profile explains with what was taken."""
+        return 1 - (self.after_px / max(self.motion_px, 1e-9)) ** 2
 
 
 def settle_conflict(
@@ -96,7 +103,8 @@ def settle_conflict(
     base = search.base()
     noise_px = float(np.median(observed.noise_px))
     readout_s, left_px = profile.shutter.readout_time_s, base.scale * noise_px
-    found = Settled(profile, False, (), left_px, left_px, noise_px, _offset(base, readout_s, noise_px))
+    motion_px = _motion_px(search.table)
+    found = Settled(profile, False, (), left_px, left_px, noise_px, _offset(base, readout_s, noise_px), motion_px)
     found = found if focal_known else replace(found, focal=_focal(base, noise_px))
     if base.scale < CONTRADICTED:
         return found
@@ -112,13 +120,18 @@ def settle_conflict(
     offset = _offset(fit, readout_s, noise_px)
     focal = None if focal_known else _focal(fit, noise_px)
     after_px = fit.scale * noise_px
-    return Settled(resolved, True, said, left_px, after_px, noise_px, offset, focal)
+    return Settled(resolved, True, said, left_px, after_px, noise_px, offset, motion_px, focal)
 
 
 def _offset(fit: TrackFit, readout_s: float, noise_px: float) -> tuple[float, float]:
     """Clock offset that goes with a readout, the middle row kept where it was, and its deviation."""
     offset_s = (fit.profile.time_offset_s or 0.0) + 0.5 * (fit.profile.shutter.readout_time_s - readout_s)
     return offset_s, float(np.hypot(fit.std("time_offset")[0], bias_std(fit, "time_offset", noise_px)[0]))
+
+
+def _motion_px(table: TrackTable) -> float:
+    moved = np.linalg.norm(table.second_px - table.first_px, axis=-1)
+    return float(np.median(moved)) / RAYLEIGH_MEDIAN
 
 
 def _focal(fit: TrackFit, noise_px: float) -> tuple[float, float]:
