@@ -20,7 +20,6 @@ from virest.degradation.row_motion import FrameTranslation, frame_times_s
 from virest.motion.alignment import (
     AGREEMENT_SLACK_S,
     COARSE_STEP_S,
-    GUESSED_FOCAL,
     OffsetEstimate,
     check_agreement,
     choose_pairs,
@@ -28,7 +27,7 @@ from virest.motion.alignment import (
 )
 from virest.motion.coarse_alignment import align_coarsely
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import observe_tracks
+from virest.motion.observed_tracks import GUESSED_FOCAL, observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
@@ -43,6 +42,7 @@ MIN_COARSE_EXPLAINED = 0.5
 OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
 """A stated offset this far from the pictures' is warned of; a bias below three of this may be tracking's own."""
 OTHER_OFFSET = "the pictures put the time offset at"
+UNCHECKED = "agreement of frames and gyroscope could not be tested"
 OTHER_PATHS = "the pictures show blur paths"
 NOT_ESTIMATED = "translation and depth not estimated: rotation only"
 
@@ -99,6 +99,8 @@ def _planned(
     if plan.copy_reason is None and not _clock_agrees(alignment, plan.profile):
         pairs = _through_resting_lens(tracked, capture, plan.profile)
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
+        if np.isnan(agreement.motion_px) and not followed:
+            plan = replace(plan, warnings=(*plan.warnings, f"{UNCHECKED} ({agreement.reason})"))
         if not agreement.agrees and not followed:
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
@@ -377,8 +379,9 @@ def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> 
     if plan.profile.time_offset_s is not None:
         return plan
     if not estimate.determined:
-        warning = f"time offset not determined ({estimate.reason}): 0 taken"
-        return replace(plan, profile=replace(plan.profile, time_offset_s=0.0), warnings=(*plan.warnings, warning))
+        warning = f"time offset not determined ({estimate.reason})"
+        plan = replace(plan, profile=replace(plan.profile, time_offset_s=0.0), warnings=(*plan.warnings, warning))
+        return plan if plan.copy_reason else replace(plan, copy_reason="time offset not determined: virest calibrate")
     offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
     profile = plan.profile.with_estimate(
         "time_offset_s", offset_s, estimate.std_s, "tracked points against the gyroscope", time_offset_s=offset_s

@@ -85,7 +85,7 @@ class Settled:
     @property
     def explained(self) -> float:
         """Part of the points' motion, as a variance, that the profile explains with what was taken."""
-        return 1 - (self.after_px / max(self.motion_px, 1e-9)) ** 2
+        return 1 - (self.after_px / self.motion_px) ** 2 if self.motion_px else 0.0
 
 
 def settle_conflict(
