@@ -15,7 +15,7 @@ from virest.motion.observed_tracks import ObservedTracks, guessed_lens, observe_
 from virest.motion.tracking import TrackPair
 from virest.motion.turns import scan_offsets
 from virest.motion.visual_inertial import VisualInertialAlignment
-from virest.restoration.capture import RestorationPlan
+from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan
 from virest.restoration.profile_conflict import CONTRADICTED, MIN_PAIRS, Settled, settle_conflict
 
 OFFSET_SOURCE = "tracked points against the gyroscope"
@@ -47,43 +47,43 @@ def settle(
     offset_known, focal_known = given.time_offset_s is not None, plan.profile.intrinsics is not None
     profile = plan.profile if focal_known else replace(plan.profile, intrinsics=guessed_lens(plan.profile))
     observed = observe_tracks(capture, pairs, profile)
-    known = {"offset_known": offset_known, "focal_known": focal_known}
-    found = settle_conflict(observed, capture.imu, profile, **known)
+    found = settle_conflict(observed, capture.imu, profile, offset_known=offset_known, focal_known=focal_known)
     if found.contradicted and not found.taken and not offset_known:
         begun = _begun(observed, capture, profile)
-        again = found if begun is None else settle_conflict(observed, capture.imu, begun, **known)
-        found = again if again.after_px < found.after_px else found
-        if not found.contradicted:
-            return _with_offset(plan, found), True
-    if not found.contradicted:
-        return plan, found.explained > FOLLOWED
-    if not found.taken and not offset_known and found.explained > FOLLOWED:
-        return _with_offset(replace(plan, warnings=(*plan.warnings, _rest(found))), found), True
-    if not found.taken:
-        return replace(plan, warnings=(*plan.warnings, _unexplained(found))), False
-    warnings = (
-        *plan.warnings,
-        *found.taken,
-        *([_rest(found)] if found.after_px > CONTRADICTED * found.noise_px else []),
-    )
-    settled = replace(plan, profile=found.profile, warnings=warnings, copy_reason=None)
+        if begun is not None:
+            again = settle_conflict(observed, capture.imu, begun, offset_known=False, focal_known=focal_known)
+            found = again if again.after_px < found.after_px else found
+    followed = found.explained > FOLLOWED
+    if offset_known and not found.taken:
+        return (_said(plan, _unexplained(found)) if found.contradicted else plan), followed
+    if offset_known:
+        plan = replace(plan, profile=found.profile, copy_reason=None)
+        return _said(plan, *found.taken, *_rest(found)), followed
+    open_yet = plan.copy_reason is not None and plan.copy_reason.startswith(("time offset", FOCAL_UNKNOWN))
+    if not found.taken and not (followed and (open_yet or found.contradicted)):
+        return (_said(plan, _unexplained(found)) if found.contradicted else plan), followed
+    return _with_open_values(plan, found), followed
+
+
+def _said(plan: RestorationPlan, *texts: str) -> RestorationPlan:
+    return replace(plan, warnings=(*plan.warnings, *texts))
+
+
+def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
+    """Take over the offset, and perhaps the focal length, that the profile leaves open, beside what was taken."""
+    assert found.offset is not None
+    offset_s, std_s = found.offset
+    profile = found.profile
     if found.focal is not None:
         if found.focal[1] > MAX_FOCAL_SPREAD * found.focal[0]:
-            return plan, False
-        settled = replace(settled, profile=found.profile.with_focal(*found.focal, OFFSET_SOURCE))
-    return settled if offset_known else _with_offset(settled, found), found.explained > FOLLOWED
-
-
-def _with_offset(plan: RestorationPlan, found: Settled) -> RestorationPlan:
-    """Take over an offset that the profile leaves open, as it was fitted beside the causes."""
-    if found.offset is None:
-        return plan
-    offset_s, std_s = found.offset
-    warnings = tuple(text for text in plan.warnings if not text.startswith("time offset"))
-    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
+            return plan
+        profile = replace(profile, intrinsics=None).with_focal(*found.focal, OFFSET_SOURCE)
+    profile = profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
+    kept = tuple(text for text in plan.warnings if not text.startswith("time offset"))
     said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
     copy = f"time offset only known to ± {std_s * 1e3:.1f} ms" if std_s > MAX_OFFSET_STD_S else None
-    return replace(plan, profile=profile, warnings=(*warnings, said), copy_reason=copy)
+    plan = replace(plan, profile=profile, warnings=kept, copy_reason=copy)
+    return _said(plan, *found.taken, *_rest(found), said)
 
 
 def _unexplained(found: Settled) -> str:
@@ -93,9 +93,11 @@ def _unexplained(found: Settled) -> str:
     )
 
 
-def _rest(found: Settled) -> str:
+def _rest(found: Settled) -> tuple[str, ...]:
+    if found.after_px < CONTRADICTED * found.noise_px:
+        return ()
     left = f"{found.after_px:.2f} px off (tracking noise {found.noise_px:.2f} px)"
-    return f"tracked points still lie {left}: virest diagnose may find why"
+    return (f"tracked points still lie {left}: virest diagnose may find why",)
 
 
 def _begun(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
