@@ -6,7 +6,7 @@ the pictures show; the camera's travel and the scene's depth are found where the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
