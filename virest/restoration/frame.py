@@ -15,8 +15,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.kernel_spread import kernel_spread
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
