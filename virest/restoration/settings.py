@@ -13,7 +13,7 @@ DEBLUR_METHODS = (
     "hyper-laplacian",
     "hyper-laplacian-global",
 )
-JOINT_METHODS = ("gradient-wiener", "hyper-laplacian", "hyper-laplacian-global")
+JOINT_METHODS = ("gradient-wiener", "hyper-laplacian")
 """Those that restore a frame together with its neighbours."""
 SHUTTER_METHODS = ("none", "perspective", "rowwise")
 REFERENCES = ("exposure-start", "frame-middle")
