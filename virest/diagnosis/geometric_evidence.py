@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.calibration.physical_limits import impossible
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.observed_tracks import ObservedTracks
@@ -76,6 +77,21 @@ class Evidence:
     def typical_px(self) -> float:
         """Typical noise of a step, px per coordinate."""
         return float(np.median(self.observed.noise_px))
+
+    @property
+    def period_s(self) -> float:
+        """Time between frames."""
+        stamps = self.observed.stamp_s[np.isfinite(self.observed.stamp_s)]
+        return float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+
+    @property
+    def exposure_s(self) -> float:
+        """Typical exposure as logged; 0 where unknown."""
+        return float(np.median(self.observed.exposure_s))
+
+    def impossible(self, profile: CameraProfile) -> frozenset[str]:
+        """Names of the effects whose values in a profile no camera has."""
+        return impossible(profile, self.period_s, self.exposure_s)
 
     def table(self, model: Model, max_points: int) -> TrackTable:
         """The points, with the stamps that the model gives the frames."""

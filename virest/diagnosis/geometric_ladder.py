@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from virest.calibration.geometry import right_way_round
+from virest.calibration.physical_limits import is_depth
 from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
@@ -131,7 +133,7 @@ def climb(
     say = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
     start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
-    model = _refitted(evidence, start, SCREEN_POINTS)[0]
+    model, notes = _with_unknowns(evidence, start)
     nominal_model = model
     accepted: list[Accepted] = []
     rungs: list[Rung] = []
@@ -146,13 +148,29 @@ def climb(
         accepted += step.accepted
         model, _ = _refitted(evidence, step.model, JUDGE_POINTS)
         log.debug("rung %d: %s", number + 1, rung.entered)
-    return _conclude(evidence, nominal_model, model, accepted, rungs, nominal)
+    verdict = _conclude(evidence, nominal_model, model, accepted, rungs, nominal)
+    verdict.notes += notes
+    return verdict
+
+
+def _with_unknowns(evidence: Evidence, start: Model) -> tuple[Model, list[str]]:
+    """The model with its unknown values fitted; those that end where no camera is stay where they began."""
+    model, notes = _refitted(evidence, start, SCREEN_POINTS)[0], []
+    at_ends = evidence.impossible(model.profile) - evidence.impossible(start.profile)
+    if "readout_time" in evidence.impossible(model.profile):
+        at_ends |= {"readout_time"}
+    ended = [term.name for term in start.terms if term.name in at_ends]
+    if ended:
+        known = tuple(term for term in start.terms if term.name not in ended)
+        model = _refitted(evidence, replace(start, terms=known), SCREEN_POINTS)[0]
+        notes = [f"{name} is unknown and cannot be told from the points" for name in ended]
+    return model, notes
 
 
 def _refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:
     table = evidence.table(model, points)
     fitted = evidence.fit(model, model.terms, table)
-    return replace(model, profile=fitted.profile, scene=fitted.scene), fitted
+    return replace(model, profile=right_way_round(fitted.profile), scene=fitted.scene), fitted
 
 
 # ── one rung ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -297,27 +315,38 @@ def _p_value(
     """Probability that a candidate's value is nought; 1 where no phone is like that."""
     if candidate.effect is None or candidate.effect.term is None:
         return SURE
-    if not is_plausible(candidate.effect, found, total_change(candidate.effect, before, found)):
+    return _p_if_plausible(evidence, fitted, candidate.effect, found, before)
+
+
+def _p_if_plausible(
+    evidence: Evidence, fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile
+) -> float:
+    """Probability that an effect's value is nought; 1 where it ends at, or beyond, what a phone can be."""
+    if not is_plausible(evidence, effect, found, total_change(effect, before, found)):
         return 1.0
-    return p_of(fitted, candidate.effect, found, before, evidence.typical_px)
+    return p_of(fitted, effect, found, before, evidence.typical_px)
 
 
 def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float:
-    """Probability of so large a change of the inverse depth by chance."""
+    """Probability of so large a change of the inverse depth by chance; 1 where the depth ends at its limits."""
     depth_m, std = depth_of(fitted, table)
+    if not is_depth(depth_m):
+        return 1.0
     given_m = given_m or np.inf
     nearer = 1 / depth_m - 1 / given_m
     certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
     return float(stats.chi2.sf((nearer / max(certain, 1e-9)) ** 2, 1))
 
 
-def is_plausible(effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
-    """Whether a phone can be like that: a cause beyond these bounds only stands in for another."""
+def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
+    """Whether a phone can be like that: a cause at or beyond these bounds compensates for another."""
+    if effect.name in evidence.impossible(found):
+        return False
     if effect.name == "stabilisation":
         low, high = STABILISER_CUTOFF_HZ
         extensions = found.extensions
         return 0 < extensions.stabilisation_fraction <= 1.1 and low < extensions.stabilisation_cutoff_hz < high
-    return bool(np.all(np.abs(change) <= PLAUSIBLE[effect.name]))
+    return bool(np.all(np.abs(change) < PLAUSIBLE[effect.name]))
 
 
 def p_of(
@@ -403,7 +432,7 @@ def _doubt(
         return depth_p(fitted, table, given.depth_m)
     if entry.effect is None or entry.effect.term is None:
         return 0.0
-    return p_of(fitted, entry.effect, found, given, evidence.typical_px)
+    return _p_if_plausible(evidence, fitted, entry.effect, found, given)
 
 
 def total_change(effect: GeometricEffect, nominal: CameraProfile, found: CameraProfile) -> Array:

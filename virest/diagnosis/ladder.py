@@ -23,6 +23,7 @@ from virest.diagnosis.points import (
     MIN_PAIRS,
     TrackedPoints,
     at_model_times,
+    at_rest,
     evened,
     frames_to_follow,
     pulses,
@@ -85,11 +86,14 @@ def _tracked(capture: Capture, profile: CameraProfile, gray: Reader, each: Each)
             hint="a longer capture, or one with more texture",
         )
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
-    rungs_allowed = MAX_RUNGS if follows or schedules else 0
+    still = at_rest(observed, start)
+    rungs_allowed = MAX_RUNGS if (follows or schedules) and not still else 0
     stamped_frames = sum(NO_STAMP not in frame.skip_codes for frame in capture.frames)
     if len(indices) < stamped_frames:
         notes.append(f"points were followed in {len(indices)} of {stamped_frames} frames, runs spread over the capture")
-    if not rungs_allowed:
+    if still:
+        notes.append("the camera is at rest: points tell nothing of clocks, readout or lens")
+    elif not rungs_allowed:
         notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
     return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
 
@@ -115,6 +119,11 @@ class _Story:
     def frames(self) -> list[Frame]:
         """Frames that can be looked at, with the stamps that the first model gives them."""
         return at_model_times(self.capture, self.first)
+
+    def _all_frames(self) -> tuple[Frame, ...]:
+        """Every frame, by movie index; those that cannot be looked at without an exposure."""
+        usable = {frame.index: frame for frame in self.frames}
+        return tuple(usable.get(frame.index, replace(frame, exposure_s=None)) for frame in self.capture.frames)
 
     def judge_light(
         self, pictures: Reader, gray: Reader, given: CameraProfile, progress: Callable[[float], None]
@@ -145,7 +154,7 @@ class _Story:
             )
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
-            shown = replace(self.capture, frames=tuple(self.frames))
+            shown = replace(self.capture, frames=self._all_frames())
             self.blur, is_exposure = climb_blur(
                 shown, lit, integrate_gyro(self.capture.imu, lit), gray, scale, self.each
             )

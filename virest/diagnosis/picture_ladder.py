@@ -20,7 +20,7 @@ from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
-from virest.diagnosis.photometry_effects import PhotometricEffect, photometric_effects
+from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
 from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_mixing import (
     MixingEstimate,
@@ -249,7 +249,7 @@ def _finding(
     held: HeldOut,
 ) -> Finding:
     std = np.sqrt(np.diag(fitted.of(effect.name)[1]))
-    changes = changes_of(values_of(effect, nominal), values_of(effect, fitted.profile), std)
+    changes = changes_of(values_of(effect, nominal), values_of(effect, fitted.profile), std, frames_of(fitted))
     p_value = significance(fitted, effect.name, observations)[1]
     gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
     return Finding(effect.name, changes, gain, (), p_value, sentence_of(effect.name, changes))
@@ -271,11 +271,24 @@ def values_of(effect: PhotometricEffect, profile: CameraProfile) -> dict[str, An
     return {name: values[name] for name in effect.parameters}
 
 
-def changes_of(before: dict[str, Any], now: dict[str, Any], std: Array) -> dict[str, ParameterChange]:
-    """Values as they were and as they are, with their deviations; a gain starts from 1 in every frame."""
+def frames_of(fitted: PhotometricFit) -> Sequence[int]:
+    """Movie indices of the frames whose gains were fitted; none without gains."""
+    return next((effect.frames for effect in fitted.effects if isinstance(effect, GainDrift)), ())
+
+
+def changes_of(
+    before: dict[str, Any], now: dict[str, Any], std: Array, frames: Sequence[int] = ()
+) -> dict[str, ParameterChange]:
+    """Values as they were and as they are, with their deviations; a gain starts from 1 in every frame.
+
+    frames: movie indices that the deviations of a gain belong to; those of other frames, whose gain is taken from
+    their neighbours, are unknown (NaN).
+    """
     if "gain" in now:
         gain = now["gain"]
-        return {"gain": ParameterChange([1.0] * len(gain), gain, [float(s) for s in np.resize(std, len(gain))])}
+        spread = np.full(len(gain), np.nan)
+        spread[np.asarray(frames, np.intp)] = std
+        return {"gain": ParameterChange([1.0] * len(gain), gain, spread.tolist())}
     return {name: ParameterChange(before[name], now[name], float(s)) for name, s in zip(now, std, strict=True)}
 
 
@@ -371,6 +384,9 @@ def climb_blur(
     exposure_hypothesis: the exposure scale that would put an offset found at constant exposure down to the exposure.
     """
     verdict = PictureVerdict(profile)
+    if not local_blur.frames_to_read(capture):
+        verdict.notes.append("no two frames with known exposures to compare: blur not judged")
+        return verdict, False
     observations = local_blur.look_for_blur(gray, capture, profile, trajectory, each)
     if len(observations) < local_blur.MIN_EDGES:
         verdict.notes.append("too little texture to measure local blur")
