@@ -100,7 +100,7 @@ def test_gains_of_frames_that_no_patch_shows_are_unknown(rng: np.random.Generato
     change = changes_of(values_of(effect, NOMINAL), values_of(effect, fit.profile), std, frames_of(fit))["gain"]
     assert len(change.estimate) == FRAMES
     assert np.flatnonzero(np.isnan(change.std)).tolist() == [10, 11, 12]
-    np.testing.assert_allclose(np.log(change.estimate[9:14]), np.log(gain[9:14] / np.median(gain)), atol=0.02)
+    np.testing.assert_allclose(np.log(change.estimate[9:14]), np.log(gain[9:14] / np.median(gain)), atol=0.04)
 
 
 def test_pictures_of_another_motion_tell_no_unknown_values() -> None:

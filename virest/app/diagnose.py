@@ -28,6 +28,7 @@ from virest.diagnosis.restoration_gain import RestorationGain, chosen_pairs, mea
 from virest.errors import OutputError, VirestError
 from virest.motion.shared_out import Each, one_by_one
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
+from virest.report.words import residual_words
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.settings import PRESETS
 from virest.simulation.recreation import recreate_session
@@ -354,8 +355,8 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
     """The causes as a table with a sentence each, what they do for restored frames, what remains, the verdict."""
     nominal = found.nominal
     lines = [
-        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, off by {_number(nominal.geometry_rms_px)} px, of "
-        f"which tracking makes {_number(nominal.geometry_noise_px)} px"
+        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, residual "
+        f"{residual_words(nominal.geometry_rms_px, nominal.geometry_noise_px)}"
     ]
     if found.causes:
         header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
@@ -370,7 +371,8 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
 def _rows(cause: Finding) -> list[list[str]]:
     """A row for each number or word that changed; what the cause gains stands on its first."""
     held_out = cause.held_out
-    judged = [_number(held_out.before), _number(held_out.after), f"{held_out.gain:.0%}", held_out.quantity]
+    gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
+    judged = [_number(held_out.before), _number(held_out.after), gain, held_out.quantity]
     rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals) or "-"
     first = [cause.name, [*judged, rivals]]
     values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
@@ -418,7 +420,7 @@ def _remaining_line(left: Remaining) -> str:
     if left.significant:
         return f"unexplained: {_one_line(left.sentence) or f'{_number(left.size)} along {left.strongest_along}'}"
     unit = "px" if left.quantity.endswith("_px") else "levels"
-    return f"unexplained: nothing of size; {_number(left.size)} {unit} along {left.strongest_along}"
+    return f"no significant residual: {_number(left.size)} {unit} along {left.strongest_along}"
 
 
 def _one_line(text: str) -> str:

@@ -32,7 +32,18 @@ from virest.diagnosis.geometric_evidence import (
     capped_rms,
     depth_of,
 )
-from virest.diagnosis.trials import JUDGE_POINTS, Judged, Screened, best_of_each, judge, lagging_gain, screen, t_ratio
+from virest.diagnosis.trials import (
+    JUDGE_POINTS,
+    Judged,
+    Screened,
+    best_of_each,
+    chance_of,
+    judge,
+    lagging_gain,
+    screen,
+    t_ratio,
+)
+from virest.motion import profile_terms as terms_of
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable
@@ -48,7 +59,6 @@ MIN_T = 3.0
 """Least ratio of the blocks' mean gain to its standard error."""
 MAX_P = 1e-5
 """Of the value being nought, for each of some twenty causes tried."""
-SURE = 1e-12
 MIN_GAIN = 0.004
 """Least part of the loss that a cause must take away on held-out blocks."""
 LARGE_GAIN, LARGE_MIN_T = 0.05, 1.7
@@ -111,6 +121,8 @@ class GeometricVerdict:
     """What tracking alone makes, as an rms like the two above."""
     step_noise_px: float
     """Typical standard deviation of a tracked step, per coordinate."""
+    lag_std_s: float | None = None
+    """Of a start-up lag; None without one."""
     astray: float = 0.0
     """Part of the points that lie in parts of the picture that move together on their own, and were left out."""
     notes: list[str] = field(default_factory=list)
@@ -239,7 +251,7 @@ def _best_single(evidence: Evidence, model: Model, before: Judged, judged: list[
         part = float(gain.mean() / before.block_loss.mean())
         if part < MIN_GAIN or t_ratio(gain) < (MIN_T if part < LARGE_GAIN else LARGE_MIN_T):
             continue
-        entered, p_value = _significant(evidence, best.candidate, model.profile)
+        entered, p_value = _significant(evidence, best.candidate, model.profile, gain)
         if entered is None:
             continue
         rivals = tuple(
@@ -299,9 +311,16 @@ def _with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
     return _refitted(evidence, replace(candidate.model, terms=(*candidate.model.terms, *candidate.added)), JUDGE_POINTS)
 
 
-def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile) -> tuple[Model | None, float]:
-    """The model with the candidate in it, if its value is, and the probability that it is nought."""
+def _significant(
+    evidence: Evidence, candidate: Candidate, before: CameraProfile, gain: Array
+) -> tuple[Model | None, float]:
+    """The model with the candidate in it, if its value is significant, and the probability that it is nought.
+
+    A word has no value: its probability is that of so even a gain (blocks,) by chance, which has been required already.
+    """
     model, fitted = _with(evidence, candidate)
+    if candidate.name != "scene_depth" and (candidate.effect is None or candidate.effect.term is None):
+        return model, chance_of(gain)
     if candidate.name == "scene_depth":
         p_value = depth_p(fitted, evidence.table(model, JUDGE_POINTS), before.depth_m)
     else:
@@ -313,8 +332,7 @@ def _p_value(
     evidence: Evidence, fitted: TrackFit, candidate: Candidate, found: CameraProfile, before: CameraProfile
 ) -> float:
     """Probability that a candidate's value is nought; 1 where no phone is like that."""
-    if candidate.effect is None or candidate.effect.term is None:
-        return SURE
+    assert candidate.effect is not None
     return _p_if_plausible(evidence, fitted, candidate.effect, found, before)
 
 
@@ -404,7 +422,23 @@ def _conclude(
     return GeometricVerdict(
         model, fitted, table, accepted, rungs, nominal_model, nominal_fit, nominal_table,
         before, capped_rms(fitted.distance) * typical, evidence.noise_px(fitted), typical,
+        _lag_std_s(evidence, model, table) if model.lag else None,
     )  # fmt: skip
+
+
+def _lag_std_s(evidence: Evidence, model: Model, table: TrackTable) -> float:
+    """Deviation of a start-up lag: of an offset of the lagging pairs alone, with how far they want one.
+
+    A schedule allows for lags in steps; what lies between two steps shows as such an offset.
+    """
+    lagging = np.array([pair.first <= model.profile.extensions.frame_lag_frames for pair in evidence.observed.pairs])
+    fitted = evidence.fit(model, (terms_of.TIME_OFFSET,), table, lagging)
+    parts = (
+        fitted.value("time_offset"),
+        fitted.std("time_offset"),
+        bias_std(fitted, "time_offset", evidence.typical_px),
+    )
+    return float(np.linalg.norm(np.concatenate(parts)))
 
 
 def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted, fitted: TrackFit) -> Accepted:
@@ -495,7 +529,7 @@ def findings_of(verdict: GeometricVerdict) -> list[Finding]:
     found = []
     for entry in verdict.accepted:
         changes = changes_of(verdict, entry)
-        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, min(verdict.noise_px, verdict.final_rms_px))
+        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, verdict.noise_px)
         sentence = _sentence(entry, changes)
         found.append(Finding(entry.name, changes, held_out, entry.rivals, entry.p_value, sentence))
     return sorted(found, key=lambda f: f.held_out.after**2 - f.held_out.before**2)
@@ -511,8 +545,8 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
     if entry.name == "frame_lag":
         extensions = found.extensions
         return {
-            "lag_s": ParameterChange(0.0, extensions.frame_lag_s, 0.3 * _period(verdict)),
-            "frames": ParameterChange(0, extensions.frame_lag_frames, 0),
+            "lag_s": ParameterChange(0.0, extensions.frame_lag_s, verdict.lag_std_s),
+            "frames": ParameterChange(0, extensions.frame_lag_frames, None),
         }
     effect = entry.effect
     assert effect is not None
@@ -534,11 +568,6 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
             moved = total_change(effect, nominal, found).tolist()
             changes = {"offset_px": replace(changes["offset_px"], estimate=moved)}
     return changes
-
-
-def _period(verdict: GeometricVerdict) -> float:
-    stamps = np.unique(verdict.table.first_stamp_s)
-    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1 / 30
 
 
 def _sentence(entry: Accepted, changes: dict[str, ParameterChange]) -> str:

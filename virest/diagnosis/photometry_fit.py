@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from virest.camera.profile import CameraProfile
+from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
 from virest.motion.shared_out import Each, one_by_one
@@ -108,12 +109,9 @@ class HeldOut:
     """``time``: fitted on some blocks of frames and judged on the others; ``place``: the same of places."""
 
     @property
-    def gain(self) -> float:
-        """1 − (after² − noise²)/(before² − noise²), held in [0, 1]; 0 where there is nothing to explain."""
-        excess = self.before**2 - self.noise**2
-        if excess <= 1e-9 * self.noise**2:
-            return 0.0
-        return float(np.clip(1 - max(self.after**2 - self.noise**2, 0.0) / excess, 0.0, 1.0))
+    def gain(self) -> float | None:
+        """As HeldOutGain has it; None where the measured noise leaves nothing to explain."""
+        return HeldOutGain(PHOTOMETRY, self.before, self.after, self.noise).gain
 
 
 def time_blocks(observations: PhotometricObservations) -> Indices:
@@ -200,8 +198,7 @@ def judge(
         after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
         noise.append(before[-1][1])
     quadratic = [float(np.sqrt(np.mean(np.square(v)))) if v else 0.0 for v in ([b[0] for b in before], after, noise)]
-    # What is left on held-out blocks contains the noise: a larger one was not noise.
-    return HeldOut(quadratic[0], quadratic[1], min(quadratic[1:]), "place" if by_place else "time")
+    return HeldOut(quadratic[0], quadratic[1], quadratic[2], "place" if by_place else "time")
 
 
 def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
@@ -222,7 +223,8 @@ def _rung(
             continue
         held_out = judge(observations, nominal, [*accepted, effect], each)
         log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
-        if held_out.gain > MIN_GAIN and held_out.after**2 < (1 - LEAST_FALL) * held_out.before**2:
+        enough = held_out.gain is None or held_out.gain > MIN_GAIN
+        if enough and held_out.after**2 < (1 - LEAST_FALL) * held_out.before**2:
             return replace(nothing, entered=name), effect, fits[name]
     return nothing, None, plain
 
@@ -356,7 +358,8 @@ def _is_sure(found: Mixed, name: str, profile: CameraProfile) -> bool:
     estimate, held = found
     now = _value_of_curve(profile, name)
     size = estimate.value - now if name == "black_level" else abs(np.log(estimate.value / now))
-    return bool(estimate.p_value < MIXING_P and size > MIXING_LEAST[name] and held.gain > MIN_GAIN)
+    gains = held.gain is not None and held.gain > MIN_GAIN
+    return bool(estimate.p_value < MIXING_P and size > MIXING_LEAST[name] and gains)
 
 
 def _value_of_curve(profile: CameraProfile, name: str) -> float:
@@ -413,12 +416,11 @@ def climb_blur(
         alone = tuple(effects[j] for j in named)
         before, after = local_blur_fit.held_out(observations, profile, trajectory, alone)
         changes = _blur_change(k, profile, scale, sigma, std)
-        noise = min(after, fitted.rms_px)
         z = abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / (2 * std[1])
-        p_value = float(np.exp(-0.5 * z**2))
+        p_value = float((2 if k == 0 else 1) * stats.t.sf(z, local_blur.BLOCKS - 1))
         name = effects[k].name
         verdict.findings.append(
-            Finding(name, changes, HeldOutGain(BLUR, before, after, noise), (), p_value, sentence_of(name, changes))
+            Finding(name, changes, HeldOutGain(BLUR, before, after, None), (), p_value, sentence_of(name, changes))
         )
         verdict.rungs.append(Rung(name, {name: after}, before, BLUR))
         values = np.array([scale]) if k == 0 else np.array([sigma])

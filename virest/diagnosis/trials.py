@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
@@ -18,6 +19,8 @@ from virest.motion.track_model import TrackTable
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 JUDGE_POINTS = 3500
+LAGGING_BLOCK, MOST_LAGGING_BLOCKS = 3, 8
+"""Pairs in a block of those that a start-up moves, at least, and blocks at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +106,18 @@ def _held_out(
 
 
 def lagging_gain(evidence: Evidence, before: Judged, after: Judged) -> Array:
-    """Gain of the pairs that a start-up schedule moves; nothing of it was fitted, so each pair is a judge."""
+    """Gain (blocks,) of the pairs that a start-up schedule moves, by blocks of neighbours that share errors."""
     last = after.candidate.model.profile.extensions.frame_lag_frames
     moved = np.array([pair.first <= last for pair in evidence.observed.pairs])
     both = min(len(before.pair_loss), len(after.pair_loss), len(moved))
-    gain: Array = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
-    return gain
+    gain = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
+    parts = np.array_split(gain, max(min(len(gain) // LAGGING_BLOCK, MOST_LAGGING_BLOCKS), 3))
+    return np.array([part.mean() for part in parts if len(part)])
+
+
+def chance_of(gain: Array) -> float:
+    """Probability (one-sided t test) of so even a gain (blocks,) where there is none."""
+    return float(stats.t.sf(t_ratio(gain), max(len(gain) - 1, 1)))
 
 
 def t_ratio(values: Array) -> float:
