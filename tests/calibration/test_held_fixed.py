@@ -7,6 +7,8 @@ import pytest
 
 from virest.calibration.geometry import _value
 from virest.calibration.held_fixed import BELIEVABLE, OPTIONAL, HeldValue, held_notes
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
 
 
 def held(name: str, change: Any, std: Any) -> dict[str, HeldValue]:

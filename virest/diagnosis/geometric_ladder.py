@@ -9,7 +9,7 @@ what is no longer significant leaves.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from virest.calibration.physical_limits import is_depth
 from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
+from virest.diagnosis.catalogue import FALSE_ALARM, MAX_P
 from virest.diagnosis.findings import GEOMETRY, JOINED, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.geometric_effects import GeometricEffect
 from virest.diagnosis.geometric_evidence import (
@@ -38,8 +39,10 @@ from virest.diagnosis.trials import (
     Screened,
     best_of_each,
     chance_of,
+    choose,
     judge,
     lagging_gain,
+    promising,
     screen,
     t_ratio,
 )
@@ -54,22 +57,20 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 FINAL_POINTS = 7000
-PROMISING = 4
-MIN_T = 3.0
-"""Least ratio of the blocks' mean gain to its standard error."""
-MAX_P = 1e-5
-"""Of the value being nought, for each of some twenty causes tried."""
+PROMISING = 3
+"""Causes that each fold chooses from."""
+HOLDS_P, LARGE_HOLDS_P = 0.01, 0.05
+"""The gain must hold between blocks too (one-sided t test; the cause was chosen by other blocks, so this is one test).
+A capture with nothing wrong passes both this and the value's test at most as often as the latter alone."""
+LARGE_GAIN = 0.05
+"""Above this part of the loss a gain need be less even: time blocks differ in how much they tell of a cause."""
 MIN_GAIN = 0.004
 """Least part of the loss that a cause must take away on held-out blocks."""
-LARGE_GAIN, LARGE_MIN_T = 0.05, 1.7
-"""So large a gain need not be so even (one-sided 5 %): stretches of time tell more or less of a cause."""
 FEEBLE_GAIN, ASTRAY_SCALE = 0.1, 1.25
 """A cause that takes less than this part away, while points are so many times their noise from where the model puts
 them, is not what is wrong: two that gain little alone are then tried together."""
-PAIR_FIRSTS, PAIRS_JUDGED = 8, 6
-"""The best alone, each beside all others, which it may hide; so many pairs are judged on held-out blocks."""
-PAIR_MIN_T = 2.7
-"""One-sided 5 % for the best of six."""
+PAIR_FIRSTS, PAIRS_JUDGED = 8, 4
+"""The best causes alone, each beside all others, which it may hide; pairs that each fold chooses from."""
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 MAX_RUNGS = 5
@@ -203,11 +204,40 @@ class _Course:
         found = candidates_of(self.evidence, self.nominal, model, tried, self.lags, self.far)
         return worth_beginning(self.evidence, model, found)
 
-    def judged(self, base: Screened, better: Sequence[Screened]) -> list[Judged]:
-        """The model without and with each cause, best first; losses by the smallest scale, that all can be compared."""
-        scale = min(entry.scale for entry in (base, *better))
-        spread = (better[0] if better else base).depth_spread_per_m
-        return judge(self.evidence, [entry.candidate for entry in (base, *better)], scale, spread, self.each)
+    def judged(self, base: Screened, better: Sequence[Screened], count: int) -> Trial:
+        """The model without and with each promising cause; losses by the smallest scale, that all can be compared."""
+        allowed = promising(base, better, count)
+        kept = [entry for entry in better if entry.candidate.name in allowed[0] | allowed[1]]
+        scale = min(entry.scale for entry in (base, *kept))
+        spread = (kept[0] if kept else base).depth_spread_per_m
+        before, *judged = judge(self.evidence, [base, *kept], scale, spread, self.each)
+        return Trial(self.evidence, before, judged, allowed, scale)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """The model without and with each promising cause, on blocks that took no part in the fits."""
+
+    evidence: Evidence
+    before: Judged
+    judged: list[Judged]
+    allowed: tuple[frozenset[str], frozenset[str]]
+    """Names that each fold may choose from."""
+    scale: float
+
+    def rounds(self) -> Iterator[tuple[Judged, Judged, Array]]:
+        """(cause, what choosing one gains, gain by block), best first, each time without those before it.
+
+        The cause is the best over all blocks; what it is judged by was chosen for each block by others.
+        """
+        left = sorted(self.judged, key=lambda entry: float(entry.block_loss.mean()))
+        while left:
+            after = choose(self.evidence, [self.before, *left], self.allowed, self.scale)
+            gain = self.before.block_loss - after.block_loss
+            if left[0].candidate.name == "frame_lag":
+                gain = lagging_gain(self.evidence, self.before, left[0])
+            yield left[0], after, gain
+            left = left[1:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,11 +254,11 @@ def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Ste
     tried = {entry.name for entry in accepted}
     nothing = Candidate("", model, (), None)
     base, *others = screen(course.evidence, [nothing, *course.candidates(model, tried)], course.each)
-    better = [entry for entry in best_of_each(others) if entry.loss < base.loss]
-    before, *judged = course.judged(base, better[:PROMISING])
+    better = [entry for entry in best_of_each(others) if min(np.subtract(entry.losses, base.losses)) < 0]
+    trial = course.judged(base, better, PROMISING)
     typical = course.evidence.typical_px
-    rung = Rung(None, {j.candidate.name: j.rms * typical for j in judged}, before.rms * typical, GEOMETRY)
-    step = _best_single(course.evidence, model, before, judged)
+    rung = Rung(None, {j.candidate.name: j.rms * typical for j in trial.judged}, trial.before.rms * typical, GEOMETRY)
+    step = _best_single(model, trial)
     feeble = step is None or step.part < FEEBLE_GAIN
     if feeble and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
         pair = _best_pair(course, model, tried, base, better)
@@ -237,19 +267,22 @@ def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Ste
     return step, rung if step is None else replace(rung, entered=_names(step))
 
 
+def _holds(gain: Array, part: float) -> bool:
+    """Whether a gain (blocks,), as a part of the loss, is no matter of a few blocks."""
+    return chance_of(gain) < (HOLDS_P if part < LARGE_GAIN else LARGE_HOLDS_P)
+
+
 def _names(step: _Step) -> str:
     return JOINED.join(entry.name for entry in step.accepted)
 
 
-def _best_single(evidence: Evidence, model: Model, before: Judged, judged: list[Judged]) -> _Step | None:
-    """The cause that takes most away where it was not fitted, if that holds."""
+def _best_single(model: Model, trial: Trial) -> _Step | None:
+    """The cause that takes most away where it was neither fitted nor chosen, if that holds."""
+    evidence, before, judged = trial.evidence, trial.before, trial.judged
     typical = evidence.typical_px
-    for best in sorted(judged, key=lambda j: float(j.block_loss.mean())):
-        gain = before.block_loss - best.block_loss
-        if best.candidate.name == "frame_lag":
-            gain = lagging_gain(evidence, before, best)
+    for best, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
-        if part < MIN_GAIN or t_ratio(gain) < (MIN_T if part < LARGE_GAIN else LARGE_MIN_T):
+        if part < MIN_GAIN or not _holds(gain, part):
             continue
         entered, p_value = _significant(evidence, best.candidate, model.profile, gain)
         if entered is None:
@@ -262,7 +295,7 @@ def _best_single(evidence: Evidence, model: Model, before: Judged, judged: list[
         )  # fmt: skip
         cause = Accepted(
             best.candidate.name, best.candidate.effect, best.candidate.word,
-            before.rms * typical, best.rms * typical, p_value, rivals,
+            before.rms * typical, after.rms * typical, p_value, rivals,
         )  # fmt: skip
         return _Step(entered, (cause,), part)
     return None
@@ -283,27 +316,32 @@ def _best_pair(
         begun = course.candidates(with_it, {*tried, first.name})
         seconds = [candidate for candidate in begun if candidate.added]
         found += [(first, second) for second in best_of_each(screen(evidence, seconds, course.each))]
-    found = sorted(found, key=lambda pair: pair[1].loss)[:PAIRS_JUDGED]
     if not found:
         return None
-    before, *judged = course.judged(base, [second for _, second in found])
-    for (first, _), pair in sorted(
-        zip(found, judged, strict=True), key=lambda known: float(known[1].block_loss.mean())
-    ):
-        gain = before.block_loss - pair.block_loss
+    members_of = {_pair_name(first, entry): (first, entry.candidate) for first, entry in found}
+    renamed = [
+        replace(entry, candidate=replace(entry.candidate, name=_pair_name(first, entry))) for first, entry in found
+    ]
+    trial = course.judged(base, sorted(renamed, key=lambda entry: entry.loss), PAIRS_JUDGED)
+    before = trial.before
+    for pair, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
-        if part < FEEBLE_GAIN or t_ratio(gain) < PAIR_MIN_T:
+        if part < FEEBLE_GAIN or not _holds(gain, part):
             continue
         entered, fitted = _with(evidence, pair.candidate)
-        members = (first, pair.candidate)
+        members = members_of[pair.candidate.name]
         p_values = [_p_value(evidence, fitted, member, entered.profile, model.profile) for member in members]
         if max(p_values) < MAX_P:
             causes = (
-                Accepted(member.name, member.effect, "", before.rms * typical, pair.rms * typical, p_value, ())
+                Accepted(member.name, member.effect, "", before.rms * typical, after.rms * typical, p_value, ())
                 for member, p_value in zip(members, p_values, strict=True)
             )
             return _Step(entered, tuple(causes), part)
     return None
+
+
+def _pair_name(first: Candidate, second: Screened) -> str:
+    return f"{first.name}{JOINED}{second.candidate.name}"
 
 
 def _with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
@@ -316,11 +354,12 @@ def _significant(
 ) -> tuple[Model | None, float]:
     """The model with the candidate in it, if its value is significant, and the probability that it is nought.
 
-    A word has no value: its probability is that of so even a gain (blocks,) by chance, which has been required already.
+    A word has no value: its probability is that of so even a gain (blocks,) by chance.
     """
     model, fitted = _with(evidence, candidate)
     if candidate.name != "scene_depth" and (candidate.effect is None or candidate.effect.term is None):
-        return model, chance_of(gain)
+        p_value = chance_of(gain)
+        return (model if p_value < FALSE_ALARM else None), p_value
     if candidate.name == "scene_depth":
         p_value = depth_p(fitted, evidence.table(model, JUDGE_POINTS), before.depth_m)
     else:
@@ -449,7 +488,10 @@ def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted,
     if not _has_term(entry):
         return entry
     less, _ = _refitted(evidence, _without(model, nominal, entry), SCREEN_POINTS)
-    without_and_with = [Candidate("", m, (), None) for m in (less, model)]
+    without_and_with = [
+        Screened(Candidate("", m, (), None), (m, m), (0.0, 0.0), fitted.scale, fitted.depth_spread_per_m)
+        for m in (less, model)
+    ]
     before, after = judge(evidence, without_and_with, fitted.scale, fitted.depth_spread_per_m, one_by_one)
     return replace(entry, before=before.rms * evidence.typical_px, after=after.rms * evidence.typical_px, rivals=())
 

@@ -19,6 +19,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
+from virest.diagnosis.catalogue import MAX_P
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
@@ -39,7 +40,6 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
-MAX_P = 1e-5
 MIN_GAIN = 0.15
 """Least part of the excess over the noise that a cause of brightness must take away on held-out blocks."""
 LEAST_FALL = 0.02
@@ -62,7 +62,8 @@ MIXING_P = 1.5e-3
 MIXING_LEAST = {"response_curve": 0.05, "black_level": 0.02}
 """Smallest change of the curve that is named from mixing: of the logarithm of gamma, of black level."""
 MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
-BLUR_Z = 3.6
+BLUR_Z = float(stats.norm.isf(MAX_P / 2))
+"""Deviations from no change of exposure or defocus at which the two-sided probability is MAX_P."""
 MIN_DEFOCUS_PX = 0.5
 SOFT_Z = 5.0
 """A defocus that is not named, for lenses differ, is said from so many deviations on; named from twice BLUR_Z."""
