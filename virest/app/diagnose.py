@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,12 @@ from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames
 from virest.diagnosis.findings import CONSISTENT, Diagnosis, Finding, Remaining, Rung
-from virest.diagnosis.restoration_gain import RestorationGain, chosen_pairs, measure_restoration_gain
+from virest.diagnosis.restoration_gain import (
+    RestorationGain,
+    chosen_pairs,
+    measure_restoration_gain,
+    pairs_to_keep_back,
+)
 from virest.errors import OutputError, VirestError
 from virest.motion.shared_out import Each, one_by_one
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
@@ -99,11 +104,14 @@ def run_diagnosis(
     folder = Path(options.out) / capture_name(path)
     require_free(folder, options.overwrite)
     source = open_source(Path(path), options.config)
-    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each)
+    firsts = pairs_to_keep_back(source.capture, source.profile)
+    kept_back = [first + step for first in firsts for step in (0, 1)]
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, kept_back)
     say("restoring", LADDER_PART)
     gain = measure_restoration_gain(
-        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray, each=each
-    )
+        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray, each=each,
+        firsts=firsts,
+    )  # fmt: skip
     say("figures", GAIN_PART)
     files, drawn = draw_figures(source.capture, found, each)
     facts = as_json(found, gain, drawn)
@@ -115,11 +123,11 @@ def run_diagnosis(
     return DiagnosisOutcome(facts, text, found.verdict)
 
 
-def climb(source: Source, progress: Progress, each: Each = one_by_one) -> Diagnosis:
-    """The ladder itself."""
+def climb(source: Source, progress: Progress, each: Each = one_by_one, kept_back: Collection[int] = ()) -> Diagnosis:
+    """The ladder itself; kept_back: movie indices of frames that no fit is to see."""
     from virest.diagnosis.ladder import diagnose_capture
 
-    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each)
+    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each, kept_back)
 
 
 def require_free(folder: Path, overwrite: bool) -> None:
@@ -407,6 +415,8 @@ def _number(value: Any) -> str:
 
 
 def _gain_line(gain: RestorationGain) -> str:
+    if not gain.frames:
+        return "restored: the capture is too short to keep frames back from the fits"
     if math.isnan(gain.sharpness_after):
         return "restored: no two neighbours could be laid on each other"
     return (
