@@ -105,28 +105,32 @@ def _phone(
 ) -> Workload:
     """640x480 at a phone's bit rate; the strengths are set here, so that ``--isp phone`` may change."""
     plain = _workload(f"phone-{name}", "phone", blur_range_px, scene, exposure_ms, rate, noise)
-    return dataclasses.replace(plain, options={**plain.options, "isp": PhoneIsp(**PHONE, **isp)})
+    own = {"readout_ms": PHONE_READOUT_MS, "isp": PhoneIsp(**{**PHONE, **isp})}
+    return dataclasses.replace(plain, options={**plain.options, **own})
 
 
+PHONE_READOUT_MS = 12.0
+"""Where the stabiliser is wrong the rows are straightened wrong: with 20 ms that, not the blur, decides the PSNR."""
 PHONE: dict[str, Any] = {
     "tone": 0.4,
     "highlights": 0.25,
     "local_tone": 0.1,
+    "denoise": 1.5,
+    "temporal_denoise": 0.4,
+    "sharpen": 0.5,
     "sharpen_radius_px": 1.0,
+    "bits_per_px": 0.3,
     "gyro_noise": 0.001,
     "gyro_jitter_s": 0.0002,
     "gyro_lowpass_hz": 60.0,
 }
 """What the phones have in common: 0.01 rad/s of gyroscope noise at 200 samples/s, before its low pass of 60 Hz."""
 PHONES = (
-    _phone("calm", "leaves", 12.0, 0.6, 1.5, (1.0, 10.0),
-           denoise=1.5, temporal_denoise=0.4, sharpen=0.5, offset_s=0.002, bits_per_px=0.3),
-    _phone("fast", "board", 16.0, 1.6, 2.0, ORDINARY_PX,
-           denoise=1.5, temporal_denoise=0.4, sharpen=0.5, offset_s=-0.002, bits_per_px=0.3),
-    _phone("stabilised", "photographs", 16.0, 1.4, 1.5, ORDINARY_PX,
-           denoise=1.5, temporal_denoise=0.4, sharpen=0.7, stabiliser_rest=0.2, bits_per_px=0.3),
-    _phone("dim", "text", 30.0, 0.9, 5.0, ORDINARY_PX,
-           denoise=2.0, temporal_denoise=0.6, sharpen=0.5, offset_s=0.002, bits_per_px=0.15),
+    _phone("calm", "text", 12.0, 0.6, 1.5, (1.0, 10.0), offset_s=0.002),
+    _phone("fast", "photographs", 16.0, 1.6, 2.0, ORDINARY_PX, offset_s=-0.002),
+    _phone("stabilised", "leaves", 20.0, 0.9, 1.5, ORDINARY_PX, stabiliser_rest=0.2),
+    _phone("dim", "text", 30.0, 0.9, 5.0, ORDINARY_PX, offset_s=0.002, denoise=2.0, temporal_denoise=0.6,
+           bits_per_px=0.15),
 )  # fmt: skip
 
 
