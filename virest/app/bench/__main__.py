@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from virest import __version__
+from virest.app.bench.broken import broken_section
 from virest.app.bench.commands import commands_section
 from virest.app.bench.compare import NOISE, compare_text, read_report
 from virest.app.bench.cost import cost_section
@@ -50,6 +51,7 @@ SECTIONS: dict[str, Section] = {
     "curves": curves_section,
     "diagnosis": diagnosis_section,
     "soak": soak_section,
+    "broken": broken_section,
     "real": real_section,
 }
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image", "deepinv", "torch")
