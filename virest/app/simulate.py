@@ -12,7 +12,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure
-from virest.simulation.effects import EffectContext, hide_effects
+from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import Session, SessionSettings, nominal_camera, plan_session
@@ -80,6 +80,9 @@ def simulate_command(
         distortion=distortion,
         depth_m=np.inf if depth_m is None else depth_m,
     )
+    context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
+    true, applied = hide_effects(nominal, list(effects), context)
+    isp = hidden_isp(applied, isp)
     settings = SessionSettings(
         scene=scene,
         frames=frames,
@@ -96,8 +99,6 @@ def simulate_command(
         seed=seed,
         isp=isp,
     )
-    context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
-    true, applied = hide_effects(nominal, list(effects), context)
     session = plan_session(nominal, isp.true_profile(true), settings)
     bits_per_px = isp.bits_per_px or bitrate_bits_per_px
     options = RecordingOptions(layout, clock, bits_per_px, crf, middle_truth=reference == "frame-middle")

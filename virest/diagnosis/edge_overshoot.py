@@ -19,14 +19,18 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from virest.camera.profile import CameraProfile
-from virest.capture.records import Frame
-from virest.diagnosis.local_blur import STILL_PX, time_blocks
+from virest.capture.records import Capture, Frame
+from virest.diagnosis.catalogue import MAX_P
+from virest.diagnosis.findings import EDGES, Finding, HeldOutGain, ParameterChange, Rung
+from virest.diagnosis.local_blur import STILL_PX, frames_to_read, time_blocks
 from virest.diagnosis.local_blur_edges import TANGENT_PX, EdgeSettings, find_edges
 from virest.diagnosis.local_blur_model import across, path_tensors
+from virest.diagnosis.picture_ladder import PictureVerdict, Reader
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -53,10 +57,10 @@ PROFILE_STD = 0.003
 """Misfit of the mean profile, as part of the step; neighbours within a pixel share it."""
 BARE_OVERSHOOT, BARE_STD = 0.006, 0.007
 """Of decoded movies that nobody sharpened, mean and spread: coding, interpolation, and the choice of sharp edges."""
-NAMED_Z = 4.3
-"""False alarms: 1 in 10⁵ captures, as for brightness."""
-AMOUNT_ERROR = 0.15
-"""Relative: coding damps the overshoot, and the phone's mask is no single Gaussian."""
+BARE_RADII_PX = (0.6, 2.2)
+"""How far a bare overshoot reaches: from interpolation's to that of edges which were picked for their sharpness."""
+SIZE_ERROR = 0.2
+"""Relative, of amount and radius: coding damps the overshoot at some frequencies more than at others."""
 BOUNDS = ([0.2, 0.0, np.log(0.4)], [3.0, 6.0, np.log(4.0)])
 
 
@@ -92,9 +96,29 @@ class Sharpening:
     rms_after: float
 
     @property
-    def named(self) -> bool:
-        """Whether it is beyond what coding alone makes."""
-        return self.z > NAMED_Z
+    def p_value(self) -> float:
+        """Probability of such an overshoot on both sides where nobody sharpened."""
+        return float(stats.norm.sf(self.z))
+
+
+def judge_sharpening(capture: Capture, profile: CameraProfile, trajectory: Trajectory, gray: Reader) -> PictureVerdict:
+    """Name the sharpening, where edges overshoot by more than coding alone makes them."""
+    verdict = PictureVerdict(profile)
+    wanted = frames_to_read(capture)
+    found = fit_sharpening(observe_profiles(gray(wanted), capture.frames, profile, trajectory)) if wanted else None
+    if found is None:
+        verdict.notes.append("too few sharp, isolated edges: sharpening was not judged")
+    elif found.p_value < MAX_P:
+        values = {"amount": (found.amount, found.amount_std), "radius_px": (found.radius_px, found.radius_std_px)}
+        changes = {name: ParameterChange(0.0, value, std) for name, (value, std) in values.items()}
+        gain = HeldOutGain(EDGES, found.rms_before, found.rms_after, None)
+        sentence = (
+            f"edges overshoot by {found.overshoot:.0%} of their step: the phone sharpened its pictures by an unsharp "
+            f"mask of {found.amount:.2g} with a radius of {found.radius_px:.2g} px"
+        )
+        verdict.findings.append(Finding("sharpening", changes, gain, (), found.p_value, sentence))
+        verdict.rungs.append(Rung("sharpening", {"sharpening": found.rms_after}, found.rms_before, EDGES))
+    return verdict
 
 
 def observe_profiles(
@@ -130,15 +154,14 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
     scatter = _jackknife([_fit(_evened(one))[0] for one in without])
     sides = np.array(_overshoots(mean))
     sides_std = np.sqrt(np.diag(_jackknife([np.array(_overshoots(one)) for one in without])) + BARE_STD**2)
-    std = np.sqrt(np.diag(covariance + scatter))
+    std = np.sqrt(np.diag(covariance + scatter + _by_bare_overshoot(_evened(mean), theta)))
     amount, radius_px = float(theta[1]), float(np.exp(theta[2]))
-    by_coding = amount * np.hypot(AMOUNT_ERROR, BARE_STD / max(float(sides.mean()), BARE_STD))
     before, after = _held_out(profiles, block)
     return Sharpening(
         amount,
-        float(np.hypot(std[1], by_coding)),
+        float(np.hypot(std[1], SIZE_ERROR * amount)),
         radius_px,
-        radius_px * float(std[2]),
+        radius_px * float(np.hypot(std[2], SIZE_ERROR)),
         float(sides.mean()),
         float(((sides - BARE_OVERSHOOT) / sides_std).min()),
         before,
@@ -238,6 +261,16 @@ def _fit(mean: Array) -> tuple[Array, Array]:
     start = [0.7, 0.3, np.log(RADIUS_PX)]
     found = least_squares(off, start, bounds=BOUNDS)
     return found.x, np.linalg.pinv(found.jac.T @ found.jac)
+
+
+def _by_bare_overshoot(mean: Array, theta: Array) -> Array:
+    """What the values move by, squared, if part of the overshoot is not sharpening's, whether narrow or wide."""
+    moved = np.zeros((3, 3))
+    for radius_px in BARE_RADII_PX:
+        bare = sharpened_step(theta[0], 1.0, radius_px) - sharpened_step(theta[0], 0.0, radius_px)
+        away = _fit(mean - np.hypot(BARE_OVERSHOOT, BARE_STD) / bare.max() * bare)[0] - theta
+        moved += np.outer(away, away)
+    return moved
 
 
 def _jackknife(values: Sequence[Array]) -> Array:
