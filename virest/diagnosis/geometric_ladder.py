@@ -122,6 +122,8 @@ class GeometricVerdict:
     """What tracking alone makes, as an rms like the two above."""
     step_noise_px: float
     """Typical standard deviation of a tracked step, per coordinate."""
+    rival: GeometricVerdict | None = None
+    """Another end of the ladder that held-out points do not tell from this one; None: there is none."""
     lag_std_s: float | None = None
     """Of a start-up lag; None without one."""
     astray: float = 0.0
@@ -148,22 +150,83 @@ def climb(
     start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
     model, notes = _with_unknowns(evidence, start)
     nominal_model = model
-    accepted: list[Accepted] = []
-    rungs: list[Rung] = []
     course = _Course(evidence, nominal, lags, far or FarClock(), each)
     say(0.1)
-    for number in range(max_rungs):
-        step, rung = _rung(course, model, accepted)
-        rungs.append(rung)
-        say(0.1 + 0.8 * (number + 1) / MAX_RUNGS)
-        if step is None:
-            break
-        accepted += step.accepted
-        model, _ = _refitted(evidence, step.model, JUDGE_POINTS)
-        log.debug("rung %d: %s", number + 1, rung.entered)
-    verdict = _conclude(evidence, nominal_model, model, accepted, rungs, nominal)
+    path, fork = _ascended(course, _Path(model, (), ()), max_rungs)
+    say(0.6)
+    verdict = _conclude(evidence, nominal_model, path.model, list(path.accepted), list(path.rungs), nominal)
+    if fork is not None:
+        other, _ = _ascended(course, fork, max_rungs)
+        say(0.9)
+        rival = _conclude(evidence, nominal_model, other.model, list(other.accepted), list(other.rungs), nominal)
+        verdict = _either(evidence, verdict, rival)
     verdict.notes += notes
     return verdict
+
+
+@dataclass(frozen=True, slots=True)
+class _Path:
+    """A way up the ladder so far."""
+
+    model: Model
+    accepted: tuple[Accepted, ...]
+    rungs: tuple[Rung, ...]
+
+    def further(self, evidence: Evidence, step: _Step, rung: Rung) -> _Path:
+        """With what enters on the next rung."""
+        model, _ = _refitted(evidence, step.model, JUDGE_POINTS)
+        log.debug("rung %d: %s", len(self.rungs) + 1, _names(step))
+        entered = replace(rung, entered=_names(step))
+        return _Path(model, (*self.accepted, *step.accepted), (*self.rungs, entered))
+
+
+def _ascended(course: _Course, path: _Path, max_rungs: int) -> tuple[_Path, _Path | None]:
+    """The path to its end, and the one that leaves it where it first might as well have gone another way."""
+    fork: tuple[_Path, _Step, Rung] | None = None
+    while len(path.rungs) < max_rungs:
+        step, rival, rung = _rung(course, path.model, list(path.accepted))
+        if step is None:
+            path = replace(path, rungs=(*path.rungs, rung))
+            break
+        if rival is not None and fork is None:
+            fork = (path, rival, rung)
+        path = path.further(course.evidence, step, rung)
+    return path, None if fork is None else fork[0].further(course.evidence, *fork[1:])
+
+
+def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
+    """The better of two ends of the ladder by held-out blocks; where those do not tell, one with the other as a rival.
+
+    Which of the two was reached first may hang on rounding; which one is returned then follows from the causes' number
+    and names alone.
+    """
+    ends = [
+        Screened(Candidate("", end.model, (), None), (end.model, end.model), (0.0, 0.0), end.fit.scale, 0.0)
+        for end in (first, second)
+    ]
+    spread = max(first.fit.depth_spread_per_m, second.fit.depth_spread_per_m)
+    one, other = judge(evidence, ends, min(first.fit.scale, second.fit.scale), spread, one_by_one)
+    worse = t_ratio(other.block_loss - one.block_loss)
+    if abs(worse) >= RIVAL_T:
+        return first if worse > 0 else second
+    chosen, rival = sorted((first, second), key=lambda end: (len(end.accepted), sorted(e.name for e in end.accepted)))
+    rms = (other if rival is second else one).rms * evidence.typical_px
+    names = {entry.name for entry in chosen.accepted}
+    instead = [Rival(entry.name, rms) for entry in rival.accepted if entry.name not in names]
+    shared = names & {entry.name for entry in rival.accepted}
+    chosen.accepted = [
+        entry if entry.name in shared else replace(entry, rivals=_joined(entry.rivals, instead))
+        for entry in chosen.accepted
+    ]
+    if instead:
+        chosen.notes.append(f"{' and '.join(r.name for r in instead)} in place of others explains the points as well")
+    chosen.rival = rival
+    return chosen
+
+
+def _joined(rivals: Sequence[Rival], more: Sequence[Rival]) -> tuple[Rival, ...]:
+    known = {rival.name for rival in rivals}
+    return (*rivals, *(rival for rival in more if rival.name not in known))
 
 
 def _with_unknowns(evidence: Evidence, start: Model) -> tuple[Model, list[str]]:
@@ -250,7 +313,8 @@ class _Step:
     """Of the held-out loss that it takes away."""
 
 
-def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, Rung]:
+def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, _Step | None, Rung]:
+    """What enters, what might have entered as well, and the rung."""
     tried = {entry.name for entry in accepted}
     nothing = Candidate("", model, (), None)
     base, *others = screen(course.evidence, [nothing, *course.candidates(model, tried)], course.each)
@@ -258,13 +322,14 @@ def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Ste
     trial = course.judged(base, better, PROMISING)
     typical = course.evidence.typical_px
     rung = Rung(None, {j.candidate.name: j.rms * typical for j in trial.judged}, trial.before.rms * typical, GEOMETRY)
-    step = _best_single(model, trial)
+    step, rival = _best_single(model, trial)
     feeble = step is None or step.part < FEEBLE_GAIN
     if feeble and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
         pair = _best_pair(course, model, tried, base, better)
         if pair is not None:
-            step, rung = pair, replace(rung, tried={**rung.tried, _names(pair): pair.accepted[0].after})
-    return step, rung if step is None else replace(rung, entered=_names(step))
+            step, rival = pair, None
+            rung = replace(rung, tried={**rung.tried, _names(pair): pair.accepted[0].after})
+    return step, rival, rung
 
 
 def _holds(gain: Array, part: float) -> bool:
@@ -276,8 +341,8 @@ def _names(step: _Step) -> str:
     return JOINED.join(entry.name for entry in step.accepted)
 
 
-def _best_single(model: Model, trial: Trial) -> _Step | None:
-    """The cause that takes most away where it was neither fitted nor chosen, if that holds."""
+def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None]:
+    """The cause that takes most away where it was neither fitted nor chosen, if that holds, and its strongest rival."""
     evidence, before, judged = trial.evidence, trial.before, trial.judged
     typical = evidence.typical_px
     for best, after, gain in trial.rounds():
@@ -287,17 +352,34 @@ def _best_single(model: Model, trial: Trial) -> _Step | None:
         entered, p_value = _significant(evidence, best.candidate, model.profile, gain)
         if entered is None:
             continue
-        rivals = tuple(
-            Rival(other.candidate.name, other.rms * typical)
-            for other in judged
-            if other is not best and t_ratio(other.block_loss - best.block_loss) < RIVAL_T
-            and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
-        )  # fmt: skip
+        others = [other for other in judged if other is not best and _rivals(before, best, other, gain)]
+        rivals = tuple(Rival(other.candidate.name, other.rms * typical) for other in others)
         cause = Accepted(
             best.candidate.name, best.candidate.effect, best.candidate.word,
             before.rms * typical, after.rms * typical, p_value, rivals,
         )  # fmt: skip
-        return _Step(entered, (cause,), part)
+        return _Step(entered, (cause,), part), _rival_step(model, trial, others, part)
+    return None, None
+
+
+def _rivals(before: Judged, best: Judged, other: Judged, gain: Array) -> bool:
+    """Whether the blocks do not prefer the best to another that gains at least half as much."""
+    apart = t_ratio(other.block_loss - best.block_loss)
+    return apart < RIVAL_T and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
+
+
+def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: float) -> _Step | None:
+    """The strongest of the rivals that is significant too."""
+    typical = trial.evidence.typical_px
+    for other in sorted(others, key=lambda entry: float(entry.block_loss.mean())):
+        gain = trial.before.block_loss - other.block_loss
+        entered, p_value = _significant(trial.evidence, other.candidate, model.profile, gain)
+        if entered is not None:
+            kind = other.candidate
+            cause = Accepted(
+                kind.name, kind.effect, kind.word, trial.before.rms * typical, other.rms * typical, p_value, ()
+            )
+            return _Step(entered, (cause,), part)
     return None
 
 
@@ -461,7 +543,7 @@ def _conclude(
     return GeometricVerdict(
         model, fitted, table, accepted, rungs, nominal_model, nominal_fit, nominal_table,
         before, capped_rms(fitted.distance) * typical, evidence.noise_px(fitted), typical,
-        _lag_std_s(evidence, model, table) if model.lag else None,
+        lag_std_s=_lag_std_s(evidence, model, table) if model.lag else None,
     )  # fmt: skip
 
 
@@ -578,7 +660,26 @@ def findings_of(verdict: GeometricVerdict) -> list[Finding]:
 
 
 def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
-    """Parameters of one cause, before and after."""
+    """Parameters of one cause, before and after; where the ladder has two ends, with how far those are apart.
+
+    Either end is as likely: the second moment about the value told grows by half the squared difference.
+    """
+    changes = _changes_at(verdict, entry)
+    twin = next((e for e in verdict.rival.accepted if e.name == entry.name), None) if verdict.rival else None
+    if verdict.rival is None or twin is None:
+        return changes
+    there = _changes_at(verdict.rival, twin)
+    return {name: _apart(change, there[name]) for name, change in changes.items()}
+
+
+def _apart(change: ParameterChange, there: ParameterChange) -> ParameterChange:
+    if change.std is None or isinstance(change.estimate, str):
+        return change
+    off = np.subtract(change.estimate, there.estimate) / np.sqrt(2)
+    return replace(change, std=np.hypot(change.std, off).tolist())
+
+
+def _changes_at(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
     nominal, found = verdict.nominal.profile, verdict.model.profile
     if entry.name == "scene_depth":
         depth_m, std = depth_of(verdict.fit, verdict.table)

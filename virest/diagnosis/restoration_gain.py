@@ -2,7 +2,8 @@
 
 Some pairs of neighbouring frames, high-motion ones spread over the capture, are kept back from every fit of points,
 blur and curve, and restored with the profile as given and with the extended one.  (Brightness sees them: a gain that
-drifts belongs to its frame, and other frames do not tell it.)  Two neighbours are two independent witnesses of one scene:
+drifts belongs to its frame, and other frames do not tell it.)  Two neighbours are two independent witnesses of one
+scene:
 
 - *sharpness*: the gradient that both show.  One picture is laid on the other by a homography through tracked points,
   and the product of their gradients is averaged: noise and the ringing of a wrong kernel differ between the two and

@@ -42,6 +42,8 @@ class Scale:
     full: bool = False
     presets: tuple[str, ...] = PRESETS
     """Those that ``honesty`` measures."""
+    seeds: int = 100
+    """Captures that calibrations are compared with truth on."""
 
     @property
     def name(self) -> str:
