@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from virest.app.diagnose import open_source
+from virest.app.diagnose import Source, open_source
 from virest.app.simulate import simulate_command
 from virest.diagnosis.catalogue import MAX_P
 from virest.diagnosis.edge_overshoot import (
@@ -17,8 +17,10 @@ from virest.diagnosis.edge_overshoot import (
     judge_sharpening,
     sharpened_step,
 )
-from virest.diagnosis.picture_ladder import PictureVerdict
+from virest.diagnosis.picture_ladder import PictureVerdict, climb_blur
 from virest.motion.integration import integrate_gyro
+from virest.motion.trajectory import Trajectory
+from virest.simulation.phone_isp import PhoneIsp
 
 
 def edges(rng, shape, count=600, widths=(0.6, 1.4)):
@@ -74,20 +76,30 @@ def test_few_edges_tell_nothing(rng):
     assert fit_sharpening(edges(rng, lambda width: ndtr(GRID_PX / width), count=20)) is None
 
 
-def judged(folder: Path, **options) -> PictureVerdict:
-    """Simulate a board and look at its edges."""
+def opened(folder: Path, **options) -> tuple[Source, Trajectory]:
+    """Simulate a board as a capture, and its motion by the capture's own profile."""
     simulate_command(
         folder, scene="board", width=480, height=360, frames=20, seed=3, exposure_ms=5.0, rate_rad_s=0.8, **options
     )
     source = open_source(folder)
-    trajectory = integrate_gyro(source.capture.imu, source.profile)
+    return source, integrate_gyro(source.capture.imu, source.profile)
+
+
+def judged(source: Source, trajectory: Trajectory) -> PictureVerdict:
+    """What its edges say."""
     return judge_sharpening(source.capture, source.profile, trajectory, source.gray)
 
 
-def test_a_hidden_sharpening_is_named_with_its_size(tmp_path):
-    """At the recorder's bit rate, from the movie alone."""
-    verdict = judged(tmp_path / "sharp", effects=["sharpening=0.9,1.4"])
-    (finding,) = verdict.findings
+@pytest.fixture(scope="module")
+def processed(tmp_path_factory) -> tuple[Source, Trajectory]:
+    """A phone denoises in space and time, and sharpens; at the recorder's bit rate."""
+    isp = PhoneIsp(denoise=1.5, temporal_denoise=0.4)
+    return opened(tmp_path_factory.mktemp("edges") / "phone", isp=isp, effects=["sharpening=0.9,1.4"])
+
+
+def test_a_hidden_sharpening_is_named_with_its_size(processed):
+    """From the movie alone, within two and a half deviations."""
+    (finding,) = judged(*processed).findings
     assert finding.name == "sharpening"
     for name, truth in (("amount", 0.9), ("radius_px", 1.4)):
         change = finding.parameters[name]
@@ -96,8 +108,17 @@ def test_a_hidden_sharpening_is_named_with_its_size(tmp_path):
     assert "unsharp" in finding.sentence
 
 
+def test_sharpening_and_denoising_are_no_defocus_and_no_other_exposure(processed):
+    """Nothing is named by the widths of edges and the ratios of spectra."""
+    source, trajectory = processed
+    verdict, is_exposure = climb_blur(source.capture, source.profile, trajectory, source.gray, None)
+    assert verdict.blur_rms_px is not None
+    assert not verdict.findings
+    assert not is_exposure
+
+
 def test_what_is_not_sharpened_is_not_named(tmp_path):
-    """Denoised by the phone, out of focus, under another curve: none of it overshoots."""
-    verdict = judged(tmp_path / "plain", effects=["defocus=0.8", "response_curve=1.3"])
+    """Out of focus and under another curve: neither overshoots, and there are edges enough to tell."""
+    verdict = judged(*opened(tmp_path / "plain", effects=["defocus=0.8", "response_curve=1.3"]))
     assert not verdict.findings
     assert not verdict.notes
