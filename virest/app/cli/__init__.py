@@ -16,7 +16,7 @@ from virest.app.cli.diagnose import diagnose
 from virest.app.cli.evaluate import evaluate
 from virest.app.cli.export import export
 from virest.app.cli.inspect import inspect
-from virest.app.cli.options import Version
+from virest.app.cli.options import GroupedCommand, Version
 from virest.app.cli.process import process
 from virest.app.cli.report import report
 from virest.app.cli.simulate import simulate
@@ -54,7 +54,7 @@ def _virest(version: Version = False) -> None:
 
 
 for command in (process, inspect, simulate, calibrate, diagnose, report, export):
-    app.command()(command)
+    app.command(cls=GroupedCommand)(command)
 app.command("calibrate-curve")(calibrate_curve)
 app.add_typer(evaluate, name="evaluate")
 
