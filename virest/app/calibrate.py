@@ -145,17 +145,24 @@ def run_calibration(
     OutputError; nothing is written then.
     """
     output.require()
+    facts, found, noise = find_calibration(plan, progress, each)
+    text = describe(facts)
+    _write(output, facts, found, noise, plan.capture)
+    facts["written"] = [str(path) for path in output.files]
+    return facts, "\n".join([text, *(f"wrote {path}" for path in output.files)])
+
+
+def find_calibration(
+    plan: CalibrationPlan, progress: Callable[[int], Any] | None = None, each: Each = one_by_one
+) -> tuple[Json, GeometryCalibration, ImuNoise | None]:
+    """Track and fit; the mapping for ``--json``, and what it was made from.  Writes nothing; raises CalibrationError."""
     step = progress or (lambda _: None)
     movie = plan.capture.movie
     pairs = track_frames(GrayReader(movie, probe_movie(movie)), plan.frames, each, step)
     found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1))
     _require_offset(found)
     noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)
-    facts = as_json(plan, found, noise)
-    text = describe(facts)
-    _write(output, facts, found, noise, plan.capture)
-    facts["written"] = [str(path) for path in output.files]
-    return facts, "\n".join([text, *(f"wrote {path}" for path in output.files)])
+    return as_json(plan, found, noise), found, noise
 
 
 def _require_offset(found: GeometryCalibration) -> None:

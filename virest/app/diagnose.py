@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from virest.app.console import table
 from virest.app.outputs import capture_name, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
-from virest.camera.profile import CameraProfile, format_profile
+from virest.camera.profile import CameraProfile, format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames
@@ -112,6 +112,17 @@ def run_diagnosis(
     say("done", 1.0)
     text = describe(source.capture.name, found, gain, folder)
     return DiagnosisOutcome(facts, text, found.verdict)
+
+
+def find_diagnosis(path: Path, config: Path | None = None) -> Json:
+    """The mapping of diagnosis.json without a file written: the extended profile and the residuals stand in it."""
+    source = open_source(path, config)
+    found = climb(source, lambda _stage, _part: None)
+    gain = measure_restoration_gain(
+        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray
+    )
+    facts = as_json(found, gain, [[] for _ in found.causes])
+    return {**facts, "extended_profile": profile_mapping(found.extended_profile), "residuals": found.residuals}
 
 
 def climb(source: Source, progress: Progress, each: Each = one_by_one) -> Diagnosis:
