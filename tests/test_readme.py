@@ -64,7 +64,8 @@ def test_the_readme_is_short() -> None:
 def test_every_example_can_be_typed(page: Path) -> None:
     """The program's own parser takes every call of virest that a page shows."""
     for call in calls(page):
-        words = shlex.split(re.sub(r'"?\$(\(\([^)]*\)\)|[A-Z_]+)', lambda m: m[0][0] * (m[0][0] == '"') + "1", call))[
+        filled = re.sub(r'("?)\$(?:\(\([^)]*\)\)|[A-Z_]+)', r"\g<1>1", call)
+        words = shlex.split(filled)[1:]
             1:
         ]
         with PROGRAM.make_context("virest", list(words)) as context:

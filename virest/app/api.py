@@ -77,7 +77,7 @@ class Capture:
         return self.record.notes
 
     def read_frames(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, Picture]]:
-        """Index and pixels (height, width, 3) RGB of the frames from ``start`` to before ``stop`` that can be decoded."""
+        """Index and RGB pixels (height, width, 3) of the decodable frames from ``start`` to before ``stop``."""
         chosen = range(len(self))[start:stop]
         if len(chosen):
             for index, picture in read_frames(self.record.movie, self._movie(), chosen[0], chosen[-1]):

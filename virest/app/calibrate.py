@@ -155,7 +155,7 @@ def run_calibration(
 def find_calibration(
     plan: CalibrationPlan, progress: Callable[[int], Any] | None = None, each: Each = one_by_one
 ) -> tuple[Json, GeometryCalibration, ImuNoise | None]:
-    """Track and fit; the mapping for ``--json``, and what it was made from.  Writes nothing; raises CalibrationError."""
+    """Track and fit; the mapping for ``--json``, and what it was made from.  Raises CalibrationError."""
     step = progress or (lambda _: None)
     movie = plan.capture.movie
     pairs = track_frames(GrayReader(movie, probe_movie(movie)), plan.frames, each, step)
