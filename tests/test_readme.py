@@ -66,8 +66,6 @@ def test_every_example_can_be_typed(page: Path) -> None:
     for call in calls(page):
         filled = re.sub(r'("?)\$(?:\(\([^)]*\)\)|[A-Z_]+)', r"\g<1>1", call)
         words = shlex.split(filled)[1:]
-            1:
-        ]
         with PROGRAM.make_context("virest", list(words)) as context:
             name, command, rest = context.command.resolve_command(context, [*context._protected_args, *context.args])
             while hasattr(command, "commands"):

@@ -30,7 +30,12 @@ def strip_figure(pictures: Sequence[tuple[str, Picture]], title: str = "", image
 
 
 def blur_figure(
-    picture: Picture, centres_px: Array, chords_px: Array, kernels: Array, shown: Sequence[int], scale: float = 3.0
+    picture: Picture,
+    centres_px: Array,
+    chords_px: Array,
+    kernels: NDArray[np.float32],
+    shown: Sequence[int],
+    scale: float = 3.0,
 ) -> bytes:
     """A recorded frame with its predicted blur as arrows, and beside it the kernels of a few of the arrows.
 
