@@ -11,6 +11,7 @@ from typing import Any
 
 from virest import __version__
 from virest.app import console
+from virest.app.finish import Finished
 from virest.app.outputs import file_facts, parse_lines, resolved
 from virest.app.planning import Job, ProcessOptions
 from virest.camera.profile import profile_mapping
@@ -36,7 +37,13 @@ def run_totals(logs: list[Path]) -> dict[str, Any]:
     return {"counts": {status: counts[status] for status in STATUSES}, "seconds": dict(seconds)}
 
 
-def run_account(job: Job, plan: RestorationPlan, totals: dict[str, Any], wall_s: float) -> dict[str, Any]:
+def run_account(
+    job: Job,
+    plan: RestorationPlan,
+    totals: dict[str, Any],
+    wall_s: float,
+    finished: Finished = Finished(),  # noqa: B008  (frozen)
+) -> dict[str, Any]:
     """The content of run.json."""
     notes = [note.text for note in job.capture.notes if note.severity != "info"]
     counts = totals["counts"]
@@ -51,7 +58,9 @@ def run_account(job: Job, plan: RestorationPlan, totals: dict[str, Any], wall_s:
         "folder": str(job.capture.folder.absolute()),
         "movie": str(job.capture.movie.absolute()),
         "command": job.request["command"],
-        "profile": profile_mapping(plan.profile),
+        "profile": profile_mapping(finished.profile(plan.profile)),
+        "crop_px": None if finished.crop_px is None else list(finished.crop_px),
+        "film": None if finished.film is None else str(finished.film),
         "profile_source": job.profile_source,
         "profile_sha256": job.request["profile_sha256"],
         "settings": dataclasses.asdict(plan.settings),

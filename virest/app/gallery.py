@@ -87,8 +87,8 @@ HEAD = f"""<!-- Written by `make figures`; edit virest/app/gallery.py instead. -
 
 Each capture below has one effect hidden in it by `virest simulate --effect`; `virest diagnose` reads the capture alone.
 Captures have {FRAMES} frames of {WIDTH}×{HEIGHT} (seed {SEED}). Grey curves show the residuals of the profile as
-given, blue curves those after the named causes are built in: medians and the middle 68 %. For the effects that show in
-brightness or blur, the figure compares a recorded frame with its simulation from the restored neighbour.
+given, blue curves those after the named causes are built in: medians and the middle 68 %. For effects that show in
+brightness or blur, bars show the held-out error that each candidate leaves; the red line is the error without any.
 
 """
 
@@ -101,7 +101,7 @@ def _draw_case(name: str, folder: Path, images: Path) -> dict[str, Any]:
     source = open_source(folder)
     found = diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
     files, _ = draw_figures(source.capture, found)
-    wanted = "residuals" if CATALOGUE[name].shows_in == GEOMETRY else "pictures"
+    wanted = "residuals" if CATALOGUE[name].shows_in == GEOMETRY else f"_{name}"
     figure = next((data for path, data in files.items() if path.endswith(f"{wanted}.png")), None)
     if figure is not None:
         write_whole(images / f"{name}.png", compact(figure))
@@ -129,7 +129,7 @@ def _section(name: str, found: dict[str, Any]) -> str:
         size = f"held-out `{cause['quantity']}` {cause['before']:.3g} → {cause['after']:.3g}{rivals}"
         lines.append(f"- `{cause['name']}`: {cause['sentence']} ({size})")
     if found["figure"]:
-        lines += ["", f"![{name}: before and after](images/gallery/{name}.png)"]
+        lines += ["", f"![{name}: what diagnose found](images/gallery/{name}.png)"]
     return "\n".join([*lines, ""])
 
 

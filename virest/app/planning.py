@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest import __version__
-from virest.app.jobs import prepare_worker
+from virest.app.finish import FinishWishes
+from virest.app.jobs import PictureWishes, prepare_worker
 from virest.app.outputs import Mode, RunFolder, check_run, file_facts, plain
 from virest.camera.profile import CameraProfile, profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
@@ -48,6 +49,8 @@ class ProcessOptions:
     scheduler: str | None = None
     mode: Mode = "new"
     command: str = ""
+    pictures: PictureWishes = PictureWishes()  # noqa: RUF009  (frozen)
+    finish: FinishWishes = FinishWishes()  # noqa: RUF009  (frozen)
     json_lines: bool = False
     """Give each frame's line on standard output, in frame order, as they are done."""
     quiet: bool = False
@@ -223,6 +226,9 @@ def _request(
         "profile_sha256": hashlib.sha256(mapping.encode()).hexdigest(),
         "inputs": [file_facts(file) for file in inputs],
     }
+    wishes = {**dataclasses.asdict(options.pictures), **dataclasses.asdict(options.finish)}
+    if options.pictures != PictureWishes() or options.finish != FinishWishes():
+        request["outputs"] = wishes
     return plain(request)
 
 

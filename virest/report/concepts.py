@@ -132,3 +132,30 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], title: str
     axes.set_aspect("equal")
     axes.set_axis_off()
     axes.set_title(title, fontsize=9)
+
+
+def preview_figure(recorded: Picture, restored: Picture, tiles: Sequence[dict[str, Any]], title: str) -> bytes:
+    """Recorded, restored, and the recorded frame again under arrows along its blur.
+
+    tiles: ``centre_px``, ``angle_rad``, ``length_px`` of each, as the log has them.
+    """
+    height, width = recorded.shape[:2]
+    tall = 6.0 if height > width else 4.0
+    figure = canvas(3 * tall * width / height + 0.3, tall + 0.7)
+    left, middle, right = figure.subplots(1, 3)
+    for axes, picture, name in ((left, recorded, "recorded"), (middle, restored, "restored"), (right, recorded, "")):
+        axes.imshow(picture)
+        axes.set_title(name, fontsize=10)
+        axes.set_axis_off()
+    known = [tile for tile in tiles if tile["length_px"] is not None]
+    longest = max((tile["length_px"] for tile in known), default=0.0)
+    if longest > 0:
+        scale = max(1.0, float(np.floor(0.12 * min(height, width) / longest)))
+        x, y = np.array([tile["centre_px"] for tile in known]).T
+        length = scale * np.array([tile["length_px"] for tile in known])
+        angle = np.array([tile["angle_rad"] for tile in known])
+        u, v = length * np.cos(angle), length * np.sin(angle)
+        right.quiver(x - u / 2, y - v / 2, u, v, angles="xy", scale_units="xy", scale=1, color="gold", width=0.006)
+        right.set_title(f"blur × {scale:g}, up to {longest:.1f} px", fontsize=10)
+    figure.suptitle(title, fontsize=10)
+    return as_file(figure, "png")

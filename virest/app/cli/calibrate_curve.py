@@ -47,5 +47,5 @@ def calibrate_curve(
     if plot is not None and not plot_format_known(plot):
         raise typer.BadParameter(f"--plot {plot.name}: the name must end in .png, .svg or .pdf")
     facts, text = fit_and_write(source, exposures=exposures, kind=kind or "auto", out=out, plot=plot)
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0

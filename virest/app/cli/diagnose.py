@@ -44,6 +44,6 @@ def diagnose(
     from virest.app.side_by_side import side_by_side
 
     with side_by_side(cores()) as each, console.progress_bar(100, "diagnose", quiet=quiet) as bar:
-        outcome = run_diagnosis(capture, DiagnosisOptions(out, config, overwrite), on_bar(bar), each)
-    emit_facts(outcome.facts, outcome.text, as_json=json)
+        outcome = run_diagnosis(console.folder_of(capture), DiagnosisOptions(out, config, overwrite), on_bar(bar), each)
+    emit_facts(outcome.facts, outcome.text, as_json=json, quiet=quiet)
     return outcome.check_code if check else 0

@@ -80,7 +80,7 @@ def shutter(
     options = ShutterOptions(tuple(paths), config, chosen, board, out, quick)
     with console.progress_bar(100, "evaluate shutter", quiet=quiet) as bar:
         facts, text = run_shutter(options, on_bar(bar))
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 
 
@@ -128,7 +128,7 @@ def deblur(
     options = DeblurOptions(tuple(paths), config, chosen, restored, reference, out, quick)
     with console.progress_bar(100, "evaluate deblur", quiet=quiet) as bar:
         facts, text = run_deblur(options, on_bar(bar))
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 
 

@@ -66,5 +66,5 @@ def export(
     plan = plan_export(paths[0], options)
     with console.progress_bar(len(plan.frames), plan.capture.name, quiet=quiet) as bar:
         facts, text = run_export(plan, bar.update if bar else None)
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0

@@ -99,7 +99,7 @@ def simulate(
         _require_only(context, LIKE_OPTIONS, "--like takes it from the capture")
         wishes = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
         facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **wishes)
-        emit_facts(facts, _describe_simulation(facts), as_json=json)
+        emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
         return 0
     count = _parse_count(frames, 12)
     exposures_ms = _parse_exposures(exposure_ms)
@@ -133,7 +133,7 @@ def simulate(
             overwrite=overwrite,
             progress=(lambda _done, _total: bar.update(1)) if bar else None,
         )
-    emit_facts(facts, _describe_simulation(facts), as_json=json)
+    emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
     return 0
 
 
