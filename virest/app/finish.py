@@ -77,13 +77,16 @@ def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
     return dataclasses.replace(profile, width=x1 - x0, height=y1 - y0, intrinsics=lens)
 
 
-def require_film(film: Path, run: Path, overwrite: bool) -> None:
-    """Raise OutputError, before any work, where the film cannot be written."""
-    if is_remote(run):
+def require_finishable(wishes: FinishWishes, name: str, run: Path, *, overwrite: bool) -> None:
+    """Raise OutputError, before any work, where the wishes cannot be met."""
+    if wishes.any and is_remote(run):
         raise OutputError("--video and --crop need --out in a file system", hint="process into a folder, then upload")
+    film = wishes.film_of(name)
+    if film is None:
+        return
     if film.is_dir() or not film.absolute().parent.is_dir():
         raise OutputError(
-            f"{film}: its folder does not exist, or it is a folder", hint="name a file in a folder that exists"
+            f"{film}: is a folder, or its folder does not exist", hint="name a file in a folder that exists"
         )
     if film.exists() and not overwrite:
         raise OutputError(f"{film}: exists already", hint="name another by --video, or pass --overwrite")

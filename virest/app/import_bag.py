@@ -96,9 +96,10 @@ def _unpack(bag: Bag, part: Path, step: Callable[[int], Any]) -> Json:
 
 def _profile_text(camera: BagCamera) -> str:
     """A profile with the lens; what a bag does not say stays unknown."""
-    k, values = camera.matrix, np.array(camera.distortion)
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    values = np.array(camera.distortion)
     model = MODELS.get(camera.model, "none") if np.any(values) else "none"
     coefficients = tuple(values[: 4 if model == "fisheye" else 5].tolist()) if model != "none" else ()
-    lens = Intrinsics(camera.width, camera.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], model, coefficients)
+    lens = Intrinsics(camera.width, camera.height, fx, fy, cx, cy, model, coefficients)
     profile = replace(phone_profile(camera.width, camera.height, "ROS bag"), intrinsics=lens)
     return f"# {AXES}\n" + format_profile(profile)

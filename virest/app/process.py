@@ -13,7 +13,7 @@ from pathlib import Path
 from virest.app import console
 from virest.app.account import PARTLY_FAILED, failure_account, run_account, run_totals
 from virest.app.cluster import is_lost
-from virest.app.finish import Finished, finish_pictures, require_film
+from virest.app.finish import Finished, finish_pictures, require_finishable
 from virest.app.jobs import Ahead, Segment, Workers, cut_frames, make_segment, run_segments
 from virest.app.names import shard_of
 from virest.app.outcome import CaptureOutcome, summary
@@ -162,9 +162,7 @@ def _process_planned(
     if planned.index is None or planned.plan is None or (found == "finished" and options.mode == "resume"):
         with opened_run(run, job.request, "resume"):
             return _repeat_finished(job, options)
-    film = options.finish.film_of(turn.name)
-    if options.finish.any:
-        require_film(film or run.path / "film.mp4", run.path, film is None or options.mode != "new")
+    require_finishable(options.finish, turn.name, run.path, overwrite=options.mode != "new")
     with opened_run(run, job.request, options.mode):
         try:
             if options.pictures.masks:

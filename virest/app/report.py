@@ -117,6 +117,7 @@ class _Account(_Lenient):
     command: str = ""
     profile: dict[str, Any] = Field(default_factory=dict)
     profile_source: str = ""
+    crop_px: tuple[int, int, int, int] | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     inputs: list[_Input] = Field(default_factory=list)
     counts: dict[str, _Count]
@@ -366,7 +367,8 @@ def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
     tiles = _read_tiles(folder, {n for n, facts in by_line.items() if facts.frame in numbers})
     movie, complaint = (None, "") if account.failure else find_movie(account, folder, options.capture)
     notes += [complaint] if complaint else []
-    shown = [_show(folder, facts, tiles[facts.frame], movie, PICTURE_BYTES // among // len(chosen)) for facts in chosen]
+    bytes_each = PICTURE_BYTES // among // len(chosen) if chosen else 0
+    shown = [_show(folder, facts, tiles[facts.frame], movie, bytes_each, account.crop_px) for facts in chosen]
     return RunRecord(account.model_dump(), frames, shown, tuple(notes))
 
 
@@ -393,15 +395,25 @@ def _frame_facts(line: _Line) -> FrameFacts:
     )
 
 
-def _show(folder: Path, facts: FrameFacts, tiles: Sequence[_Tile], movie: _Movie | None, max_bytes: int) -> ShownFrame:
-    """A frame with its pictures before and after; one that was copied has no after."""
+def _show(
+    folder: Path,
+    facts: FrameFacts,
+    tiles: Sequence[_Tile],
+    movie: _Movie | None,
+    max_bytes: int,
+    crop_px: tuple[int, int, int, int] | None = None,
+) -> ShownFrame:
+    """A frame with its pictures before and after, cut alike; one that was copied has no after."""
+    x0, y0, x1, y1 = crop_px or (0, 0, None, None)
     before = None if movie is None else _recorded(movie, facts.frame)
+    before = None if before is None else before[y0:y1, x0:x1]
     after = None
     if facts.state == "restored" or (facts.state == "copied" and before is None):
         after = read_picture(RunFolder(folder).picture(facts.frame))
     picture = after if after is not None else before
     size = (1, 1) if picture is None else (picture.shape[1], picture.shape[0])
-    columns = [(*tile.centre_px, tile.angle_rad, tile.length_px) for tile in tiles]
+    centres = [(tile.centre_px[0] - x0, tile.centre_px[1] - y0) for tile in tiles]
+    columns = [(*centre, tile.angle_rad, tile.length_px) for centre, tile in zip(centres, tiles, strict=True)]
     return show_frame(facts, before, after, columns, size, max_bytes)
 
 
