@@ -13,7 +13,6 @@ Behind an address (``s3://…``) every file is put there by one request, the fol
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import math
@@ -34,6 +33,14 @@ from numpy.typing import NDArray
 from virest.app.png import png_bytes
 from virest.capture.location import RemotePath, is_remote, locate, read_each, remove_files
 from virest.errors import OutputError, RestorationError
+
+fcntl: Any
+msvcrt: Any
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+    import msvcrt
 
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
 PART = re.compile(r".*\.[0-9a-f]{8}\.part")
@@ -353,15 +360,23 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
                 run.path.rmdir()
 
 
+def _take(handle: int) -> None:
+    """Lock an open file for this process alone.  Raises OSError where another one holds it."""
+    if fcntl is not None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    else:  # Windows
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+
+
 @contextmanager
 def _locked(run: RunFolder) -> Iterator[None]:
     while True:
         try:
-            handle = os.open(run.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            handle = os.open(run.lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
         except OSError as error:
             raise output_error(run.path, error) from error
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _take(handle)
         except OSError:
             os.close(handle)
             raise OutputError(
@@ -375,9 +390,12 @@ def _locked(run: RunFolder) -> Iterator[None]:
     try:
         yield
     finally:
+        if fcntl is None:
+            os.close(handle)  # Windows removes no open file
         with suppress(OSError):
             run.lock.unlink()
-        os.close(handle)
+        if fcntl is not None:
+            os.close(handle)
 
 
 def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
