@@ -98,7 +98,12 @@ class Capture:
         frame = self.frames[number]
         if frame.skip_reason is not None:
             return RestoredFrame(frame, "skipped", None, (frame.skip_reason,))
-        return next(restore_frames([(frame, self.read_frame(number))], self.imu, plan))
+        around = range(max(number - plan.reach, 0), min(number + plan.reach + 1, len(self)))
+        decoded = dict(self.read_frames(around[0], around[-1] + 1))
+        if number not in decoded:
+            raise CaptureError(f"{self.name}: frame {number} cannot be decoded", hint="inspect the capture")
+        near = [(self.frames[k], decoded[k]) for k in sorted(decoded) if k == number or not self.frames[k].skip_reason]
+        return next(restore_frames(near, self.imu, plan, {number}))
 
     def plan(self, preset: str = "balanced", **settings: Any) -> RestorationPlan:
         """What restoring this capture takes: the profile with unknown values filled in, translations, warnings."""

@@ -196,7 +196,9 @@ def _with_missing_turn(
     frames = at_true_times(capture.frames, profile, capture.repeats)
     sights = {}
     for number, luma in lumas.items():
-        motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
+        motion = moved_over_frame(
+            trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile
+        )
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")

@@ -97,7 +97,9 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
 
 def _tiles(height: int, width: int) -> NDArray[np.intp]:
     """(n, 2) top and left of at most MOST_TILES tiles, evenly over a picture."""
-    tops, lefts = (np.linspace(0, length - TILE, max(1, length // TILE)).astype(np.intp) for length in (height, width))
+    tops, lefts = (
+        np.linspace(0, length - TILE, max(1, length // TILE)).astype(np.intp) for length in (height, width)
+    )
     corners = np.stack(np.meshgrid(tops, lefts, indexing="ij"), -1).reshape(-1, 2)
     chosen = np.unique(np.linspace(0, len(corners) - 1, min(len(corners), MOST_TILES)).round().astype(np.intp))
     return np.asarray(corners[chosen])
@@ -108,9 +110,7 @@ def _full_px(tops_lefts: NDArray[np.intp], times: float, at: float) -> Array:
     return np.asarray((tops_lefts[:, ::-1] + at + 0.5) * times - 0.5)
 
 
-def _kernel_spectra(
-    view: NeighbourView, tops_lefts: NDArray[np.intp], times: float
-) -> list[NDArray[np.complex64]] | None:
+def _kernel_spectra(view: NeighbourView, tops_lefts: NDArray[np.intp], times: float) -> list[NDArray[np.complex64]] | None:
     """Transposes of the kernels of the frame and of its neighbour, (n, TILE, TILE / 2 + 1) each.
 
     None where a path does not fit into half a tile.

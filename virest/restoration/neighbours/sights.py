@@ -40,9 +40,7 @@ class Sight:
         return self.motion is not None and not self.outside and self.motion.exposure_s > 0
 
 
-def with_neighbours(
-    sights: Iterable[Sight], reach: int
-) -> Iterator[tuple[tuple[Sight, ...], Sight, tuple[Sight, ...]]]:
+def with_neighbours(sights: Iterable[Sight], reach: int) -> Iterator[tuple[tuple[Sight, ...], Sight, tuple[Sight, ...]]]:
     """Each frame with up to ``reach`` before and after it, in order; holds 2 reach + 1 at a time."""
     window: deque[Sight] = deque()
     here = 0
