@@ -134,7 +134,7 @@ def test_fisheye_coefficients_follow_a_lens() -> None:
 
 
 def test_what_cannot_be_exported_is_one_line(walk: Path, tmp_path: Path) -> None:
-    """An unknown lens and a file that is no trajectory."""
+    """An unknown lens and a file that is not a trajectory."""
     (tmp_path / "no.yaml").write_text("virest_profile: 1\nimage: {width: 160, height: 120}\nimu: {time_offset_s: 0}\n")
     (tmp_path / "poses.txt").write_text("1 2 3\n")
     with pytest.raises(SettingsError, match="no trajectory"):

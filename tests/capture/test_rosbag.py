@@ -134,7 +134,7 @@ def test_an_import_never_replaces_what_is_not_its_own(tmp_path: Path) -> None:
 
 
 def test_wrong_topics_and_damaged_bags_are_one_line(tmp_path: Path) -> None:
-    """A topic that is not there is answered by those that are; what is no bag is said to be none."""
+    """A topic that is not there is answered by those that are; what is not a bag is said to be none."""
     bag = write_bag(tmp_path / "walk", "ros1", "rgb8")
     with pytest.raises(CaptureError, match=r"no image topic /left.*/cam/image_raw"):
         run_import(bag, ImportOptions(tmp_path / "out", image="/left"))

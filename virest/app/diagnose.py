@@ -365,8 +365,8 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
     """The causes as a table with a sentence each, what they do for restored frames, what remains, the verdict."""
     nominal = found.nominal
     lines = [
-        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, off by {_number(nominal.geometry_rms_px)} px, of "
-        f"which tracking makes {_number(nominal.geometry_noise_px)} px"
+        f"{name}: residual {_number(nominal.geometry_rms_px)} px (tracking noise "
+        f"{_number(nominal.geometry_noise_px)} px), {nominal.tracks} tracks in {nominal.frames} frames"
     ]
     if found.causes:
         header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
@@ -417,7 +417,7 @@ def _number(value: Any) -> str:
 
 def _gain_line(gain: RestorationGain) -> str:
     if math.isnan(gain.sharpness_after):
-        return "restored: no two neighbours could be laid on each other"
+        return "restored: no two neighbouring frames could be registered"
     return (
         f"restored: sharpness {_number(gain.sharpness_recorded)} recorded, {_number(gain.sharpness_before)} as given, "
         f"{_number(gain.sharpness_after)} extended; neighbours disagree by "
@@ -429,7 +429,7 @@ def _remaining_line(left: Remaining) -> str:
     if left.significant:
         return f"unexplained: {_one_line(left.sentence) or f'{_number(left.size)} along {left.strongest_along}'}"
     unit = "px" if left.quantity.endswith("_px") else "levels"
-    return f"unexplained: nothing of size; {_number(left.size)} {unit} along {left.strongest_along}"
+    return f"unexplained: no significant residual; {_number(left.size)} {unit} along {left.strongest_along}"
 
 
 def _one_line(text: str) -> str:

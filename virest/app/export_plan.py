@@ -152,7 +152,7 @@ def _require_free(target: Path, capture: Path, options: ExportOptions) -> None:
     if not target.exists() and not target.is_symlink():
         return
     if not (target / RECORD).is_file():
-        raise OutputError(f"{target}: exists and is no export of virest", hint="choose another folder with --out")
+        raise OutputError(f"{target}: exists and is not an export of virest", hint="choose another folder with --out")
     if not options.overwrite:
         raise OutputError(f"{target}: holds an export", hint="--overwrite replaces it, --out chooses another folder")
 
@@ -182,7 +182,7 @@ def _restored_pictures(run: RunFolder, capture: Capture, left_out: dict[str, int
         index, status = int(line.get("frame", -1)), line.get("status")
         known = 0 <= index < len(capture.frames)
         if not known or line.get("timestamp_ns") != capture.frames[index].timestamp_ns:
-            text = f"{run.parameters}: frame {index} is none of {capture.name}: its stamp differs"
+            text = f"{run.parameters}: frame {index} is not one of {capture.name}: its stamp differs"
             raise CaptureError(text, hint="pass the run of this capture")
         picture = run.picture(index)
         if status in PLAIN_PICTURES and picture.is_file():

@@ -68,7 +68,7 @@ class GivenPoses:
             if len(rows) < 2 or values.shape[1] != 7 or (np.diff(self._times_ns) <= 0).any():
                 raise ValueError
         except (ValueError, IndexError):
-            raise SettingsError(f"{name}: is no trajectory", hint="lines: time x y z qx qy qz qw, rising") from None
+            raise SettingsError(f"{name}: is not a trajectory", hint="lines: time x y z qx qy qz qw, rising") from None
         self._seconds = (self._times_ns - self._times_ns[0]) * 1e-9
         self._positions, self._turns = values[:, :3], Slerp(self._seconds, turns)
 

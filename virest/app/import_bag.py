@@ -44,7 +44,7 @@ def run_import(path: Path, options: ImportOptions, progress: Callable[[int], Any
     try:
         with Bag(path, options.image, options.imu) as bag:
             facts = _unpack(bag, part, step)
-        read_capture(part)  # what cannot be read back is no capture
+        read_capture(part)  # what cannot be read back is not a capture
         if out.exists():
             shutil.rmtree(out)
         part.rename(out)

@@ -443,7 +443,7 @@ class Workers:
         """The error of work that was called off from outside."""
         if isinstance(self._executor, ClusterExecutor):
             return self._executor.lost()
-        return RestorationError("the work was called off", hint="go on with --resume")
+        return RestorationError("the job was cancelled", hint="continue with --resume")
 
     def renew(self) -> None:
         """After a worker's death: a pool is broken and begins anew, a cluster has others."""

@@ -24,7 +24,7 @@ class CaptureOutcome:
     """Frames by status."""
     verdict: str
     seconds: float
-    """Wall-clock time."""
+    """Wall-clock time of restoring, as the progress bar counts it; reading and planning come before."""
     advice: str = ""
     """The command that would make more of this capture; empty: none is known to."""
     film: Path | None = None

@@ -252,7 +252,7 @@ def check_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Found:
 
 
 def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
-    """Whether a run stands here, and its request. Raises OutputError for a folder or file that is none of ours."""
+    """Whether a run stands here, and its request. Raises OutputError for a folder or file that is not one of ours."""
     if run.path.exists() and not run.path.is_dir():
         raise OutputError(f"{run.path}: is a file", hint="choose another folder with --out")
     if run.frames.is_symlink() or run.segments.is_symlink():

@@ -26,6 +26,7 @@ from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, VirestError
+from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import RestorationSettings
@@ -185,7 +186,7 @@ def _require_capture(path: str) -> None:
     try:
         if place.is_dir():
             return
-        what = "is no folder" if place.exists() else "no such folder"
+        what = "is not a folder" if place.exists() else "no such folder"
     except (OSError, ValueError) as fault:  # a name too long, an address that does not answer
         what = getattr(fault, "strerror", None) or str(fault)
     raise CaptureError(f"{shown(path)}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
@@ -253,8 +254,9 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
     plan = plan_restoration(job.capture, job.profile, settings, read_decodable)
     for name, estimate in plan.profile.estimates.items():
         if name not in job.profile.estimates:
-            spread = "" if estimate.std is None else f" ± {estimate.std}"
-            log.info("%s: %s = %s%s (%s)", job.name, name, estimate.value, spread, estimate.source)
+            if not (name == "time_offset_s" and any(warning.startswith("time offset") for warning in plan.warnings)):
+                said = with_deviation(name, estimate.value, estimate.std)
+                log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
     for note in plan.notes:
         log.info("%s: %s", job.name, note)
     for warning in plan.warnings:

@@ -115,7 +115,7 @@ def _require_config(config: Path) -> None:
     except OSError as error:
         raise SettingsError(f"{config}: {error.strerror}", hint="--config takes a camera profile") from None
     if not found:
-        what = "is no plain file" if config.exists() else "no such file"
+        what = "is not a regular file" if config.exists() else "no such file"
         raise SettingsError(f"{config}: {what}", hint="--config takes a camera profile")
 
 
@@ -205,6 +205,7 @@ def _run(
     """Run the segments that are not done yet, then finish the run's folder; tells when all are given out."""
     parts = cut_frames(job.selected, job.capture.keyframes or index.keyframes)
     numbers = [tuple(frame.index for frame in part) for part in parts]
+    restoring = time.perf_counter()
     done = finished_segments(job.run, numbers)
     _clean(job.run, [frame for n in done for frame in n])
     if done:
@@ -219,7 +220,7 @@ def _run(
     _work(_then(todo, given_out), workers, give, len(job.selected), sum(map(len, done)), job.name, options.quiet)
     logs = [job.run.segment_log(n[0], n[-1]) for n in numbers]
     totals = run_totals(logs)
-    wall_s = time.perf_counter() - began
+    wall_s, restoring_s = time.perf_counter() - began, time.perf_counter() - restoring
     finished = Finished()
     if options.finish.any:
         finished = finish_pictures(job.run, logs, job.capture.movie, index, options.finish, job.name)
@@ -229,7 +230,14 @@ def _run(
         _emit_lines(job.run)
     _warn_about(job.name, account["counts"], len(job.selected))
     return CaptureOutcome(
-        job.name, job.path, job.run.path, account["counts"], account["verdict"], wall_s, _advice(plan), finished.film
+        job.name,
+        job.path,
+        job.run.path,
+        account["counts"],
+        account["verdict"],
+        restoring_s,
+        _advice(plan),
+        finished.film,
     )
 
 
@@ -288,7 +296,7 @@ def _in_order(
 def _leave_account(turn: _Turn, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float) -> None:
     """Write down why a capture could not be processed, where no run stands in its folder.
 
-    A single path that leads nowhere is a slip of the pen: it leaves nothing.
+    A single mistyped path writes no run.json.
     """
     try:
         if turn.among == 1 and not locate(turn.path).is_dir():

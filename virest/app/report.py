@@ -239,7 +239,7 @@ def _require_dir(run_dir: Path) -> None:
     except OSError as error:
         raise CaptureError(f"{run_dir}: {error.strerror}", hint="pass OUT/<capture> of a run, or OUT itself") from None
     if not found:
-        what = "is no folder" if run_dir.exists() else "no such folder"
+        what = "is not a folder" if run_dir.exists() else "no such folder"
         raise CaptureError(f"{run_dir}: {what}", hint="pass OUT/<capture> of a run, or OUT itself")
 
 
@@ -293,7 +293,7 @@ def _read_bytes(path: Path, limit: int) -> bytes:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
             raise CaptureError(
-                f"{path}: is no plain file of at most {limit >> 20} MB", hint="was it written by virest?"
+                f"{path}: is not a regular file of at most {limit >> 20} MB", hint="was it written by virest?"
             )
         return path.read_bytes()
     except OSError as error:
@@ -436,7 +436,7 @@ def read_picture(path: Path) -> Picture | None:
         log.warning("%s", str(error).strip().splitlines()[-1])
         return None
     if picture is None:
-        log.warning("%s: is no picture", path)
+        log.warning("%s: is not a picture", path)
     return None if picture is None else np.asarray(picture, np.uint8)
 
 

@@ -127,7 +127,7 @@ def _number(value: Any) -> Any:
         try:
             value = float(value)
         except ValueError:
-            raise ValueError("is no number") from None
+            raise ValueError("is not a number") from None
     if isinstance(value, int | float) and LARGEST < abs(value) < math.inf:
         raise ValueError("is too large")
     return value
@@ -305,7 +305,7 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
     """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
     try:
         if not path.is_file():
-            what = "is no plain file" if path.exists() else "no such file"
+            what = "is not a regular file" if path.exists() else "no such file"
             raise SettingsError(f"{path}: {what}", hint="pass a YAML file")
         size = path.stat().st_size
         if size > MAX_PROFILE_BYTES:

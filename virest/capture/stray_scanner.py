@@ -77,7 +77,7 @@ def _with_matrix(profile: CameraProfile, path: Path, movie: MovieIndex) -> Camer
         text = scan_text(path, CaptureError, HINT).head.replace(",", " ").split()
         matrix = np.array([float(value) for value in text[:9]]).reshape(3, 3)
     except ValueError:
-        raise CaptureError(f"{label(path)}: is no 3 x 3 matrix", hint=HINT) from None
+        raise CaptureError(f"{label(path)}: is not a 3 x 3 matrix", hint=HINT) from None
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     if not (0.3 <= fx / movie.width <= 3.0 and 0 < cx < movie.width and 0 < cy < movie.height):
         raise CaptureError(

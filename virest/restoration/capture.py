@@ -27,7 +27,7 @@ from virest.restoration.neighbours.refinement import MissingTurn
 from virest.restoration.neighbours.sights import FrameTurns, Sight, with_neighbours
 from virest.restoration.settings import RestorationSettings
 
-FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
+FOCAL_UNKNOWN = "focal length unknown; it could not be estimated from the frames: give fx_px in camera.yaml"
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,9 +82,24 @@ def _terminate(number: int, _frame: Any) -> NoReturn:
     raise _Terminated(number)
 
 
+def program() -> Any:
+    """The commands as the parser has them; arguments are shown by name, without their Python type."""
+    command = typer.main.get_command(app)
+    _hide_types(command)
+    return command
+
+
+def _hide_types(command: Any) -> None:
+    for parameter in command.params:
+        if parameter.param_type_name == "argument":
+            parameter.display_type_rich = lambda ctx: None
+    for inner in getattr(command, "commands", {}).values():
+        _hide_types(inner)
+
+
 def run(arguments: list[str] | None = None) -> int:
     """Run one command and turn whatever happens into an exit code."""
-    command = typer.main.get_command(app)
+    command = program()
     try:
         with command.make_context("virest", list(sys.argv[1:] if arguments is None else arguments)) as context:
             code = command.invoke(context)
@@ -95,10 +110,10 @@ def run(arguments: list[str] | None = None) -> int:
         _report_usage(error)
         return USAGE
     except _Terminated:
-        console.CONSOLE.line("terminated; what is done stays, --resume goes on from there")
+        console.CONSOLE.line("terminated; finished work is kept, --resume continues from there")
         return TERMINATED
     except (KeyboardInterrupt, typer.Abort):
-        console.CONSOLE.line("interrupted; what is done stays, --resume goes on from there")
+        console.CONSOLE.line("interrupted; finished work is kept, --resume continues from there")
         return INTERRUPTED
     except BrokenPipeError:
         console.silence_stdout()

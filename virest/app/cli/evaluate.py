@@ -117,7 +117,7 @@ def deblur(
     if captures and not paths:
         return 0
     if (restored is None) != (reference is None):
-        raise typer.BadParameter("--restored and --reference go together")
+        raise typer.BadParameter("--restored and --reference belong together")
     if restored is not None and paths:
         raise typer.BadParameter("give captures, or --restored and --reference, not both")
     _require_captures(paths, {"--config": config, "--frames": frames})

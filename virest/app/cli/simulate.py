@@ -171,7 +171,7 @@ def _parse_count(text: str | None, default: int) -> int:
     if text is None:
         return default
     if not re.fullmatch(r"\s*[+-]?\d{1,9}\s*", text, re.ASCII):
-        raise typer.BadParameter(f"--frames {text!r} is no number; A:B is for --like")
+        raise typer.BadParameter(f"--frames {text!r} is not a number; A:B is for --like")
     return int(text)
 
 
@@ -180,7 +180,7 @@ def _parse_exposures(text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no list of milliseconds; write 10 or 5,10,20") from None
+        raise typer.BadParameter(f"{text!r} is not a list of milliseconds; write 10 or 5,10,20") from None
 
 
 def _parse_auto_exposure(text: str | None) -> tuple[float | None, int | None]:
