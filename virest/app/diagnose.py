@@ -303,7 +303,7 @@ def _shots(capture: Capture, found: Diagnosis) -> dict[str, tuple[Capture, Camer
 def _pictures_figure(
     capture: Capture, simulated: Mapping[str, Picture | None], shots: Mapping[str, tuple[Capture, CameraProfile, int]]
 ) -> bytes | None:
-    """A lively frame against its simulation from its neighbour's restored picture, with either profile."""
+    """A high-motion frame against its simulation from its neighbour's restored picture, with either profile."""
     number = next((number for _, _, number in shots.values()), None)
     if number is None:
         return None

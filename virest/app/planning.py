@@ -253,10 +253,10 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
 
     plan = plan_restoration(job.capture, job.profile, settings, read_decodable)
     for name, estimate in plan.profile.estimates.items():
-        if name not in job.profile.estimates:
-            if not (name == "time_offset_s" and any(warning.startswith("time offset") for warning in plan.warnings)):
-                said = with_deviation(name, estimate.value, estimate.std)
-                log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
+        told = name == "time_offset_s" and any(warning.startswith("time offset") for warning in plan.warnings)
+        if name not in job.profile.estimates and not told:
+            said = with_deviation(name, estimate.value, estimate.std)
+            log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
     for note in plan.notes:
         log.info("%s: %s", job.name, note)
     for warning in plan.warnings:

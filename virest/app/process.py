@@ -135,7 +135,8 @@ def _process(turn: _Turn, options: ProcessOptions, workers: Workers) -> CaptureO
     planned = Planned()
     try:
         require_startable(turn.path, turn.name, options)
-        planned = turn.plan(options)
+        with console.progress_bar(1, f"{shown(turn.name)}: reading and planning", quiet=options.quiet):
+            planned = turn.plan(options)
         seconds = planned.seconds if turn.ahead else time.perf_counter() - began
         say(planned.messages)
         if planned.error is not None:
