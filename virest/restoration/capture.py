@@ -23,6 +23,7 @@ from virest.restoration.frame import (
     restore_frame,
     unknown_parameters,
 )
+from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.refinement import MissingTurn
 from virest.restoration.neighbours.sights import FrameTurns, Sight, with_neighbours
 from virest.restoration.settings import RestorationSettings
@@ -53,6 +54,9 @@ class RestorationPlan:
 
     missing_turn: MissingTurn | None = None
     """What neighbouring frames show that the predicted turns lack; None: nothing, or it could not be measured."""
+
+    confirmed: ConfirmedGain | None = None
+    """How much of a promised gain neighbouring frames confirm; None: they could not tell."""
 
     @property
     def reach(self) -> int:
@@ -115,7 +119,7 @@ def restore_frames(
             moved = translations.get(frame.index)
             seen = moved_over_frame(trajectory, lens, frame, plan.settings.reference, moved, plan.contradicted)
         refined = turns.refined(before, here, after) if turns is not None else None
-        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined)
+        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed)
 
 
 def moved_over_frame(

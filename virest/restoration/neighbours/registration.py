@@ -95,6 +95,31 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
     return _turn(view, tops_lefts, times, shift + apart, precision)
 
 
+def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Image) -> tuple[float, float] | None:
+    """How far a frame, as recorded and as restored, is from its neighbour once each is blurred as that one was.
+
+    Mean squares over spectra of light over its mean; what only shifts a tile is no error of the blur.  All pictures
+    are reduced; None where a path does not fit into a tile or the frames show different things.
+    """
+    times = view.frame.profile.height / first.shape[0]
+    tops_lefts = _tiles(*first.shape)
+    kernels = _kernel_spectra(view, tops_lefts, times)
+    if kernels is None:
+        return None
+    b = _spectra(_seen(view, second, tops_lefts, np.zeros(2), times))
+    left, used = [], np.ones(len(tops_lefts), bool)
+    for picture in (first, sharp):
+        a = _spectra(_cut(picture, tops_lefts)) * kernels[1]
+        shift, precision = _tile_shifts(a, b, np.zeros(2))
+        used &= precision > 0
+        wx, wy = _frequencies()
+        ahead = shift[:, 0, None, None] * wx + shift[:, 1, None, None] * wy
+        left.append((np.abs(a * np.exp(1j * ahead) - b) ** 2).mean(axis=(1, 2)))
+    if np.count_nonzero(used) < LEAST_TILES:
+        return None
+    return float(left[0][used].mean()), float(left[1][used].mean())
+
+
 def _tiles(height: int, width: int) -> NDArray[np.intp]:
     """(n, 2) top and left of at most MOST_TILES tiles, evenly over a picture."""
     tops, lefts = (
