@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -94,3 +95,24 @@ def test_every_known_readout_is_documented_with_its_source(virest_here) -> None:
         assert entry.source in page
     done = virest_here("profile", "devices", "galaxy", "--json")
     assert [d["readout_s"] for d in json.loads(done.stdout)["devices"]] == [0.03, 0.03267]
+
+
+def test_help_shows_no_types_and_cuts_no_description(virest_here) -> None:
+    """Arguments bear their names, not Python's types; every command has a whole line; pages are 100 columns at most."""
+    shown = virest_here("--help").stdout
+    commands = shown.partition("Commands:")[2].strip().splitlines()
+    assert all(line.rstrip().endswith(".") and "..." not in line for line in commands)
+    for command in ("process", "simulate", "report", "export", "profile new", "evaluate slam"):
+        page = virest_here(*command.split(), "--help").stdout
+        assert not re.search(r"<(list|str|path|file)", page), command
+        assert "Usage: virest" in page
+
+
+def test_a_bad_folder_is_told_in_few_lines(virest_here, tmp_path: Path) -> None:
+    """What is missing stands in one line, not in one for each file."""
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "gyro_accel.csv").write_text("t,x\n")
+    done = virest_here("inspect", "bad")
+    assert done.returncode == 4
+    assert "missing too: movie.mp4, frame_timestamps.txt, movie_metadata.csv" in done.stdout
+    assert len(done.stdout.splitlines()) <= 6

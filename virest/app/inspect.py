@@ -151,7 +151,7 @@ def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
     notes = [Note("error", _code(fault), str(fault))]
     if _is_folder(folder):
         readers = partial_readers(folder)
-        missing = [path.name for path in readers if not is_present(path)]
+        missing = [path.name for path in readers if path.name != EPOCHS and not is_present(path)]
         for path, reader in readers.items():
             if path.name not in missing:
                 _look_at(path, reader, facts, notes)
