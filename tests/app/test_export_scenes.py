@@ -137,7 +137,7 @@ def test_what_cannot_be_exported_is_one_line(walk: Path, tmp_path: Path) -> None
     """An unknown lens and a file that is not a trajectory."""
     (tmp_path / "no.yaml").write_text("virest_profile: 1\nimage: {width: 160, height: 120}\nimu: {time_offset_s: 0}\n")
     (tmp_path / "poses.txt").write_text("1 2 3\n")
-    with pytest.raises(SettingsError, match="no trajectory"):
+    with pytest.raises(SettingsError, match="not a trajectory"):
         exported(walk, tmp_path, format="colmap", poses=tmp_path / "poses.txt")
     metadata = walk / "movie_metadata.csv"
     kept = metadata.read_text()

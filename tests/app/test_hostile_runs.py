@@ -99,7 +99,7 @@ def test_settings_made_to_hurt_are_refused(capfd: pytest.CaptureFixture[str], tm
 def test_pipes_in_the_output_folder_do_not_hang(
     capfd: pytest.CaptureFixture[str], tiny: Path, tmp_path: Path, name: str
 ) -> None:
-    """A folder that is not one of ours is refused, whatever stands in it."""
+    """A folder that is none of ours is refused, whatever stands in it."""
     (tmp_path / "out/tiny").mkdir(parents=True)
     os.mkfifo(tmp_path / "out/tiny" / name)
     os.mkfifo(tmp_path / "out/tiny/another")

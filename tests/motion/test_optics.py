@@ -143,7 +143,7 @@ def test_rays_are_those_that_the_simulator_renders(lens: tuple[str, tuple[float,
 
 
 def test_a_stabiliser_needs_a_focal_length() -> None:
-    """Without intrinsics there is not a lens to move."""
+    """Without intrinsics there is no lens to move."""
     profile = phone()
     with pytest.raises(ValueError, match="intrinsics"):
         moving_lens(sampled(HAND, profile, 0.0, 0.1), replace(profile, intrinsics=None))

@@ -173,7 +173,7 @@ def test_what_cannot_be_taken_again_is_said(lively, tmp_path):
 
 
 def test_the_command_takes_the_camera_and_the_times_from_the_capture(lively, tmp_path, capfd):
-    """``--like``: --frames A:B chooses; what would be ignored is refused (2), what is not a capture too (4)."""
+    """``--like``: --frames A:B chooses; what would be ignored is refused (2), what is no capture too (4)."""
     again = tmp_path / "again"
     assert cli.run(["simulate", str(again), "--like", str(lively), "--frames", "1:4", "--json"]) == 0
     facts = json.loads(capfd.readouterr().out)
