@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from virest.app.bench import __main__ as bench
 from virest.app.cli import app
+from virest.app.gallery import CASES
 from virest.app.settings import settings_model
 from virest.camera import profile
 from virest.diagnosis.catalogue import CATALOGUE
@@ -113,6 +114,7 @@ def test_every_effect_is_documented_and_in_the_gallery() -> None:
     """Each effect has its line in the profile's table and its section in the gallery, with a picture that is there."""
     for name in CATALOGUE:
         assert f"| `{name}` |" in read(DOCS / "profile.md")
+    for name in CASES:
         assert re.search(rf"^## {name}$", read(DOCS / "gallery.md"), re.MULTILINE), name
 
 

@@ -18,7 +18,7 @@ from virest.app.png import png_bytes
 from virest.capture.folder import Frame
 from virest.capture.video import MovieIndex, read_frames
 from virest.errors import VirestError
-from virest.restoration.capture import RestorationPlan, restore_frames
+from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 
 PROBED = 3
 """Frames of a capture that are restored: the first is left out of the time, since tables are made for it."""
@@ -101,11 +101,15 @@ def _restored(
     job: Job, index: MovieIndex, plan: RestorationPlan, frame: Frame
 ) -> tuple[float, int, float | None, float | None] | None:
     """Seconds, bytes of the PNG, blur in pixels and predicted gain of a frame; None where it cannot be decoded."""
-    picture = next((p for _, p in read_frames(job.capture.movie, index, frame.index, frame.index)), None)
-    if picture is None:
+    frames = {f.index: f for f in at_true_times(job.capture.frames, plan.profile, job.capture.repeats)}
+    first, last = max(frame.index - plan.reach, 0), min(frame.index + plan.reach, len(frames) - 1)
+    decoded = {n: p for n, p in read_frames(job.capture.movie, index, first, last) if p is not None}
+    if frame.index not in decoded:
         return None
+    near = [(frames[n], decoded[n]) for n in sorted(decoded) if n != frame.index and not frames[n].skip_reason]
+    near = sorted([*near, (frame, decoded[frame.index])], key=lambda pair: pair[0].index)
     began = time.perf_counter()
-    restored = next(restore_frames([(frame, picture)], job.capture.imu, plan.of([frame])), None)
+    restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}), None)
     if restored is None or restored.picture is None:
         return None
     size = len(png_bytes(restored.picture))
