@@ -53,7 +53,11 @@ def test_a_film_has_the_movies_times_and_the_frames(swing: Path, virest_here, tm
     assert pictures[0].shape == (176, 480, 3)
     run = tmp_path / "virest-out" / "swing"
     assert not list((run / "frames").iterdir())
-    assert {line["output"] for line in lines_of(run)} == {None}
+    lines = lines_of(run)
+    assert {line["output"] for line in lines} == {None}
+    counts = json.loads((run / "run.json").read_text())["counts"]
+    assert counts["straightened"] == sum("straightened" in line["done"] for line in lines) > 0
+    assert counts["deblurred"] == sum("deblurred" in line["done"] for line in lines)
     assert json.loads((run / "run.json").read_text())["film"] == "film.mp4"
     whole = virest_here("process", swing, *FAST, "--frames", "2:8", "--out", "again")
     assert whole.returncode == 0

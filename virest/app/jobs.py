@@ -315,7 +315,17 @@ def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, flo
         "response": curve,
         "deblur": {"method": "none"},
     }
-    return {**line, **restored.parameters, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
+    line |= restored.parameters
+    line["done"] = steps_done(line)
+    return {**line, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
+
+
+def steps_done(line: dict[str, Any]) -> list[str]:
+    """What was done to a frame: ``deblurred``, ``straightened``."""
+    if line["status"] != "restored":
+        return []
+    steps = (("deblurred", line["deblur"]), ("straightened", line["shutter"]))
+    return [name for name, step in steps if step and step["method"] != "none"]
 
 
 # ── workers ──────────────────────────────────────────────────────────────────────────────────────────────────────

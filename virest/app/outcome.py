@@ -40,7 +40,7 @@ def summary(outcomes: list[CaptureOutcome]) -> str:
     rows = []
     for outcome in outcomes:
         counts = [str(outcome.counts.get(status, 0)) for status in STATUSES]
-        rate = sum(outcome.counts.values()) / outcome.seconds if outcome.seconds else 0.0
+        rate = sum(map(int, counts)) / outcome.seconds if outcome.seconds else 0.0
         verdict = outcome.verdict if len(outcomes) == 1 else _cut(outcome.verdict, MOST_VERDICT)
         rows.append([_cut(outcome.name, MOST_NAME), *counts, f"{rate:.1f}" if rate else "-", verdict.partition(":")[0]])
     lines = [console.table(["capture", *STATUSES, "frames/s", "verdict"], rows, words=1)]

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from virest import __version__
+from virest.app.account import STATUSES
 from virest.app.outputs import RunFolder, file_facts, write_whole
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.video import MovieIndex, probe_movie, read_frames
@@ -360,7 +361,7 @@ def _numbered(path: Path) -> Iterator[tuple[int, bytes]]:
 
 def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
     account = _read_model(folder / RUN, _Account, "account of a run")
-    by_line, notes = _read_lines(folder, sum(account.counts.values()))
+    by_line, notes = _read_lines(folder, sum(account.counts.get(status, 0) for status in STATUSES))
     frames = list(by_line.values())
     chosen = choose_frames(frames, options.frames or max(1, min(FRAMES_SHOWN, MOST_FRAMES // among)))
     numbers = {facts.frame for facts in chosen}
@@ -559,7 +560,8 @@ def _describe(facts: Json) -> str:
     for capture in facts["captures"]:
         parts = []
         if capture["counts"] is not None:
-            counted = ", ".join(f"{count} {state}" for state, count in capture["counts"].items() if count)
+            known = {state: capture["counts"].get(state, 0) for state in STATUSES}
+            counted = ", ".join(f"{count} {state}" for state, count in known.items() if count)
             parts.append(f"{capture['verdict']} ({counted or 'no frames'})")
         if capture["diagnosis"] is not None:
             named = ", ".join(capture["causes"])
