@@ -46,7 +46,7 @@ figures: $(READY)
 	$(BIN)/python -m virest.app.gallery docs
 	$(BIN)/virest simulate demo-out/bracket --auto-exposure 5:9 --rate 0 --exposure-ms 4 --frames 27 \
 		--width 640 --height 480 --response five_segment --overwrite --quiet
-	$(BIN)/virest calibrate-curve demo-out/bracket --out demo-out/curve.yaml --plot docs/images/curve.png
+	$(BIN)/virest calibrate-curve demo-out/bracket --out demo-out/curve.yaml --plot docs/images/curve.png --overwrite
 	rm -rf demo-out/bracket demo-out/curve.yaml
 
 sample: $(READY)

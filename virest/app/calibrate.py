@@ -168,7 +168,7 @@ def find_calibration(
 def _require_offset(found: GeometryCalibration) -> None:
     """Nothing else can be believed of a capture whose clock is unknown."""
     offset = next((value for value in found.values if value.name == "time_offset_s"), None)
-    if offset is not None and not offset.determined:
+    if offset is not None and not offset.determined and not offset.rough:
         std = f" (± {1e3 * float(np.max(offset.std)):.1f} ms)" if offset.std is not None else ""
         raise CalibrationError(
             f"the motion does not determine the time offset{std}",
@@ -211,7 +211,7 @@ def _profile_text(facts: Json, profile: CameraProfile) -> str:
 def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise | None) -> Json:
     """Everything that was found, as one mapping."""
     values = [_value_facts(value) for value in found.values]
-    undetermined = [value["name"] for value in values if not value["determined"]]
+    undetermined = [value["name"] for value in values if not value["determined"] and not value["rough"]]
     return {
         "capture": plan.capture.name,
         "folder": str(plan.capture.folder),
@@ -251,6 +251,7 @@ def _value_facts(value: CalibratedValue) -> Json:
         "std": value.std,
         "determined": value.determined,
         "note": value.note,
+        "rough": value.rough,
     }
 
 
@@ -271,6 +272,12 @@ def _own_notes(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNois
             f"the residual is {found.residual_px / found.noise_px:.1f} times the tracking noise: something remains "
             "unexplained, and the standard deviations include it as noise"
         )
+    notes += [
+        f"the time offset is written although it is known to ± {1e3 * float(np.max(value.std)):.1f} ms only: film a "
+        "few seconds more, and turn the phone about all three axes"
+        for value in found.values
+        if value.rough and value.std is not None
+    ]
     if plan.imu_file and noise:
         notes += _imu_disagreements(plan.imu_file, noise)
     return notes
@@ -341,7 +348,7 @@ def _rows(value: Json) -> list[list[str]]:
 
 
 def _row(value: Json, name: str, start: Any, found: Any, std: Any) -> list[str]:
-    shown = _cell(found, std) if value["determined"] else "–"
+    shown = _cell(found, std) if value["determined"] or value.get("rough") else "–"
     spread = "" if std is None else f"{std:.2g}"
     return [name, _cell(start, std), shown, spread, "yes" if value["determined"] else "no", _one_line(value["note"])]
 

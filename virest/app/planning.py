@@ -111,7 +111,9 @@ def plan_capture(path: str, name: str, options: ProcessOptions) -> Planned:
         planned = Planned(job)
         if check_run(job.run, job.request, options.mode) != "finished" or options.mode != "resume":
             index = probe_movie(job.capture.movie)
-            planned = Planned(job, index, _plan(job, index, options.settings))
+            plan = _plan(job, index, options.settings)
+            job = dataclasses.replace(job, selected=_selected(job.capture, plan.profile, options))
+            planned = Planned(job, index, plan)
     except VirestError as error:
         planned = dataclasses.replace(planned, error=error)
     return dataclasses.replace(planned, seconds=time.perf_counter() - began)
@@ -200,11 +202,17 @@ def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> 
     profile, source = resolve_profile(capture, options.config)
     log.info("%s: camera profile from %s", name, source)
     chosen = sorted(range(len(capture.frames))[options.frames])
-    frames = at_true_times(capture.frames, profile, capture.repeats)
-    selected = tuple(_admit(frames[i], keep_start_up=options.settings.keep_start_up) for i in chosen)
+    selected = _selected(capture, profile, options)
     inputs = tuple(_input_files(capture, options.config))
     request = _request(profile, options, chosen, inputs)
     return Job(name, path, run, capture, profile, str(source), selected, request, inputs)
+
+
+def _selected(capture: Capture, profile: CameraProfile, options: ProcessOptions) -> tuple[Frame, ...]:
+    """The frames that were asked for, at the times that a profile gives them."""
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    chosen = sorted(range(len(frames))[options.frames])
+    return tuple(_admit(frames[i], keep_start_up=options.settings.keep_start_up) for i in chosen)
 
 
 def _admit(frame: Frame, *, keep_start_up: bool) -> Frame:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
 from virest.diagnosis.findings import GEOMETRY, JOINED, Finding, HeldOutGain, ParameterChange, Rival, Rung
@@ -31,6 +30,7 @@ from virest.diagnosis.geometric_evidence import (
     depth_of,
 )
 from virest.diagnosis.trials import JUDGE_POINTS, Judged, Screened, best_of_each, judge, lagging_gain, screen, t_ratio
+from virest.motion.recorder_lag import Schedule
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable

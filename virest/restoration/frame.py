@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,6 +28,7 @@ from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.neighbours.confirmation import ConfirmedGain
+from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
@@ -96,12 +98,14 @@ def restore_frame(
     seen: RowMotion | None = None,
     refined: RefinedMotion | None = None,
     confirmed: ConfirmedGain | None = None,
+    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
     picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
     pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
-    is then taken.  confirmed: how much of a promised gain neighbours confirm.
+    is then taken.  confirmed: how much of a promised gain neighbours confirm.  neighbours:
+    brings those to the frame that it is restored with.
     """
     clock = _Clock()
     if refined is not None:
@@ -123,7 +127,7 @@ def restore_frame(
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
         restored, parameters["deblur"], why_not = _deblurred(
-            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed
+            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed, neighbours
         )
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
@@ -305,6 +309,7 @@ def _deblurred(
     light: FrameLight | None,
     covariance_px2: NDArray[np.float64],
     confirmed: ConfirmedGain | None,
+    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
@@ -322,7 +327,9 @@ def _deblurred(
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    blurred = replace(blurred, spread=spread)
+    joined = neighbours() if neighbours is not None and light is None and anchor == 0.5 else ()
+    longest_px = max((longest_px, *(one.longest_px for one in joined)))
+    blurred = replace(blurred, spread=spread, neighbours=joined, longest_px=longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
     recorded = picture
@@ -347,6 +354,7 @@ def _deblurred(
         "expected_gain_std_db": None if confirmed is None else confirmed.std_db,
         "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
+        "neighbours": [{"frame": one.number, "weight": float(one.weights.mean())} for one in joined],
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
