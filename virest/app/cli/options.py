@@ -17,6 +17,8 @@ from virest.app import console
 log = logging.getLogger(__name__)
 
 PARTLY_FAILED = 9
+MOST_NEIGHBOURS = 8
+"""Frames on each side: beyond that even 30 frames/s show another picture."""
 
 
 def show_version(wanted: bool) -> None:
@@ -73,6 +75,15 @@ def capture_paths(captures: list[str]) -> list[str]:
     if not paths:
         log.warning("no capture: standard input names none")
     return paths
+
+
+def parse_neighbours(text: str | None) -> int | None:
+    """How many neighbours on each side; None for ``auto``, which is the preset's number."""
+    if text is None or text.strip() == "auto":
+        return None
+    if not re.fullmatch(r"\s*\d{1,2}\s*", text, re.ASCII) or int(text) > MOST_NEIGHBOURS:
+        raise typer.BadParameter(f"--neighbours {text!r}: write auto, or 0 to {MOST_NEIGHBOURS}")
+    return int(text)
 
 
 def parse_shard(text: str | None) -> tuple[int, int]:

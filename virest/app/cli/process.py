@@ -23,6 +23,7 @@ from virest.app.cli.options import (
     one_of,
     one_thread_each,
     parse_frames,
+    parse_neighbours,
     parse_shard,
 )
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS
@@ -54,6 +55,10 @@ def process(
         typer.Option(
             metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Time of the picture. [exposure-start]"
         ),
+    ] = None,
+    neighbours: Annotated[
+        str | None,
+        typer.Option(metavar="N|auto", help="Frames before and after that help to restore each. [auto: the preset's]"),
     ] = None,
     jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes. [the cores]")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler does the work.")] = None,
@@ -129,6 +134,7 @@ def process(
         shutter=shutter,
         reference=reference,
         keep_start_up=keep_start_up or None,
+        neighbours=parse_neighbours(neighbours),
     )
     options = ProcessOptions(
         locate(out),
