@@ -148,7 +148,7 @@ def parse_response(text: str) -> ResponseCurve:
     try:
         values = [float(n) for n in numbers.split(",")] if numbers else []
     except ValueError:
-        raise SettingsError(f"response '{text}' is no curve", hint="write gamma:2.2, for instance") from None
+        raise SettingsError(f"response '{text}' is not a curve", hint="write gamma:2.2, for instance") from None
     if kind in ("srgb", "linear") and not values:
         return ResponseCurve(kind)
     if kind == "gamma" and len(values) <= 1:
@@ -156,7 +156,7 @@ def parse_response(text: str) -> ResponseCurve:
     if kind == "five_segment" and len(values) in (0, 5):
         xb, yb, xc, yc, top = values or (0.12, 0.08, 0.62, 0.80, 1.0)
         return ResponseCurve("five_segment", b=(xb, yb), c=(xc, yc), y_max=top)
-    raise SettingsError(f"response '{text}' is no curve", hint="use srgb, linear, gamma:2.2 or five_segment")
+    raise SettingsError(f"response '{text}' is not a curve", hint="use srgb, linear, gamma:2.2 or five_segment")
 
 
 def _blur_px(session: Session) -> float:

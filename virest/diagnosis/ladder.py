@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from virest.calibration.start_up import lag_schedules
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
@@ -35,6 +34,7 @@ from virest.diagnosis.remaining import points_left, remaining_structure, residua
 from virest.errors import CaptureError
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import observe_tracks
+from virest.motion.recorder_lag import lag_schedules
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_model import predict

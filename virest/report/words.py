@@ -49,7 +49,7 @@ QUANTITY_WORDS = {
 FIGURE_WORDS = {
     "residuals": "What is left between tracked and predicted points, over row, time, radius and rate",
     "ladder": "What was tried on each rung of the ladder, the best on top",
-    "pictures": "A lively frame beside its simulation",
+    "pictures": "A high-motion frame beside its simulation",
 }
 UNITS = {
     "_rad_s": "rad/s",

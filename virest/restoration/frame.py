@@ -15,8 +15,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.kernel_spread import kernel_spread
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
@@ -85,6 +85,8 @@ class RestoredFrame:
     """motion, depth_m, depth_source, blur, shutter, response, deblur: the log's line."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent: estimate, deblur, shutter."""
+    source_px: NDArray[np.float32] | None = None
+    """(height, width, 2) where in the recorded picture each pixel came from; None: from its own place."""
 
 
 def restore_frame(
@@ -146,7 +148,7 @@ def restore_frame(
     status = "copied" if restored is picture else "restored"
     warnings = (*_limits(motion), *why_not)
     return RestoredFrame(
-        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds
+        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source
     )
 
 

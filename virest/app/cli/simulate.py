@@ -132,7 +132,7 @@ def simulate(
         _require_only(context, LIKE_OPTIONS, "--like takes it from the capture")
         wishes = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
         facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **wishes)
-        emit_facts(facts, _describe_simulation(facts), as_json=json)
+        emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
         return 0
     count = _parse_count(frames, 12)
     exposures_ms = _parse_exposures(exposure_ms)
@@ -177,7 +177,7 @@ def simulate(
             isp=phone,
             progress=(lambda _done, _total: bar.update(1)) if bar else None,
         )
-    emit_facts(facts, _describe_simulation(facts), as_json=json)
+    emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
     return 0
 
 
@@ -221,7 +221,7 @@ def _parse_count(text: str | None, default: int) -> int:
     if text is None:
         return default
     if not re.fullmatch(r"\s*[+-]?\d{1,9}\s*", text, re.ASCII):
-        raise typer.BadParameter(f"--frames {text!r} is no number; A:B is for --like")
+        raise typer.BadParameter(f"--frames {text!r} is not a number; A:B is for --like")
     return int(text)
 
 
@@ -230,7 +230,7 @@ def _parse_exposures(text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no list of milliseconds; write 10 or 5,10,20") from None
+        raise typer.BadParameter(f"{text!r} is not a list of milliseconds; write 10 or 5,10,20") from None
 
 
 def _parse_auto_exposure(text: str | None) -> tuple[float | None, int | None]:
