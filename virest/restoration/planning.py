@@ -34,11 +34,12 @@ from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.conflict_plan import MAX_FOCAL_SPREAD, MAX_OFFSET_STD_S, explains_points, settle
+from virest.restoration.frame import deblurred_luma
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbours.sights import Sight
-from virest.restoration.neighbours.survey import kept_lumas, survey_runs, survey_turns
+from virest.restoration.neighbours.survey import kept_lumas, survey_gain, survey_runs, survey_turns
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
-from virest.restoration.settings import RestorationSettings
+from virest.restoration.settings import PRESETS, RestorationSettings
 
 MIN_COARSE_EXPLAINED = 0.5
 """Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
@@ -120,7 +121,7 @@ def _planned(
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
     plan = _with_seen_paths(plan, profile, capture, powers)
-    return _with_missing_turn(plan, capture, surveyed, lumas)
+    return _with_neighbours(plan, capture, surveyed, lumas)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
@@ -194,13 +195,13 @@ def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[i
     return dict(zip((f.index for f in frames), (focal_px * at_frames * exposure_s).tolist(), strict=True))
 
 
-def _with_missing_turn(
+def _with_neighbours(
     plan: RestorationPlan,
     capture: Capture,
     runs: Sequence[Sequence[int]],
     lumas: Mapping[int, NDArray[np.uint8]],
 ) -> RestorationPlan:
-    """What neighbouring frames show that the predicted turns lack, so that each frame's paths can be corrected."""
+    """What neighbouring frames show that the predicted turns lack, and how much of a promised gain they confirm."""
     profile = plan.profile
     if not lumas or profile.intrinsics is None:
         return plan
@@ -214,13 +215,24 @@ def _with_missing_turn(
         outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
     missing = survey_turns(runs, sights, trajectory, lens)
-    if missing is None:
+    if missing is not None:
+        said = (
+            f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
+            "each frame's motion is corrected by its neighbours"
+        )
+        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, said))
+    if plan.settings.deblur == "none":
         return plan
-    said = (
-        f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
-        "each frame's motion is corrected by its neighbours"
+    quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
+    confirmed = survey_gain(
+        runs,
+        sights,
+        missing,
+        trajectory,
+        lens,
+        lambda luma, motion, refined: deblurred_luma(luma, motion, quick, refined),
     )
-    return replace(plan, missing_turn=missing, notes=(*plan.notes, said))
+    return replace(plan, confirmed=confirmed)
 
 
 def _with_seen_paths(
