@@ -308,6 +308,8 @@ def process_pool(jobs: int, *, verbose: bool = False) -> ProcessPoolExecutor:
 
 def submit_uninterrupted(pool: ProcessPoolExecutor, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
     """Hand a call to a pool; processes that this starts never see the Ctrl-C meant for the parent."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        return pool.submit(function, *arguments)
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
     try:
         return pool.submit(function, *arguments)

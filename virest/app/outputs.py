@@ -13,7 +13,6 @@ Behind an address (``s3://…``) every file is put there by one request, the fol
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import math
@@ -31,6 +30,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.app.file_lock import lock_file
 from virest.app.png import png_bytes
 from virest.capture.location import RemotePath, is_remote, locate, read_each, remove_files
 from virest.errors import OutputError, RestorationError
@@ -342,11 +342,11 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
 def _locked(run: RunFolder) -> Iterator[None]:
     while True:
         try:
-            handle = os.open(run.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            handle = os.open(run.lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
         except OSError as error:
             raise output_error(run.path, error) from error
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(handle)
         except OSError:
             os.close(handle)
             raise OutputError(

@@ -66,8 +66,10 @@ def _terminate(number: int, _frame: Any) -> NoReturn:
 def run(arguments: list[str] | None = None) -> int:
     """Run one command and turn whatever happens into an exit code."""
     command = typer.main.get_command(app)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    go_on = "; what is done stays, --resume goes on from there" if "process" in words[:1] else ""
     try:
-        with command.make_context("virest", list(sys.argv[1:] if arguments is None else arguments)) as context:
+        with command.make_context("virest", list(words)) as context:
             code = command.invoke(context)
         return code if isinstance(code, int) else 0
     except typer.Exit as leaving:
@@ -76,10 +78,10 @@ def run(arguments: list[str] | None = None) -> int:
         _report_usage(error)
         return USAGE
     except _Terminated:
-        console.CONSOLE.line("terminated; what is done stays, --resume goes on from there")
+        console.CONSOLE.line(f"terminated{go_on}")
         return TERMINATED
     except (KeyboardInterrupt, typer.Abort):
-        console.CONSOLE.line("interrupted; what is done stays, --resume goes on from there")
+        console.CONSOLE.line(f"interrupted{go_on}")
         return INTERRUPTED
     except BrokenPipeError:
         console.silence_stdout()
@@ -106,8 +108,9 @@ def _report_usage(error: Any) -> None:
 
 def main() -> NoReturn:
     """The console script."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _terminate)
+    for name in ("SIGTERM", "SIGHUP"):  # Windows knows no hang-up
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), _terminate)
     code = run()
     try:
         if sys.stdout is not None:
