@@ -20,20 +20,22 @@ from virest.restoration.capture import RestorationPlan
 
 PARTLY_FAILED = 9
 STATUSES = ("restored", "copied", "skipped", "failed")
+DONE = ("deblurred", "straightened")
+"""What was done to restored frames: the one, the other, or both."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 MOST_FILES, MOST_BYTES = 32, 1 << 30
 """Of a capture that cannot be read: what is looked at for run.json."""
 
 
 def run_totals(logs: list[Path]) -> dict[str, Any]:
-    """Counts by status, warnings by text, and seconds by stage, over all lines."""
+    """Counts by status and by what was done, and seconds by stage, over all lines."""
     counts: Counter[str] = Counter()
     seconds: Counter[str] = Counter()
     for content in read_each(logs):
         for line in parse_lines(content):
-            counts[line["status"]] += 1
+            counts.update([line["status"], *line.get("done", ())])
             seconds.update({stage: line["seconds"].get(stage, 0.0) for stage in STAGES})
-    return {"counts": {status: counts[status] for status in STATUSES}, "seconds": dict(seconds)}
+    return {"counts": {name: counts[name] for name in (*STATUSES, *DONE)}, "seconds": dict(seconds)}
 
 
 def run_account(job: Job, plan: RestorationPlan, totals: dict[str, Any], wall_s: float) -> dict[str, Any]:
@@ -87,7 +89,7 @@ def failure_account(
         "settings": dataclasses.asdict(options.settings),
         "frames": job.request["frames"] if job else None,
         "inputs": _inputs(job) if job else _facts_of_folder(locate(path)),
-        "counts": dict.fromkeys(STATUSES, 0),
+        "counts": dict.fromkeys((*STATUSES, *DONE), 0),
         "totals": _sums(0, {}, wall_s),
         "verdict": f"not processed: {known.message}",
         "warnings": [text for text in (known.message, known.hint) if text],

@@ -269,6 +269,7 @@ def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, flo
         "timestamp_ns": frame.timestamp_ns,
         "exposure_s": None if frame.exposure_s is None else frame.exposure_s * scale,
         "status": restored.status,
+        "done": [],
         "output": None if restored.picture is None else f"frames/{segment.run.picture(frame.index).name}",
         "warnings": list(restored.warnings),
         "valid_px": list(restored.valid_px),
@@ -280,7 +281,17 @@ def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, flo
         "response": curve,
         "deblur": {"method": "none"},
     }
-    return {**line, **restored.parameters, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
+    line = {**line, **restored.parameters}
+    line["done"] = _done(line)
+    return {**line, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
+
+
+def _done(line: dict[str, Any]) -> list[str]:
+    """What was done to a frame, by the methods in its line."""
+    if line["status"] != "restored":
+        return []
+    methods = {"deblurred": line["deblur"], "straightened": line["shutter"] or {}}
+    return [name for name, step in methods.items() if step.get("method", "none") != "none"]
 
 
 # ── workers ──────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -52,7 +52,7 @@ class CaptureOutcome:
     name: str
     folder: Path
     counts: dict[str, int]
-    """Frames by status."""
+    """Frames by status, and restored ones by what was done."""
     verdict: str
     seconds: float
     """Wall-clock time."""
@@ -343,10 +343,12 @@ def _repeat_finished(job: Job, options: ProcessOptions) -> CaptureOutcome:
 
 
 def _summary(outcomes: list[CaptureOutcome]) -> str:
-    header = ["capture", *STATUSES, "frames/s", "verdict", "output"]
+    columns = ("deblurred", "straightened", *STATUSES[1:])
+    header = ["capture", *columns, "frames/s", "verdict", "output"]
     rows = []
     for outcome in outcomes:
-        counts = [str(outcome.counts.get(status, 0)) for status in STATUSES]
-        rate = sum(outcome.counts.values()) / outcome.seconds if outcome.seconds else 0.0
+        counts = [str(outcome.counts.get(name, 0)) for name in columns]
+        frames = sum(outcome.counts.get(status, 0) for status in STATUSES)
+        rate = frames / outcome.seconds if outcome.seconds else 0.0
         rows.append([outcome.name, *counts, f"{rate:.1f}" if rate else "-", outcome.verdict, str(outcome.folder)])
     return console.table(header, rows)

@@ -30,6 +30,7 @@ from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.video import MovieIndex, probe_movie, read_frames
 from virest.errors import CaptureError, OutputError, VirestError
 from virest.report.html import (
+    STATES,
     CaptureRecord,
     DiagnosisRecord,
     Embedded,
@@ -37,6 +38,7 @@ from virest.report.html import (
     RunRecord,
     ShownFrame,
     choose_frames,
+    count_words,
     embed_figure,
     report_page,
     show_frame,
@@ -143,6 +145,7 @@ class _Motion(_Lenient):
 
 
 class _Shutter(_Lenient):
+    method: str = "none"
     max_displacement_px: float | None = None
 
 
@@ -359,7 +362,7 @@ def _numbered(path: Path) -> Iterator[tuple[int, bytes]]:
 
 def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
     account = _read_model(folder / RUN, _Account, "account of a run")
-    by_line, notes = _read_lines(folder, sum(account.counts.values()))
+    by_line, notes = _read_lines(folder, sum(account.counts.get(state, 0) for state in STATES))
     frames = list(by_line.values())
     chosen = choose_frames(frames, options.frames or max(1, min(FRAMES_SHOWN, MOST_FRAMES // among)))
     numbers = {facts.frame for facts in chosen}
@@ -389,6 +392,7 @@ def _frame_facts(line: _Line) -> FrameFacts:
         gain_db=deblur.expected_gain_db,
         noise_levels=deblur.noise_grey_levels,
         deblurred=deblur.method != "none",
+        straightened=line.status == "restored" and shutter.method != "none",
         valid_px=line.valid_px,
     )
 
@@ -547,8 +551,7 @@ def _describe(facts: Json) -> str:
     for capture in facts["captures"]:
         parts = []
         if capture["counts"] is not None:
-            counted = ", ".join(f"{count} {state}" for state, count in capture["counts"].items() if count)
-            parts.append(f"{capture['verdict']} ({counted or 'no frames'})")
+            parts.append(f"{capture['verdict']} ({count_words(capture['counts']) or 'no frames'})")
         if capture["diagnosis"] is not None:
             named = ", ".join(capture["causes"])
             parts.append(f"diagnosis {capture['diagnosis']}{f' ({named})' if named else ''}")
