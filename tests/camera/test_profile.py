@@ -445,7 +445,7 @@ def test_files_that_are_too_large_missing_or_folders_are_refused(tmp_path: Path)
         read_profile(tmp_path / "large.yaml")
     with pytest.raises(SettingsError, match=r"none\.yaml: no such file"):
         read_profile(tmp_path / "none.yaml")
-    with pytest.raises(SettingsError, match="is no plain file"):
+    with pytest.raises(SettingsError, match="is not a regular file"):
         load_yaml_mapping(tmp_path)
 
 

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,15 +19,21 @@ from numpy.typing import NDArray
 from virest.app.console import table
 from virest.app.outputs import capture_name, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
-from virest.camera.profile import CameraProfile, format_profile
+from virest.camera.profile import CameraProfile, format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames
 from virest.diagnosis.findings import CONSISTENT, Diagnosis, Finding, Remaining, Rung
-from virest.diagnosis.restoration_gain import RestorationGain, chosen_pairs, measure_restoration_gain
+from virest.diagnosis.restoration_gain import (
+    RestorationGain,
+    chosen_pairs,
+    measure_restoration_gain,
+    pairs_to_keep_back,
+)
 from virest.errors import OutputError, VirestError
 from virest.motion.shared_out import Each, one_by_one
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
+from virest.report.words import residual_words
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.settings import PRESETS
 from virest.simulation.recreation import recreate_session
@@ -98,11 +104,7 @@ def run_diagnosis(
     folder = Path(options.out) / capture_name(path)
     require_free(folder, options.overwrite)
     source = open_source(Path(path), options.config)
-    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each)
-    say("restoring", LADDER_PART)
-    gain = measure_restoration_gain(
-        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray, each=each
-    )
+    found, gain = _found_and_judged(source, say, each)
     say("figures", GAIN_PART)
     files, drawn = draw_figures(source.capture, found, each)
     facts = as_json(found, gain, drawn)
@@ -114,11 +116,29 @@ def run_diagnosis(
     return DiagnosisOutcome(facts, text, found.verdict)
 
 
-def climb(source: Source, progress: Progress, each: Each = one_by_one) -> Diagnosis:
-    """The ladder itself."""
+def find_diagnosis(path: Path, config: Path | None = None) -> Json:
+    """The mapping of diagnosis.json without a file written: the extended profile and the residuals stand in it."""
+    found, gain = _found_and_judged(open_source(path, config), lambda _stage, _part: None, one_by_one)
+    facts = as_json(found, gain, [[] for _ in found.causes])
+    return {**facts, "extended_profile": profile_mapping(found.extended_profile), "residuals": found.residuals}
+
+
+def _found_and_judged(source: Source, say: Progress, each: Each) -> tuple[Diagnosis, RestorationGain]:
+    """What is wrong, and what mending it does to pictures that no fit has seen."""
+    firsts = pairs_to_keep_back(source.capture, source.profile)
+    kept_back = [first + step for first in firsts for step in (0, 1)]
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, kept_back)
+    say("restoring", LADDER_PART)
+    profiles = found.nominal_profile, found.extended_profile
+    gain = measure_restoration_gain(source.capture, *profiles, source.pictures, source.gray, each=each, firsts=firsts)
+    return found, gain
+
+
+def climb(source: Source, progress: Progress, each: Each = one_by_one, kept_back: Collection[int] = ()) -> Diagnosis:
+    """The ladder itself; kept_back: movie indices of frames that no fit is to see."""
     from virest.diagnosis.ladder import diagnose_capture
 
-    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each)
+    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each, kept_back)
 
 
 def require_free(folder: Path, overwrite: bool) -> None:
@@ -292,7 +312,7 @@ def _shots(capture: Capture, found: Diagnosis) -> dict[str, tuple[Capture, Camer
 def _pictures_figure(
     capture: Capture, simulated: Mapping[str, Picture | None], shots: Mapping[str, tuple[Capture, CameraProfile, int]]
 ) -> bytes | None:
-    """A lively frame against its simulation from its neighbour's restored picture, with either profile."""
+    """A high-motion frame against its simulation from its neighbour's restored picture, with either profile."""
     number = next((number for _, _, number in shots.values()), None)
     if number is None:
         return None
@@ -354,8 +374,8 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
     """The causes as a table with a sentence each, what they do for restored frames, what remains, the verdict."""
     nominal = found.nominal
     lines = [
-        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, off by {_number(nominal.geometry_rms_px)} px, of "
-        f"which tracking makes {_number(nominal.geometry_noise_px)} px"
+        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, residual "
+        f"{residual_words(nominal.geometry_rms_px, nominal.geometry_noise_px)}"
     ]
     if found.causes:
         header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
@@ -370,7 +390,8 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
 def _rows(cause: Finding) -> list[list[str]]:
     """A row for each number or word that changed; what the cause gains stands on its first."""
     held_out = cause.held_out
-    judged = [_number(held_out.before), _number(held_out.after), f"{held_out.gain:.0%}", held_out.quantity]
+    gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
+    judged = [_number(held_out.before), _number(held_out.after), gain, held_out.quantity]
     rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals) or "-"
     first = [cause.name, [*judged, rivals]]
     values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
@@ -405,8 +426,10 @@ def _number(value: Any) -> str:
 
 
 def _gain_line(gain: RestorationGain) -> str:
+    if not gain.frames:
+        return "restored: the capture is too short to keep frames back from the fits"
     if math.isnan(gain.sharpness_after):
-        return "restored: no two neighbours could be laid on each other"
+        return "restored: no two neighbouring frames could be registered"
     return (
         f"restored: sharpness {_number(gain.sharpness_recorded)} recorded, {_number(gain.sharpness_before)} as given, "
         f"{_number(gain.sharpness_after)} extended; neighbours disagree by "
@@ -418,7 +441,7 @@ def _remaining_line(left: Remaining) -> str:
     if left.significant:
         return f"unexplained: {_one_line(left.sentence) or f'{_number(left.size)} along {left.strongest_along}'}"
     unit = "px" if left.quantity.endswith("_px") else "levels"
-    return f"unexplained: nothing of size; {_number(left.size)} {unit} along {left.strongest_along}"
+    return f"no significant residual: {_number(left.size)} {unit} along {left.strongest_along}"
 
 
 def _one_line(text: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from virest.capture.detect import partial_readers
+from virest.capture.files import is_present
 from virest.capture.folder import EPOCHS, Capture, Frame, Note, read_capture, resolve_profile
 from virest.capture.join import median_period_s
 from virest.capture.video import MovieIndex
@@ -165,8 +166,14 @@ def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
     }
     notes = [Note("error", _code(fault), str(fault))]
     if _is_folder(folder):
-        for path, reader in partial_readers(folder).items():
-            _look_at(path, reader, facts, notes)
+        readers = partial_readers(folder)
+        missing = [path.name for path in readers if path.name != EPOCHS and not is_present(path)]
+        for path, reader in readers.items():
+            if path.name not in missing:
+                _look_at(path, reader, facts, notes)
+        others = [name for name in missing if name not in str(fault)]
+        if others:
+            notes.append(Note("error", "files-missing", f"missing too: {', '.join(others)}"))
     facts["notes"] = [_note(note) for note in notes]
     return facts
 

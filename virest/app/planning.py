@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest import __version__
-from virest.app.jobs import prepare_worker
+from virest.app.finish import FinishWishes
+from virest.app.jobs import PictureWishes, prepare_worker
 from virest.app.outputs import Mode, RunFolder, check_run, file_facts, plain
 from virest.camera.profile import CameraProfile, profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
@@ -25,6 +26,7 @@ from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, VirestError
+from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import RestorationSettings
@@ -48,6 +50,8 @@ class ProcessOptions:
     scheduler: str | None = None
     mode: Mode = "new"
     command: str = ""
+    pictures: PictureWishes = PictureWishes()  # noqa: RUF009  (frozen)
+    finish: FinishWishes = FinishWishes()  # noqa: RUF009  (frozen)
     json_lines: bool = False
     """Give each frame's line on standard output, in frame order, as they are done."""
     quiet: bool = False
@@ -184,7 +188,7 @@ def _require_capture(path: str) -> None:
     try:
         if place.is_dir():
             return
-        what = "is no folder" if place.exists() else "no such folder"
+        what = "is not a folder" if place.exists() else "no such folder"
     except (OSError, ValueError) as fault:  # a name too long, an address that does not answer
         what = getattr(fault, "strerror", None) or str(fault)
     raise CaptureError(f"{shown(path)}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
@@ -231,6 +235,9 @@ def _request(
         "profile_sha256": hashlib.sha256(mapping.encode()).hexdigest(),
         "inputs": [file_facts(file) for file in inputs],
     }
+    wishes = {**dataclasses.asdict(options.pictures), **dataclasses.asdict(options.finish)}
+    if options.pictures != PictureWishes() or options.finish != FinishWishes():
+        request["outputs"] = wishes
     return plain(request)
 
 
@@ -254,9 +261,10 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
 
     plan = plan_restoration(job.capture, job.profile, settings, read_decodable)
     for name, estimate in plan.profile.estimates.items():
-        if name not in job.profile.estimates:
-            spread = "" if estimate.std is None else f" ± {estimate.std}"
-            log.info("%s: %s = %s%s (%s)", job.name, name, estimate.value, spread, estimate.source)
+        told = name == "time_offset_s" and any(warning.startswith("time offset") for warning in plan.warnings)
+        if name not in job.profile.estimates and not told:
+            said = with_deviation(name, estimate.value, estimate.std)
+            log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
     for note in plan.notes:
         log.info("%s: %s", job.name, note)
     for warning in plan.warnings:

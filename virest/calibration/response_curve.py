@@ -329,8 +329,8 @@ def _require_possible(first: FirstCurve, samples: BracketSamples) -> None:
     if worst >= WIDEST_EV:
         listed = np.log2(samples.exposure)
         raise CalibrationError(
-            f"the listed exposures, {np.ptp(listed):.1f} EV apart, would need corrections of up to {worst:.0f} EV: they "
-            "are not those of the pictures",
+            f"the listed exposures, {np.ptp(listed):.1f} EV apart, would need corrections of up to {worst:.0f} EV: "
+            "they are not those of the pictures",
             hint="check the list against the pictures; several may have been taken at one exposure",
         )
 

@@ -137,7 +137,7 @@ def _number(value: Any) -> Any:
         try:
             value = float(value)
         except ValueError:
-            raise ValueError("is no number") from None
+            raise ValueError("is not a number") from None
     if isinstance(value, int | float) and LARGEST < abs(value) < math.inf:
         raise ValueError("is too large")
     return value
@@ -315,7 +315,7 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
     """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
     try:
         if not path.is_file():
-            what = "is no plain file" if path.exists() else "no such file"
+            what = "is not a regular file" if path.exists() else "no such file"
             raise SettingsError(f"{path}: {what}", hint="pass a YAML file")
         size = path.stat().st_size
         if size > MAX_PROFILE_BYTES:
@@ -328,18 +328,16 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "cannot be read"
-        raise SettingsError(
-            f"{path.name}:{where} is not plain YAML: {problem}", hint="see the profile in README"
-        ) from None
+        raise SettingsError(f"{path.name}:{where} is not plain YAML: {problem}", hint="see docs/profile.md") from None
     except (UnicodeDecodeError, RecursionError):
         raise SettingsError(f"{path.name}: is not YAML text", hint="is it a profile?") from None
     except (ValueError, LookupError, AttributeError, OverflowError):  # of the library, for dates and tagged values
         text = f"{path.name}: a value is not of the kind that it is written as, such as a date that is none"
-        raise SettingsError(text, hint="write plain numbers and words, see the profile in README") from None
+        raise SettingsError(text, hint="write plain numbers and words, see docs/profile.md") from None
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}", hint="check the path and its permissions") from None
     if not isinstance(content, dict):
-        raise SettingsError(f"{path.name}: no keys at the top level", hint="see the profile in README")
+        raise SettingsError(f"{path.name}: no keys at the top level", hint="see docs/profile.md")
     return content
 
 
@@ -405,7 +403,7 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
     found = first.get("input")
     value = "" if isinstance(found, dict) else ", got null" if found is None else f", got {str(found)[:60]!r}"
     message = _printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
-    return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see the profile in README")
+    return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see docs/profile.md")
 
 
 def _key_path(fault: Any) -> list[str]:
@@ -539,9 +537,9 @@ def _response(block: _Response | None, extensions: _Extensions) -> ResponseCurve
     if block is None:
         return None
     if block.kind == "five_segment" and (block.b is None or block.c is None):
-        raise SettingsError("response: five_segment needs b and c", hint="see the profile in README")
+        raise SettingsError("response: five_segment needs b and c", hint="see docs/profile.md")
     if block.kind == "table" and (block.x is None or block.y is None):
-        raise SettingsError("response: table needs x and y", hint="see the profile in README")
+        raise SettingsError("response: table needs x and y", hint="see docs/profile.md")
     return ResponseCurve(
         block.kind,
         block.gamma,

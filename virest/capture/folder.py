@@ -138,7 +138,7 @@ def require_folder(path: Path) -> Path:
     except (OSError, RuntimeError, ValueError) as fault:
         reason = getattr(fault, "strerror", None) or str(fault)
         raise CaptureError(f"{path}: {reason}", hint="check the path and its links") from None
-    raise CaptureError(f"{path}: is no folder", hint="pass the folder that holds movie.mp4")
+    raise CaptureError(f"{path}: is not a folder", hint="pass the folder that holds movie.mp4")
 
 
 def _note_movie(files: Source, notes: list[Note]) -> None:

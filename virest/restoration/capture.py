@@ -32,7 +32,7 @@ from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 LAG_TO_THE_END = 0.8
 """Lags that repeats are still using up this far into the movie may outlast it."""
 ALMOST = 1e-6
-FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
+FOCAL_UNKNOWN = "focal length unknown; it could not be estimated from the frames: give fx_px in camera.yaml"
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,6 +85,8 @@ class RestoredFrame:
     """motion, depth_m, depth_source, blur, shutter, response, deblur: the log's line."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent: estimate, deblur, shutter."""
+    source_px: NDArray[np.float32] | None = None
+    """(height, width, 2) where in the recorded picture each pixel came from; None: from its own place."""
 
 
 def restore_frame(
@@ -146,7 +148,7 @@ def restore_frame(
     status = "copied" if restored is picture else "restored"
     warnings = (*_limits(motion), *why_not)
     return RestoredFrame(
-        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds
+        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source
     )
 
 

@@ -50,7 +50,7 @@ def calibrate(
     readout_time_s           0.020000       0.022700  8.1e-05  yes
     readout_direction   right_to_left  right_to_left           yes
     ...
-    residual 0.399 -> 0.123 px, of which tracking makes 0.123 px
+    residual 0.399 -> 0.123 px (tracking noise 0.123 px)
     wrote camera.yaml
 
     \b
@@ -70,7 +70,7 @@ def calibrate(
     plan = plan_calibration(Path(paths[0]), config, names)
     with side_by_side(cores()) as each, console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
         facts, text = run_calibration(plan, output, bar.update if bar else None, each)
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 
 

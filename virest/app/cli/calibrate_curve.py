@@ -50,5 +50,5 @@ def calibrate_curve(
     facts, text = fit_and_write(
         source, exposures=exposures, kind=kind or "auto", out=out, plot=plot, overwrite=overwrite
     )
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
