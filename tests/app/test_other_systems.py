@@ -42,7 +42,7 @@ def test_only_process_speaks_of_resume(monkeypatch: pytest.MonkeyPatch, command:
     said: list[str] = []
 
     monkeypatch.setattr(console.CONSOLE, "line", said.append)
-    monkeypatch.setattr(cli.typer.main, "get_command", lambda _app: _Interrupted())
+    monkeypatch.setattr(cli, "program", _Interrupted)
     assert cli.run([command, "somewhere"]) == cli.INTERRUPTED
     assert ("--resume" in said[0]) is goes_on
 
