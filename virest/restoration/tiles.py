@@ -71,6 +71,7 @@ class TileDeconvolution:
         _power_at_ends(self.kernels, self.powers)
         if variance is not None:
             self.powers += variance(self.size)
+        self._once: Image | np.float32 = np.float32(1)
         self._joined: Image | None = None
         """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra."""
         self._tamed: dict[int, Image] = {}
@@ -100,6 +101,7 @@ class TileDeconvolution:
         _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
         if self._joined is not None:
             projected += self._joined
+            projected *= self._once
         return projected
 
     def join(self, channel: Image, kernels: Image, weights: NDArray[np.float64], sharpness: Image) -> None:
@@ -122,6 +124,17 @@ class TileDeconvolution:
             _power_inside(kernel, one)
             _power_at_ends(kernel[None], one[None])
             cv2.scaleAdd(one, weight, self.powers[number], self.powers[number])
+
+    def share_noise(self, shared: float, weights: NDArray[np.float64]) -> None:
+        """Count that part of the noise once that further pictures have in common with the first.
+
+        weights: (tiles,) sums of those that :meth:`join` was given.  Of n equal pictures whose noise is wholly shared
+        the sum tells no more than one, so their sums are divided by n.
+        """
+        if self._joined is None:
+            return
+        self._once = (1.0 / (1.0 + shared * weights)).astype(np.float32)[:, None, None]
+        self.powers *= self._once
 
     def touched(self, mask: Image) -> list[int]:
         """Numbers of the tiles that see anything of a mask (height, width)."""
