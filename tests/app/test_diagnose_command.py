@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +74,7 @@ def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Let the ladder come to a given verdict."""
 
     def give(verdict: str = "explained", *causes: Finding, error: Exception | None = None) -> None:
-        def climb(source: diagnose.Source, progress: Say, _each: Each) -> Diagnosis:
+        def climb(source: diagnose.Source, progress: Say, _each: Each, _kept_back: Sequence[int]) -> Diagnosis:
             progress("points", 0.5)
             assert [number for number, _ in source.pictures([7, 3, 4])] == [3, 4, 7]
             assert next(source.gray([5]))[1].shape == (120, 160)  # type: ignore[union-attr]
