@@ -29,12 +29,12 @@ def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -
 
     image_format: one of FORMATS.  Returns the file's bytes.
     """
-    figure = _canvas(11.0, 7.5)
+    figure = canvas(11.0, 7.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.3, 1.0))
     _draw_curve(figure.add_subplot(grid[:, 0]), fit, title)
     _draw_residuals(figure.add_subplot(grid[0, 1]), fit)
     _draw_pictures(figure.add_subplot(grid[1, 1]), fit)
-    return _as_file(figure, image_format)
+    return as_file(figure, image_format)
 
 
 def _literal(text: str) -> str:
@@ -104,7 +104,7 @@ def comparison_figure(
 
     Pictures (h, w) or (h, w, 3) of 8 bits.  The difference is of luma, all on one scale; its rms stands above.
     """
-    figure = _canvas(11.0, 0.6 + 3.0 * len(rows))
+    figure = canvas(11.0, 0.6 + 3.0 * len(rows))
     axes = figure.subplots(len(rows), 3, squeeze=False)
     differences = [_luma(measured) - _luma(simulated) for _, measured, simulated in rows]
     reach = max(1.0, *(float(np.percentile(np.abs(d), 99)) for d in differences))
@@ -120,7 +120,7 @@ def comparison_figure(
             place.set_xticks([])
             place.set_yticks([])
     figure.suptitle(_literal(title))
-    return _as_file(figure, image_format)
+    return as_file(figure, image_format)
 
 
 def residual_figure(
@@ -131,7 +131,7 @@ def residual_figure(
     before, after: covariate name → (n,), and ``x_px``, ``y_px`` (n,).
     """
     names = [name for name in COVARIATES if name in before or name in after]
-    figure = _canvas(3.4 * max(len(names), 1), 5.6)
+    figure = canvas(3.4 * max(len(names), 1), 5.6)
     axes = figure.subplots(2, max(len(names), 1), squeeze=False, sharey="row")
     for line, component in zip(axes, RESIDUALS, strict=True):
         for place, name in zip(line, names, strict=False):
@@ -144,7 +144,7 @@ def residual_figure(
     if axes[0][0].get_legend_handles_labels()[0]:
         axes[0][0].legend(loc="upper right", fontsize=8)
     figure.suptitle(_literal(title))
-    return _as_file(figure, image_format)
+    return as_file(figure, image_format)
 
 
 def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str = "png") -> bytes:
@@ -152,12 +152,12 @@ def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str 
 
     rungs: (quantity, before, {name: after}, entered or None).
     """
-    figure = _canvas(4.2 * max(len(rungs), 1), 0.9 + 0.26 * max([8, *(len(tried) for _, _, tried, _ in rungs)]))
+    figure = canvas(4.2 * max(len(rungs), 1), 0.9 + 0.26 * max([8, *(len(tried) for _, _, tried, _ in rungs)]))
     axes = figure.subplots(1, max(len(rungs), 1), squeeze=False)[0]
     for number, (place, rung) in enumerate(zip(axes, rungs, strict=False), start=1):
         _draw_rung(place, number, rung)
     figure.suptitle(_literal(title))
-    return _as_file(figure, image_format)
+    return as_file(figure, image_format)
 
 
 def _draw_rung(axes: Any, number: int, rung: RungBars) -> None:
@@ -197,7 +197,8 @@ def _luma(picture: Picture) -> Array:
     return values if values.ndim == 2 else values @ np.array([0.299, 0.587, 0.114])
 
 
-def _canvas(width_in: float, height_in: float) -> Any:
+def canvas(width_in: float, height_in: float) -> Any:
+    """An empty figure of this size in inches, without a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -206,7 +207,8 @@ def _canvas(width_in: float, height_in: float) -> Any:
     return figure
 
 
-def _as_file(figure: Any, image_format: str) -> bytes:
+def as_file(figure: Any, image_format: str) -> bytes:
+    """The figure as the bytes of a file; image_format: one of FORMATS."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=image_format, dpi=DPI, metadata={} if image_format == "png" else None)
     return buffer.getvalue()

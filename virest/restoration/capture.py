@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +26,13 @@ from virest.restoration.frame import (
 )
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.refinement import MissingTurn
-from virest.restoration.neighbours.sights import FrameTurns, Sight, with_neighbours
-from virest.restoration.settings import RestorationSettings
+from virest.restoration.neighbours.sights import FrameNeighbours, Sight, with_neighbours
+from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 
-FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
+LAG_TO_THE_END = 0.8
+"""Lags that repeats are still using up this far into the movie may outlast it."""
+ALMOST = 1e-6
+FOCAL_UNKNOWN = "focal length unknown; it could not be estimated from the frames: give fx_px in camera.yaml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +65,15 @@ class RestorationPlan:
     @property
     def reach(self) -> int:
         """Neighbours of a frame on each side that its restoration looks at."""
-        return 0 if self.missing_turn is None or self.copy_reason is not None else 1
+        if self.copy_reason is not None:
+            return 0
+        joined = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
+        return max(joined, 0 if self.missing_turn is None else 1)
+
+    def joined(self, before: Sequence[Sight], after: Sequence[Sight]) -> tuple[Sight, ...]:
+        """Those of a frame's neighbours that are restored with it, in order."""
+        count = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
+        return (*before[len(before) - count :], *after[:count]) if count else ()
 
     def of(self, frames: Iterable[Frame]) -> RestorationPlan:
         """The plan as a worker needs it who has these frames only."""
@@ -85,9 +97,9 @@ def restore_frames(
     profile = plan.profile
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
     lens = moving_lens(trajectory, profile) if trajectory is not None else None
-    translations, turns = plan.translations or {}, None
-    if trajectory is not None and lens is not None and plan.missing_turn is not None:
-        turns = FrameTurns(trajectory, lens, plan.missing_turn)
+    translations, neighbours = plan.translations or {}, None
+    if trajectory is not None and lens is not None and plan.reach:
+        neighbours = FrameNeighbours(trajectory, lens, plan.missing_turn)
 
     def sight(frame: Frame, picture: NDArray[np.uint8]) -> Sight:
         if trajectory is None:
@@ -118,8 +130,11 @@ def restore_frames(
         if plan.contradicted is not None:
             moved = translations.get(frame.index)
             seen = moved_over_frame(trajectory, lens, frame, plan.settings.reference, moved, plan.contradicted)
-        refined = turns.refined(before, here, after) if turns is not None else None
-        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed)
+        refined, pictures = None, None
+        if neighbours is not None:
+            refined = neighbours.refined(before, here, after)
+            pictures = partial(neighbours.pictures, plan.joined(before, after), here, refined)
+        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures)
 
 
 def moved_over_frame(
@@ -138,25 +153,31 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     """All frames of a movie, those of the recorder's start-up at the times and exposures of what they show.
 
     frame_lag: slot k shows capture k + lag − repeats so far; exact repeats use the lag up over the first slots.
-    repeats: slots that were seen to repeat; where they are not as many as the lag, they are taken as evenly spread.
+    repeats: slots that were seen to repeat; where they are not as many as the lag, they are taken as evenly spread,
+    unless the movie ends before the lag is used up: then all slots keep what is left of it.
     Frames that only the start-up speaks against may then be used.
     """
     lagging = profile.extensions.frame_lag_frames
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
-    lag = round(profile.extensions.frame_lag_s / period_s) if period_s > 0 else 0
+    periods = profile.extensions.frame_lag_s / period_s if period_s > 0 else 0.0
+    lag, last = round(periods), lagging
     if not lagging or not lag:
         return tuple(frames)
-    seen = np.array([slot for slot in repeats if 0 < slot <= lagging])
-    spread = np.round(np.arange(1, lag + 1) * lagging / lag).astype(int)
-    used = np.sort(seen) if len(seen) == lag else spread
+    used = np.sort(np.array([slot for slot in repeats if 0 < slot <= lagging], int))
+    unfinished = 0 < len(used) < periods and lagging >= LAG_TO_THE_END * len(frames)
+    if unfinished:
+        lag, last = int(periods + ALMOST), len(frames) - 1
+    elif len(used) != lag:
+        used = np.round(np.arange(1, lag + 1) * lagging / lag).astype(int)
+    rest_s = (periods - lag) * period_s if unfinished else 0.0
     shows = np.arange(len(frames)) + lag - np.searchsorted(used, np.arange(len(frames)), side="right")
-    early = [_showing(frame, frames, int(shows[k]), period_s) for k, frame in enumerate(frames[: lagging + 1])]
-    return (*early, *frames[lagging + 1 :])
+    early = [_showing(frame, frames, int(shows[k]), period_s, rest_s) for k, frame in enumerate(frames[: last + 1])]
+    return (*early, *frames[last + 1 :])
 
 
-def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float) -> Frame:
+def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float, later_s: float) -> Frame:
     """A slot's frame with the time and exposure of the capture that it shows; stamp and place stay the slot's."""
     source = frames[min(capture, len(frames) - 1)]
-    time_s = source.time_s + max(capture - len(frames) + 1, 0) * period_s
+    time_s = source.time_s + max(capture - len(frames) + 1, 0) * period_s + later_s
     frame = replace(frame, time_s=time_s, exposure_s=source.exposure_s)
     return replace(frame, skip_reason=None, skip_codes=()) if frame.only_startup else frame

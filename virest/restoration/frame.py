@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,8 +15,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.kernel_spread import kernel_spread
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
@@ -27,6 +28,7 @@ from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.neighbours.confirmation import ConfirmedGain
+from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
@@ -83,6 +85,8 @@ class RestoredFrame:
     """motion, depth_m, depth_source, blur, shutter, response, deblur: the log's line."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent: estimate, deblur, shutter."""
+    source_px: NDArray[np.float32] | None = None
+    """(height, width, 2) where in the recorded picture each pixel came from; None: from its own place."""
 
 
 def restore_frame(
@@ -94,16 +98,20 @@ def restore_frame(
     seen: RowMotion | None = None,
     refined: RefinedMotion | None = None,
     confirmed: ConfirmedGain | None = None,
+    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
     picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
     pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
-    is then taken.  confirmed: how much of a promised gain neighbours confirm.
+    is then taken.  confirmed: how much of a promised gain neighbours confirm.  neighbours:
+    brings those to the frame that it is restored with.
     """
     clock = _Clock()
     if refined is not None:
         motion = refined.motion
+        if seen is not None and refined.turn is not None:
+            seen = _exposed_as(motion, seen)
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     parameters = degradation_parameters(motion, trajectory, settings)
@@ -121,7 +129,7 @@ def restore_frame(
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
         restored, parameters["deblur"], why_not = _deblurred(
-            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed
+            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed, neighbours
         )
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
@@ -142,8 +150,17 @@ def restore_frame(
     status = "copied" if restored is picture else "restored"
     warnings = (*_limits(motion), *why_not)
     return RestoredFrame(
-        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds
+        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source
     )
+
+
+def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
+    """A motion that its neighbours bear out, over the exposure that another account gives it, about the same middle.
+
+    Neighbours tell where the picture moved, whatever clocks say; the exposure's length they do not see.
+    """
+    start_s = motion.start_s + 0.5 * (motion.exposure_s - seen.exposure_s)
+    return replace(motion, start_s=start_s, exposure_s=seen.exposure_s)
 
 
 def deblurred_luma(
@@ -303,6 +320,7 @@ def _deblurred(
     light: FrameLight | None,
     covariance_px2: NDArray[np.float64],
     confirmed: ConfirmedGain | None,
+    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
@@ -320,7 +338,9 @@ def _deblurred(
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    blurred = replace(blurred, spread=spread)
+    joined = neighbours() if neighbours is not None and light is None and anchor == 0.5 else ()
+    longest_px = max((longest_px, *(one.longest_px for one in joined)))
+    blurred = replace(blurred, spread=spread, neighbours=joined, longest_px=longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
     recorded = picture
@@ -345,6 +365,7 @@ def _deblurred(
         "expected_gain_std_db": None if confirmed is None else confirmed.std_db,
         "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
+        "neighbours": [{"frame": one.number, "weight": float(one.weights.mean())} for one in joined],
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }

@@ -33,6 +33,8 @@ FAR_PX = 3.0
 """A common shift beyond this is taken out before the fits, in reduced pixels: tiles then show the same again."""
 RIVAL_PEAK = 0.8
 """Of two agreements nearly as good the one nearer to the prediction is taken: periodic texture has many."""
+CLIPPED_LIGHT = 0.95
+"""Tiles with brighter places are not judged: light that was clipped cannot be blurred again."""
 LEAST_COHERENCE = 0.5
 """Tiles whose spectra agree less, Σ|Re A*B| over Σ|A||B|, show different things."""
 HUBER = 1.5
@@ -95,6 +97,42 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
     return _turn(view, tops_lefts, times, shift + apart, precision)
 
 
+@dataclass(frozen=True, slots=True)
+class TileAgreement:
+    """How a neighbour's tiles agree with a frame's, each blurred as the other was and shifted onto it."""
+
+    centres_px: Array
+    """(n, 2) in the frame."""
+    shift_px: Array
+    """(n, 2): the neighbour shows at a predicted place what the frame has so far on."""
+    precision: Array
+    """(n,) of the shifts, relative; 0: the tile shows something else."""
+    error: Array
+    """(n,) mean square difference, in light over its mean."""
+    signal: Array
+    """(n,) mean square of what both show."""
+    gain: float
+    """The neighbour's light over the frame's."""
+
+
+def tile_agreement(view: NeighbourView, first: Image, second: Image) -> TileAgreement | None:
+    """Compare all tiles of two reduced pictures; None where a path does not fit into a tile."""
+    times = view.frame.profile.height / first.shape[0]
+    tops_lefts = _tiles(first.shape[0], first.shape[1], first.size)
+    kernels = _kernel_spectra(view, tops_lefts, times)
+    if kernels is None:
+        return None
+    here, there = _cut(first, tops_lefts), _seen(view, second, tops_lefts, np.zeros(2), times)
+    a, b = _spectra(here) * kernels[1], _spectra(there) * kernels[0]
+    shift, precision = _tile_shifts(a, b, np.zeros(2))
+    wx, wy = _frequencies()
+    ahead = shift[:, 0, None, None].astype(np.float32) * wx + shift[:, 1, None, None].astype(np.float32) * wy
+    error = (np.abs(a * np.exp(1j * ahead) - b) ** 2).mean(axis=(1, 2))
+    gain = float(np.median(there.mean(axis=(1, 2)) / np.maximum(here.mean(axis=(1, 2)), 1e-6)))
+    centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)
+    return TileAgreement(centres_px, shift * times, precision, error, (np.abs(b) ** 2).mean(axis=(1, 2)), gain)
+
+
 def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Image) -> tuple[float, float] | None:
     """How far a frame, as recorded and as restored, is from its neighbour once each is blurred as that one was.
 
@@ -106,8 +144,9 @@ def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Ima
     kernels = _kernel_spectra(view, tops_lefts, times)
     if kernels is None:
         return None
-    b = _spectra(_seen(view, second, tops_lefts, np.zeros(2), times))
-    left, used = [], np.ones(len(tops_lefts), bool)
+    there = _seen(view, second, tops_lefts, np.zeros(2), times)
+    b, left = _spectra(there), []
+    used = np.maximum(_cut(first, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT
     for picture in (first, sharp):
         a = _spectra(_cut(picture, tops_lefts)) * kernels[1]
         shift, precision = _tile_shifts(a, b, np.zeros(2))
@@ -120,13 +159,16 @@ def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Ima
     return float(left[0][used].mean()), float(left[1][used].mean())
 
 
-def _tiles(height: int, width: int) -> NDArray[np.intp]:
-    """(n, 2) top and left of at most MOST_TILES tiles, evenly over a picture."""
+def _tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
+    """(n, 2) top and left of at most so many tiles, evenly over a picture."""
     tops, lefts = (
-        np.linspace(0, length - TILE, max(1, length // TILE)).astype(np.intp) for length in (height, width)
+        np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(
+            np.intp
+        )
+        for length in (height, width)
     )
     corners = np.stack(np.meshgrid(tops, lefts, indexing="ij"), -1).reshape(-1, 2)
-    chosen = np.unique(np.linspace(0, len(corners) - 1, min(len(corners), MOST_TILES)).round().astype(np.intp))
+    chosen = np.unique(np.linspace(0, len(corners) - 1, min(len(corners), most)).round().astype(np.intp))
     return np.asarray(corners[chosen])
 
 
@@ -135,7 +177,9 @@ def _full_px(tops_lefts: NDArray[np.intp], times: float, at: float) -> Array:
     return np.asarray((tops_lefts[:, ::-1] + at + 0.5) * times - 0.5)
 
 
-def _kernel_spectra(view: NeighbourView, tops_lefts: NDArray[np.intp], times: float) -> list[NDArray[np.complex64]] | None:
+def _kernel_spectra(
+    view: NeighbourView, tops_lefts: NDArray[np.intp], times: float
+) -> list[NDArray[np.complex64]] | None:
     """Transposes of the kernels of the frame and of its neighbour, (n, TILE, TILE / 2 + 1) each.
 
     None where a path does not fit into half a tile.
@@ -204,7 +248,7 @@ def _common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
 
 
 def _tile_shifts(a: NDArray[np.complex64], b: NDArray[np.complex64], start_px: Array) -> tuple[Array, Array]:
-    """Shifts (n, 2) of each tile and their precision (n,), 1 / px², by the phases' scatter (0: shows something else)."""
+    """Shifts (n, 2) of tiles and their precision (n,), 1 / px², by the phases' scatter; 0: it shows something else."""
     wx, wy = _frequencies()
     product, shift = np.conj(a) * b, np.tile(start_px, (len(a), 1))
     radius = np.hypot(wx, wy) / (2 * np.pi)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion, missing_turn
 from virest.restoration.neighbours.registration import PairTurn, predicted_error
-from virest.restoration.neighbours.sights import FrameTurns, Sight, light_of, turn_between
+from virest.restoration.neighbours.sights import FrameNeighbours, Sight, light_of, turn_between
 
 RUN_FRAMES = 4
 """Three pairs: what linear interpolation leaves of the middle one shows."""
@@ -66,7 +67,7 @@ def survey_turns(
             return None
         return turn_between(sights[first], sights[second], light[first], light[second], trajectory, lens)
 
-    turns = [[between(a, b) for a, b in zip(run, run[1:], strict=False)] for run in runs]
+    turns = [[between(a, b) for a, b in pairwise(run)] for run in runs]
     return missing_turn(turns, motions)
 
 
@@ -84,7 +85,7 @@ def survey_gain(
     None: it is left alone.  The most blurred inner frame of each run is restored and held against both its neighbours.
     """
     found = []
-    turns = FrameTurns(trajectory, lens, missing) if missing is not None else None
+    turns = FrameNeighbours(trajectory, lens, missing) if missing is not None else None
     for run in runs:
         around = [sights[n] for n in run if n in sights and sights[n].usable]
         for before, here, after in zip(around, around[1:], around[2:], strict=False):
