@@ -325,9 +325,9 @@ def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Ste
     step, rival = _best_single(model, trial)
     feeble = step is None or step.part < FEEBLE_GAIN
     if feeble and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
-        pair = _best_pair(course, model, tried, base, better)
+        pair, other = _best_pair(course, model, tried, base, better)
         if pair is not None:
-            step, rival = pair, None
+            step, rival = pair, other
             rung = replace(rung, tried={**rung.tried, _names(pair): pair.accepted[0].after})
     return step, rival, rung
 
@@ -385,12 +385,12 @@ def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: floa
 
 def _best_pair(
     course: _Course, model: Model, tried: set[str], base: Screened, better: Sequence[Screened]
-) -> _Step | None:
+) -> tuple[_Step | None, _Step | None]:
     """Two causes that gain together what neither does alone, while points are far from where the model puts them.
 
     A stabiliser hides the clocks' drift, and the drift blurs what the stabiliser does.
     """
-    evidence, typical = course.evidence, course.evidence.typical_px
+    evidence = course.evidence
     firsts = [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]
     found: list[tuple[Candidate, Screened]] = []
     for first in firsts:
@@ -399,7 +399,7 @@ def _best_pair(
         seconds = [candidate for candidate in begun if candidate.added]
         found += [(first, second) for second in best_of_each(screen(evidence, seconds, course.each))]
     if not found:
-        return None
+        return None, None
     members_of = {_pair_name(first, entry): (first, entry.candidate) for first, entry in found}
     renamed = [
         replace(entry, candidate=replace(entry.candidate, name=_pair_name(first, entry))) for first, entry in found
@@ -410,16 +410,32 @@ def _best_pair(
         part = float(gain.mean() / before.block_loss.mean())
         if part < FEEBLE_GAIN or not _holds(gain, part):
             continue
-        entered, fitted = _with(evidence, pair.candidate)
-        members = members_of[pair.candidate.name]
-        p_values = [_p_value(evidence, fitted, member, entered.profile, model.profile) for member in members]
-        if max(p_values) < MAX_P:
-            causes = (
-                Accepted(member.name, member.effect, "", before.rms * typical, after.rms * typical, p_value, ())
-                for member, p_value in zip(members, p_values, strict=True)
-            )
-            return _Step(entered, tuple(causes), part)
-    return None
+        step = _pair_step(model, trial, members_of[pair.candidate.name], pair, after)
+        if step is not None:
+            others = [other for other in trial.judged if other is not pair and _rivals(before, pair, other, gain)]
+            steps = (_pair_step(model, trial, members_of[o.candidate.name], o, o) for o in sorted(others, key=_by_loss))
+            return step, next((other for other in steps if other is not None), None)
+    return None, None
+
+
+def _by_loss(entry: Judged) -> float:
+    return float(entry.block_loss.mean())
+
+
+def _pair_step(
+    model: Model, trial: Trial, members: tuple[Candidate, Candidate], pair: Judged, after: Judged
+) -> _Step | None:
+    """Two causes that enter together, if both are significant beside each other."""
+    evidence, before, typical = trial.evidence, trial.before, trial.evidence.typical_px
+    entered, fitted = _with(evidence, pair.candidate)
+    p_values = [_p_value(evidence, fitted, member, entered.profile, model.profile) for member in members]
+    if max(p_values) >= MAX_P:
+        return None
+    causes = tuple(
+        Accepted(member.name, member.effect, "", before.rms * typical, after.rms * typical, p_value, ())
+        for member, p_value in zip(members, p_values, strict=True)
+    )
+    return _Step(entered, causes, float((before.block_loss - after.block_loss).mean() / before.block_loss.mean()))
 
 
 def _pair_name(first: Candidate, second: Screened) -> str:
