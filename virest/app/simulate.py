@@ -12,7 +12,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure
-from virest.simulation.effects import EffectContext, hide_effects
+from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
+from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import Session, SessionSettings, nominal_camera, plan_session
 
@@ -50,6 +51,7 @@ def simulate_command(
     reference: str = "exposure-start",
     overwrite: bool = False,
     profile: CameraProfile | None = None,
+    isp: PhoneIsp = OFF,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Simulate a recording and write it to ``out``; returns a summary for ``--json``.
@@ -63,6 +65,7 @@ def simulate_command(
     effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), hidden from everything but ``truth/``.
     reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  profile: use this camera as the nominal
     one; width, height, focal_px, distortion, readout_ms, direction and response are then taken from it.
+    isp: the phone's own processing; truth/ shows its global curves, the capture's profile nothing of it.
     """
     if reference not in ("exposure-start", "frame-middle"):
         raise SettingsError(f"reference '{reference}' is not known", hint="use exposure-start or frame-middle")
@@ -77,6 +80,9 @@ def simulate_command(
         distortion=distortion,
         depth_m=np.inf if depth_m is None else depth_m,
     )
+    context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
+    true, applied = hide_effects(nominal, list(effects), context)
+    isp = hidden_isp(applied, isp)
     settings = SessionSettings(
         scene=scene,
         frames=frames,
@@ -91,11 +97,11 @@ def simulate_command(
         gyro_noise_rad_s=gyro_noise_rad_s,
         accel_noise_m_s2=accel_noise_m_s2,
         seed=seed,
+        isp=isp,
     )
-    context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
-    true, applied = hide_effects(nominal, list(effects), context)
-    session = plan_session(nominal, true, settings)
-    options = RecordingOptions(layout, clock, bitrate_bits_per_px, crf, middle_truth=reference == "frame-middle")
+    session = plan_session(nominal, isp.true_profile(true), settings)
+    bits_per_px = isp.bits_per_px or bitrate_bits_per_px
+    options = RecordingOptions(layout, clock, bits_per_px, crf, middle_truth=reference == "frame-middle")
     folder = write_recording(
         session, Path(out), applied=applied, options=options, overwrite=overwrite, progress=progress
     )  # fmt: skip
@@ -112,6 +118,7 @@ def simulate_command(
         "seed": seed,
         "blur_px": _blur_px(session),
         **_exposed(session),
+        **({"isp": isp.in_force()} if isp.in_force() else {}),
         "effects": [{"name": effect.name, "parameters": effect.parameters} for effect in applied],
     }
 

@@ -6,7 +6,7 @@ they should be; then brightness, then blur.  What is left is tested for structur
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
+from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
 from virest.diagnosis.light_values import settle_light
@@ -22,6 +23,7 @@ from virest.diagnosis.points import (
     MIN_PAIRS,
     TrackedPoints,
     at_model_times,
+    at_rest,
     evened,
     frames_to_follow,
     pulses,
@@ -36,7 +38,7 @@ from virest.motion.recorder_lag import lag_schedules
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_model import predict
-from virest.motion.tracking import track_frames, track_pairs
+from virest.motion.tracking import TrackPair, track_frames, track_pairs
 
 Progress = Callable[[str, float], None]
 MOST_TRAVEL_PX = 0.35
@@ -50,18 +52,20 @@ def diagnose_capture(
     gray: Reader,
     progress: Progress | None = None,
     each: Each = one_by_one,
+    kept_back: Collection[int] = (),
 ) -> Diagnosis:
     """Climb the ladder on one capture; pictures gives (index, RGB), gray (index, luma) of the frames asked for.
 
-    each: shares work out; gray then goes to other processes.  Raises CaptureError where there is nothing to judge by:
-    too few points.
+    kept_back: movie indices of frames that no fit of points, blur or curve is to see.  each: shares work out; gray then
+    goes to other processes.  Raises CaptureError where there is nothing to judge by: too few points.
     """
     say = progress or (lambda _text, _part: None)
     say("tracking", 0.02)
-    points, notes = _tracked(capture, profile, gray, each)
+    points, notes = _tracked(capture, profile, gray, each, frozenset(kept_back))
     say("points", 0.15)
     first = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
     story = _Story(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each)
+    story.kept_back = frozenset(kept_back)
     say("brightness", 0.5)
     story.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
     say("blur", 0.75)
@@ -69,14 +73,18 @@ def diagnose_capture(
     say("curve", 0.92)
     story.judge_curve(pictures)
     story.settle_light()
+    say("edges", 0.95)
+    story.judge_edges(gray)
     say("what is left", 0.97)
     return story.told()
 
 
-def _tracked(capture: Capture, profile: CameraProfile, gray: Reader, each: Each) -> tuple[TrackedPoints, list[str]]:
-    """Points of the frames that are followed, those of the start-up too."""
+def _tracked(
+    capture: Capture, profile: CameraProfile, gray: Reader, each: Each, kept_back: frozenset[int]
+) -> tuple[TrackedPoints, list[str]]:
+    """Points of the frames that are followed, those of the start-up too; pairs with a frame kept back are left out."""
     indices = frames_to_follow(capture, profile)
-    observed = observe_tracks(capture, track_frames(gray, indices, each), profile)
+    observed = observe_tracks(capture, _seen(track_frames(gray, indices, each), kept_back), profile)
     start, null_terms, notes, far, follows = with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
@@ -85,13 +93,20 @@ def _tracked(capture: Capture, profile: CameraProfile, gray: Reader, each: Each)
             hint="a longer capture, or one with more texture",
         )
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
-    rungs_allowed = MAX_RUNGS if follows or schedules else 0
+    still = at_rest(observed, start)
+    rungs_allowed = MAX_RUNGS if (follows or schedules) and not still else 0
     stamped_frames = sum(NO_STAMP not in frame.skip_codes for frame in capture.frames)
     if len(indices) < stamped_frames:
         notes.append(f"points were followed in {len(indices)} of {stamped_frames} frames, runs spread over the capture")
-    if not rungs_allowed:
+    if still:
+        notes.append("the camera is at rest: points tell nothing of clocks, readout or lens")
+    elif not rungs_allowed:
         notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
     return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
+
+
+def _seen(pairs: Sequence[TrackPair], kept_back: frozenset[int]) -> list[TrackPair]:
+    return [pair for pair in pairs if not kept_back & {pair.first, pair.second}]
 
 
 @dataclass(slots=True)
@@ -106,15 +121,28 @@ class _Story:
     light: PictureVerdict
     blur: PictureVerdict | None = None
     curve: PictureVerdict | None = None
+    edges: PictureVerdict | None = None
     findings: list[Finding] = field(default_factory=list)
     """Of the points, and what blur made of them."""
     notes: list[str] = field(default_factory=list)
     each: Each = one_by_one
+    kept_back: frozenset[int] = frozenset()
+    """Movie indices of frames that only brightness is to see."""
 
     @property
     def frames(self) -> list[Frame]:
         """Frames that can be looked at, with the stamps that the first model gives them."""
         return at_model_times(self.capture, self.first)
+
+    @property
+    def frames_to_fit(self) -> list[Frame]:
+        """Those that blur and curve are fitted to."""
+        return [frame for frame in self.frames if frame.index not in self.kept_back]
+
+    def _all_frames(self) -> tuple[Frame, ...]:
+        """Every frame, by movie index; those that cannot be looked at without an exposure."""
+        usable = {frame.index: frame for frame in self.frames_to_fit}
+        return tuple(usable.get(frame.index, replace(frame, exposure_s=None)) for frame in self.capture.frames)
 
     def judge_light(
         self, pictures: Reader, gray: Reader, given: CameraProfile, progress: Callable[[float], None]
@@ -126,7 +154,8 @@ class _Story:
         if points_left(self.geometric).significant and pulses(self.light.profile):
             even = evened(gray, frames, self.light.profile)
             followed = set(frames_to_follow(self.capture, given)) & {frame.index for frame in frames}
-            again = observe_tracks(self.capture, track_pairs(even(sorted(followed))), given)
+            pairs = _seen(track_pairs(even(sorted(followed))), self.kept_back)
+            again = observe_tracks(self.capture, pairs, given)
             start = self.points.start
             self.points = replace(
                 self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
@@ -145,7 +174,7 @@ class _Story:
             )
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
-            shown = replace(self.capture, frames=tuple(self.frames))
+            shown = replace(self.capture, frames=self._all_frames())
             self.blur, is_exposure = climb_blur(
                 shown, lit, integrate_gyro(self.capture.imu, lit), gray, scale, self.each
             )
@@ -171,7 +200,8 @@ class _Story:
                 )
             return
         trajectory = integrate_gyro(self.capture.imu, extended)
-        self.curve = judge_curve(extended, self.light.observations, self.frames, trajectory, pictures, self.each)
+        frames = self.frames_to_fit
+        self.curve = judge_curve(extended, self.light.observations, frames, trajectory, pictures, self.each)
 
     def settle_light(self) -> None:
         """Brightness's values once more, now that the curve and the exposure are known as well as they will be."""
@@ -181,11 +211,18 @@ class _Story:
         self.light, profile = settle_light(self.light, self.curve, self.points.start, causes)
         self.curve = replace(self.curve, profile=profile)
 
+    def judge_edges(self, gray: Reader) -> None:
+        """What the phone did to its edges; no blur overshoots, so the paths need not be right."""
+        assert self.curve is not None
+        shown, extended = replace(self.capture, frames=self._all_frames()), self.curve.profile
+        self.edges = judge_sharpening(shown, extended, integrate_gyro(self.capture.imu, extended), gray)
+
     def told(self) -> Diagnosis:
         """The verdict, with everything that led to it."""
         assert self.blur is not None
         assert self.curve is not None
-        looks = (self.light, self.blur, self.curve)
+        assert self.edges is not None
+        looks = (self.light, self.blur, self.curve, self.edges)
         findings = [*self.findings, *(finding for look in looks for finding in look.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         left = remaining_structure(self.geometric, self.light)

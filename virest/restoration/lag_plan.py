@@ -48,4 +48,4 @@ def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
 
 def _followed(profile: CameraProfile, lag: StartUpLag) -> CameraProfile:
     extensions = replace(profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
-    return profile.with_estimate("lag_s", lag.lag_s, lag.std_s, SOURCE, extensions=extensions)
+    return profile.with_estimate("lag_s", lag.lag_s, None, SOURCE, extensions=extensions)

@@ -19,7 +19,7 @@ from virest.app.cli.evaluate import evaluate
 from virest.app.cli.export import export
 from virest.app.cli.import_bag import import_bag
 from virest.app.cli.inspect import inspect
-from virest.app.cli.options import Version
+from virest.app.cli.options import GroupedCommand, Version
 from virest.app.cli.preview import preview
 from virest.app.cli.process import process
 from virest.app.cli.profile import profile
@@ -73,7 +73,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
 }
 """Each command with the line that ``virest --help`` shows."""
 for name, (command, line) in COMMANDS.items():
-    app.command(name, short_help=line)(command)
+    app.command(name, short_help=line, cls=GroupedCommand)(command)
 app.add_typer(evaluate, name="evaluate", short_help="Measure quality against truth and other methods.")
 app.add_typer(profile, name="profile", short_help="Start a camera profile; known phones.")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
 from virest import __version__
 from virest.app import console
@@ -37,6 +38,24 @@ def one_of(names: tuple[str, ...]) -> Callable[[str | None], str | None]:
         return value
 
     return check
+
+
+class GroupedCommand(typer.core.TyperCommand):
+    """A command whose ``--help`` lists the options of each ``rich_help_panel`` under that title."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Arguments, options, then each group in the order in which its first option is declared."""
+        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is None:
+                continue
+            usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
+            groups.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(record)
+        for title, records in groups.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
 
 
 Captures = Annotated[
