@@ -23,7 +23,12 @@ from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.ladder import diagnose_capture
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 11
-EVIDENCE = {GEOMETRY: "tracked points", PHOTOMETRY: "brightness along tracks", BLUR: "blur of image regions", EDGES: "edges"}
+EVIDENCE = {
+    GEOMETRY: "tracked points",
+    PHOTOMETRY: "brightness along tracks",
+    BLUR: "blur of image regions",
+    EDGES: "edges",
+}
 
 
 @dataclass(frozen=True, slots=True)
