@@ -110,6 +110,8 @@ def restore_frame(
     clock = _Clock()
     if refined is not None:
         motion = refined.motion
+        if seen is not None and refined.turn is not None:
+            seen = _exposed_as(motion, seen)
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     parameters = degradation_parameters(motion, trajectory, settings)
@@ -150,6 +152,15 @@ def restore_frame(
     return RestoredFrame(
         frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source
     )
+
+
+def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
+    """A motion that its neighbours bear out, over the exposure that another account gives it, about the same middle.
+
+    Neighbours tell where the picture moved, whatever clocks say; the exposure's length they do not see.
+    """
+    start_s = motion.start_s + 0.5 * (motion.exposure_s - seen.exposure_s)
+    return replace(motion, start_s=start_s, exposure_s=seen.exposure_s)
 
 
 def deblurred_luma(
