@@ -97,7 +97,7 @@ def _notes(facts: Json) -> list[str]:
     notes = []
     if facts["cores"] == 1:
         notes.append(
-            "one core: frames are restored one after the other; --preset fast is about 24 times as fast as best"
+            "one core: frames are restored one after the other; --preset fast is many times as fast as best"
         )
     memory = facts["memory_bytes"]
     if memory is not None and facts["cores"] * PER_WORKER_BYTES > 0.8 * memory:
