@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from virest.app.bench import compare, honesty, summary
-from virest.app.bench.workload import Scale, honesty_workloads, quality_workloads
+from virest.app.bench.workload import Scale, honesty_workloads, quality_workloads, simulated
 
 Facts = dict[str, Any]
 
@@ -76,3 +76,14 @@ def test_phones_are_measured_in_both_sections_and_their_profile_is_the_nominal_o
         assert bool(told) == (workload.kind == "defocused")
         assert ("isp" in workload.options) == (workload.kind == "phone")
     assert len(honesty_workloads(Scale(quick=True))) == 4
+
+
+def test_a_kept_capture_is_used_again_only_if_it_is_the_same(tmp_path: Path) -> None:
+    """The same options: not touched; others: made anew under its name."""
+    options = {"width": 64, "height": 48, "frames": 2, "exposure_ms": 4.0}
+    movie = simulated(tmp_path, "small", **options) / "movie.mp4"
+    first = movie.stat().st_mtime_ns
+    assert simulated(tmp_path, "small", **options) == movie.parent
+    assert movie.stat().st_mtime_ns == first
+    simulated(tmp_path, "small", **options, seed=4)
+    assert movie.stat().st_mtime_ns != first

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 import os
 import signal
+import time
 
-from virest.app.side_by_side import side_by_side
+import pytest
+
+from virest.app.side_by_side import _SharedOut, side_by_side
 from virest.motion.shared_out import one_by_one
 
 
@@ -33,3 +36,23 @@ def test_one_job_is_done_here() -> None:
     """Without a second core no process is started."""
     with side_by_side(1) as each:
         assert each(os.getpid, [(), ()]) == [os.getpid()] * 2
+
+
+def test_an_interruption_waits_for_no_worker() -> None:
+    """Ctrl-C in the middle of long calls ends the processes that make them."""
+    begun = []
+
+    def interrupted() -> None:
+        with side_by_side(2) as each:
+            assert isinstance(each, _SharedOut)
+            each._submit(time.sleep, (3600,))
+            assert each._pool is not None
+            begun.extend(each._pool._processes.values())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert begun
+    for process in begun:
+        process.join(60)
+        assert not process.is_alive()

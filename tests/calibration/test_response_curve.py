@@ -340,3 +340,16 @@ def test_structure_is_seen_above_noise(rng: np.random.Generator) -> None:
     noise = rng.standard_normal(20_000)
     assert residual_structure(grey, noise) < 0.05
     assert residual_structure(grey, noise + 0.5 * np.sin(grey / 30)) == pytest.approx(0.35, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_pictures_of_one_exposure_under_a_list_of_many_are_refused(seed):
+    """Five pictures that were all taken alike, listed over 8 EV: no traceback, and no curve."""
+    rng = np.random.default_rng(seed)
+    light = make_scene(420, 310, rng)
+    true = [1.0] * 5 + [2.0**k for k in (-3, -1, 1, 2)]
+    listed = [2.0**k for k in (-4, -2, 0, 2, 4)] + true[5:]
+    pairs = zip(true, listed, strict=True)
+    bracket = [BracketPicture(f"{k}.png", take(light, t, GAMMA, rng), s / 60) for k, (t, s) in enumerate(pairs)]
+    with pytest.raises(CalibrationError, match="EV"):
+        fit_response(bracket)

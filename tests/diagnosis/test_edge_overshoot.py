@@ -77,10 +77,8 @@ def test_few_edges_tell_nothing(rng):
 
 
 def opened(folder: Path, **options) -> tuple[Source, Trajectory]:
-    """Simulate a board as a capture, and its motion by the capture's own profile."""
-    simulate_command(
-        folder, scene="board", width=480, height=360, frames=20, seed=3, exposure_ms=5.0, rate_rad_s=0.8, **options
-    )
+    """Simulate a capture, and its motion by the capture's own profile."""
+    simulate_command(folder, width=480, height=360, frames=20, seed=3, exposure_ms=5.0, rate_rad_s=0.8, **options)
     source = open_source(folder)
     return source, integrate_gyro(source.capture.imu, source.profile)
 
@@ -103,7 +101,7 @@ def test_a_hidden_sharpening_is_named_with_its_size(processed):
     assert finding.name == "sharpening"
     for name, truth in (("amount", 0.9), ("radius_px", 1.4)):
         change = finding.parameters[name]
-        assert abs(change.estimate - truth) < 2.5 * change.std < 1.5 * truth, (name, change)
+        assert abs(change.estimate - truth) < 2.5 * change.std < 2.5 * truth, (name, change)
     assert finding.held_out.gain > 0.5
     assert "unsharp" in finding.sentence
 
@@ -119,6 +117,6 @@ def test_sharpening_and_denoising_are_no_defocus_and_no_other_exposure(processed
 
 def test_what_is_not_sharpened_is_not_named(tmp_path):
     """Out of focus and under another curve: neither overshoots, and there are edges enough to tell."""
-    verdict = judged(*opened(tmp_path / "plain", effects=["defocus=0.8", "response_curve=1.3"]))
+    verdict = judged(*opened(tmp_path / "plain", scene="board", effects=["defocus=0.8", "response_curve=1.3"]))
     assert not verdict.findings
     assert not verdict.notes

@@ -154,9 +154,11 @@ def test_frames_left_alone_are_grouped_by_reason_whatever_its_numbers():
 def test_the_verdict_counts():
     """All, some or none restored, and what became of the others."""
     mixed = run_verdict({**COUNTS, "failed": 4}, "some frames failed", [facts(3)])
-    assert (mixed.level, mixed.headline) == ("poor", "2 of 7 frames restored")
+    assert (mixed.level, mixed.headline) == ("poor", "1 of 7 frames deblurred, 1 only straightened")
     assert mixed.sentence.startswith("1 left out, 4 failed.")
     assert run_verdict({**COUNTS, "skipped": 0}, "restored", []).level == "good"
+    told = run_verdict({"restored": 103, "copied": 0, "skipped": 0, "failed": 0, "deblurred": 14}, "restored", [])
+    assert told.headline == "14 of 103 frames deblurred, 89 only straightened"
     none = run_verdict({"restored": 0, "copied": 3, "skipped": 0, "failed": 0}, "copied: focal length unknown", [])
     assert none.sentence == "3 copied unchanged. Copied: focal length unknown."
 
@@ -268,3 +270,21 @@ def test_a_diagnosis_is_told_with_values_deviations_and_rivals():
     assert "more than chance" in text_of(
         report_page([CaptureRecord("t", None, DiagnosisRecord({**found, "verdict": "unexplained"}))], "1")
     )
+
+
+def test_a_copied_frame_is_not_called_straightened():
+    """What the shutter bent is told, and what was done is told by what was done."""
+    bent = facts(3, "copied", shift_px=5.0, deblurred=False)
+    assert bent.done == "copied unchanged"
+    straight = facts(4, shift_px=5.0, deblurred=False, straightened=True)
+    assert straight.done == "straightened"
+    assert facts(5, deblurred=True, straightened=True).done == "deblurred and straightened"
+
+
+def test_only_what_a_profile_states_is_called_given():
+    """A null is not known, whatever stands in for it; a default may be nobody's."""
+    profile = {"imu": {"time_offset_s": None, "gyro_bias_rad_s": [0.0, 0.0, 0.0]}, "intrinsics": {"fx_px": 500.0}}
+    values = {value.title: value.source for value in camera_values(profile, "camera.yaml")}
+    assert values["Time offset"] == "not known"
+    assert values["Gyroscope bias"] == "camera.yaml, or the default"
+    assert values["Focal length"] == "given by camera.yaml"

@@ -29,7 +29,7 @@ MOST_FILES, MOST_BYTES = 32, 1 << 30
 
 
 def run_totals(logs: list[Path]) -> dict[str, Any]:
-    """Counts by status, warnings by text, and seconds by stage, over all lines."""
+    """Counts by status and by what was done, and seconds by stage, over all lines."""
     counts: Counter[str] = Counter()
     seconds: Counter[str] = Counter()
     for content in read_each(logs):

@@ -304,6 +304,7 @@ def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, flo
         "timestamp_ns": frame.timestamp_ns,
         "exposure_s": None if frame.exposure_s is None else frame.exposure_s * scale,
         "status": restored.status,
+        "done": [],
         "output": None if restored.picture is None else f"frames/{segment.run.picture(frame.index).name}",
         "warnings": list(restored.warnings),
         "valid_px": list(restored.valid_px),

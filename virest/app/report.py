@@ -38,6 +38,7 @@ from virest.report.html import (
     RunRecord,
     ShownFrame,
     choose_frames,
+    count_words,
     embed_figure,
     report_page,
     show_frame,
@@ -145,6 +146,7 @@ class _Motion(_Lenient):
 
 
 class _Shutter(_Lenient):
+    method: str = "none"
     max_displacement_px: float | None = None
 
 
@@ -392,6 +394,7 @@ def _frame_facts(line: _Line) -> FrameFacts:
         gain_db=deblur.expected_gain_db,
         noise_levels=deblur.noise_grey_levels,
         deblurred=deblur.method != "none",
+        straightened=line.status == "restored" and shutter.method != "none",
         valid_px=line.valid_px,
     )
 
@@ -560,9 +563,7 @@ def _describe(facts: Json) -> str:
     for capture in facts["captures"]:
         parts = []
         if capture["counts"] is not None:
-            known = {state: capture["counts"].get(state, 0) for state in STATUSES}
-            counted = ", ".join(f"{count} {state}" for state, count in known.items() if count)
-            parts.append(f"{capture['verdict']} ({counted or 'no frames'})")
+            parts.append(f"{capture['verdict']} ({count_words(capture['counts']) or 'no frames'})")
         if capture["diagnosis"] is not None:
             named = ", ".join(capture["causes"])
             parts.append(f"diagnosis {capture['diagnosis']}{f' ({named})' if named else ''}")

@@ -23,6 +23,9 @@ def side_by_side(jobs: int) -> Iterator[Each]:
     shared = _SharedOut(jobs)
     try:
         yield shared if jobs > 1 else one_by_one
+    except BaseException:
+        shared.kill()  # Ctrl-C waits for nobody
+        raise
     finally:
         shared.close()
 
@@ -62,6 +65,12 @@ class _SharedOut:
         """Let the processes go; what they have not begun is not wanted any more."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def kill(self) -> None:
+        """End the processes in the middle of what they do."""
+        if self._pool is not None:
+            for process in list((self._pool._processes or {}).values()):
+                process.kill()
 
 
 def _told(future: Future[Any], place: int, done: Callable[[int], None] | None) -> Any:

@@ -41,6 +41,8 @@ MAX_MOVED = 0.2
 USUAL_MISSES = 3.0
 """A place whose worst miss is so many times the usual worst miss is left out."""
 OUTLIER_LEVELS = 20.0
+WIDEST_EV = 20.0
+"""Corrections of listed exposures are sought up to this; cameras' shutters span less."""
 SCORE_CAP = 16.0
 """The most that one grey, in units of its variance, counts against a curve."""
 Z_REJECTED = 3.0
@@ -133,6 +135,7 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     samples = samples.keep_pictures(seen)
     samples = samples.take(samples.measured.sum(axis=1) >= 2)
     first = fit_first_curve(samples)
+    _require_possible(first, samples)
     still = _still_rows(samples, first)
     samples = samples.take(still)
     verdict = _fit_kinds(kind, samples, first, np.ones(len(first.suspect), bool))
@@ -317,6 +320,21 @@ class _Trial:
         return trend > Z_REJECTED**2 * max(scatter, TRUSTED_EV**2)
 
 
+def _require_possible(first: FirstCurve, samples: BracketSamples) -> None:
+    """Raise CalibrationError where the exposures fit no curve but by corrections that no list of them needs.
+
+    So it is where most pictures were taken at one exposure whatever the list says: any curve is then flat.
+    """
+    worst = float(np.abs(first.correction_ev).max())
+    if worst >= WIDEST_EV:
+        listed = np.log2(samples.exposure)
+        raise CalibrationError(
+            f"the listed exposures, {np.ptp(listed):.1f} EV apart, would need corrections of up to {worst:.0f} EV: "
+            "they are not those of the pictures",
+            hint="check the list against the pictures; several may have been taken at one exposure",
+        )
+
+
 def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDArray[np.bool_],
               evaluations: int = 30) -> tuple[Array, Array]:  # fmt: skip
     """(curve parameters, corrections in EV) of least cost, the sizes of the residuals held down (soft L1)."""
@@ -341,7 +359,7 @@ def _optimise(family: Family, start: Array, samples: BracketSamples, suspect: ND
             columns[:, i] = (miss(q + h * np.eye(1, len(q), i)[0]) - base) / h
         return columns
 
-    wide = np.full(len(suspect), 20.0)
+    wide = np.full(len(suspect), WIDEST_EV)
     bounds = (np.concatenate([family.lower, -wide]), np.concatenate([family.upper, wide]))
     found = least_squares(miss, start, jac=jacobian, bounds=bounds, loss="soft_l1", max_nfev=evaluations,
                           ftol=1e-6, xtol=1e-7, gtol=1e-8)  # fmt: skip

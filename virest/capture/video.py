@@ -62,6 +62,10 @@ KR_KB = {
 """Weights of red and blue in luma, by the number that H.264 gives the matrix."""
 BT601 = 6
 FULL_RANGE = 2
+CENTRED_CHROMA = {"mjpeg", "mpeg1video"}
+"""Codecs whose chroma lies between two columns of luma."""
+HDR_CURVES = {16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}
+"""Transfer curves that no response curve here describes."""
 PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
 FIXED_POINT = 64
 """Steps of a grey level in the 16-bit sums: luma and chroma together stay below 2^15."""
@@ -128,6 +132,7 @@ def probe_movie(path: Path) -> MovieIndex:
             stream = _video_stream(container, path)
             width, height = stream.codec_context.width, stream.codec_context.height
             _check_size(width, height, path)
+            _check_curve(stream, path)
             return _index(container, stream, width, height, path)
     except (av.FFmpegError, UnicodeError, ValueError) as fault:
         raise VideoError(
@@ -162,6 +167,16 @@ def _missing_movie_hint(path: Path) -> str:
     shown = "".join(c if c.isprintable() else "?" for c in others[0][:60])
     what = "rename it" if Path(others[0]).suffix.lower() in OWN_SUFFIXES else "ffmpeg -i FILE -c copy movie.mp4"
     return f"{needs}; is it '{shown}'? {what}"
+
+
+def _check_curve(stream: Any, path: Path) -> None:
+    """Raise VideoError for HDR movies: read as if they were standard ones, their light would be wrong throughout."""
+    curve = HDR_CURVES.get(int(stream.codec_context.color_trc or 0))
+    if curve is not None:
+        raise VideoError(
+            f"{label(path)}: is an HDR movie with the transfer curve {curve}, which is not read",
+            hint="film with HDR off, or convert it to BT.709 with its time stamps kept",
+        )
 
 
 def index_pictures(path: Path, found: PictureList) -> MovieIndex:
@@ -299,13 +314,14 @@ def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> 
 
 
 def _read(
-    path: Path, index: MovieIndex, frames: Iterable[int], convert: Callable[[Any], NDArray[np.uint8]]
+    path: Path, index: MovieIndex, frames: Iterable[int], convert: Callable[..., NDArray[np.uint8]]
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     if index.pictures:
         base, size = path if path.is_dir() else path.parent, (index.width, index.height)
         yield from read_pictures(base, index.pictures, size, frames, gray=convert is to_gray)
         return
     require_regular_file(path, VideoError, _missing_movie_hint(path))
+    centred = index.codec in CENTRED_CHROMA
     for run in _runs(index, frames):
         try:
             with _opened(path) as container:
@@ -315,7 +331,7 @@ def _read(
                 stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
                 for frame_index, frame in _in_order(run, _decoded(container, stream, index, run[0])):
                     usable = frame is not None and (frame.width, frame.height) == (index.width, index.height)
-                    yield frame_index, convert(frame) if usable else None
+                    yield frame_index, convert(frame, centred=centred) if usable else None
         except (av.FFmpegError, UnicodeError) as fault:
             raise VideoError(f"{label(path)}: cannot be read ({_reason(fault)})", hint="copy the movie again") from None
 
@@ -439,8 +455,11 @@ def _planes(frame: Any) -> list[NDArray[np.uint8]]:
     ]
 
 
-def to_rgb(frame: Any) -> NDArray[np.uint8]:
-    """RGB (h, w, 3) of a decoded PyAV frame, rounded; its size, matrix and range as the stream says."""
+def to_rgb(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
+    """RGB (h, w, 3) of a decoded PyAV frame, rounded; its size, matrix and range as the stream says.
+
+    centred: chroma lies between two columns of luma, not on the left one.
+    """
     if frame.format.is_rgb:
         return frame.to_ndarray(format="rgb24")
     if frame.format.name not in PLANAR_8BIT:
@@ -450,7 +469,7 @@ def to_rgb(frame: Any) -> NDArray[np.uint8]:
     luma = cv2.LUT(y_code, tables.luma)
     green = cv2.add(cv2.LUT(u_code, tables.green_u), cv2.LUT(v_code, tables.green_v))
     channels = [
-        _levels(cv2.add(luma, _upsample(chroma, luma.shape)))
+        _levels(cv2.add(luma, _upsample(chroma, luma.shape, centred=centred)))
         for chroma in (cv2.LUT(v_code, tables.red_v), green, cv2.LUT(u_code, tables.blue_u))
     ]
     return np.asarray(cv2.merge(channels), np.uint8)
@@ -461,18 +480,27 @@ def _levels(fixed: NDArray[Any]) -> NDArray[Any]:
     return cv2.convertScaleAbs(cv2.max(fixed, 0), alpha=1 / FIXED_POINT)  # type: ignore[call-overload]
 
 
-def _upsample(chroma: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Chroma at the luma's size, bilinear between centred samples; an odd side is cut after doubling."""
+def _upsample(chroma: NDArray[Any], shape: tuple[int, ...], *, centred: bool) -> NDArray[Any]:
+    """Chroma at the luma's size, bilinear.
+
+    A sample lies on the left one of its two columns of luma, as H.264 and its kin have it unless they say otherwise, or
+    between them (centred: JPEG and MPEG-1); always between its two rows.
+    """
     height, width = shape[:2]
     if chroma.shape[:2] == (height, width):
         return chroma
     factor_x, factor_y = -(-width // chroma.shape[1]), -(-height // chroma.shape[0])
+    if factor_x == 2 and not centred:
+        right = cv2.copyMakeBorder(chroma[:, 1:], 0, 0, 0, 1, cv2.BORDER_REPLICATE)
+        between = cv2.addWeighted(chroma, 0.5, right, 0.5, 0.0)
+        chroma, factor_x = cv2.merge([chroma, between]).reshape(len(chroma), -1), 1
     size = (chroma.shape[1] * factor_x, chroma.shape[0] * factor_y)
     return np.ascontiguousarray(cv2.resize(chroma, size, interpolation=cv2.INTER_LINEAR)[:height, :width])
 
 
-def to_gray(frame: Any) -> NDArray[np.uint8]:
-    """Luma (h, w) of a decoded PyAV frame, scaled to the full range."""
+def to_gray(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
+    """Luma (h, w) of a decoded PyAV frame, scaled to the full range; centred: of the chroma, which is not used."""
+    del centred
     if frame.format.is_rgb:
         return cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
     if frame.format.name not in PLANAR_8BIT:

@@ -81,8 +81,15 @@ class FrameFacts:
     """What deblurring was expected to gain."""
     noise_levels: float | None = None
     deblurred: bool = False
+    straightened: bool = False
     valid_px: tuple[int, int, int, int] | None = None
     """x0, y0, x1, y1 of the real data in the restored picture; beyond them the edge is repeated."""
+
+    @property
+    def done(self) -> str:
+        """What became of the frame, in words."""
+        steps = [name for name, was in (("deblurred", self.deblurred), ("straightened", self.straightened)) if was]
+        return " and ".join(steps) if self.state == "restored" and steps else STATE_WORDS[self.state]
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,17 +301,32 @@ def _run_view(run: RunRecord) -> dict[str, Any]:
 
 def run_verdict(counts: Mapping[str, int], verdict: str, frames: Sequence[FrameFacts]) -> Verdict:
     """The run in words."""
-    total, restored = sum(counts.values()), counts["restored"]
+    total, restored = sum(counts[state] for state in STATES), counts["restored"]
+    deblurred = counts.get("deblurred", sum(facts.deblurred for facts in frames))
     rest = ", ".join(f"{counts[s]} {STATE_WORDS[s]}" for s in ("copied", "skipped", "failed") if counts[s])
     if not restored:
         level, headline = "poor", "No frame was restored"
-    elif restored == total:
-        level, headline = "good", f"All {total} frames restored" if total > 1 else "The frame was restored"
     else:
-        level, headline = "poor" if counts["failed"] else "fair", f"{restored} of {total} frames restored"
+        level = "good" if restored == total else "poor" if counts["failed"] else "fair"
+        only = restored - deblurred
+        parts = [f"{deblurred} of {total} {_frames(total)} deblurred"] if deblurred else []
+        parts += [f"{only}{'' if deblurred else f' of {total} {_frames(total)}'} only straightened"] if only else []
+        headline = ", ".join(parts)
     words = [f"{rest}." if rest else ""]
     words += [f"{verdict[:1].upper()}{verdict[1:]}." if verdict != "restored" and not restored else ""]
     return Verdict(level, headline, " ".join(filter(None, [*words, _motion_words(frames)])))
+
+
+def _frames(count: int) -> str:
+    return "frame" if count == 1 else "frames"
+
+
+def count_words(counts: Mapping[str, int]) -> str:
+    """What became of how many frames, in a line: those that were deblurred first, then those only straightened."""
+    deblurred = counts.get("deblurred", 0)
+    parts = {"deblurred": deblurred, "only straightened": counts.get("restored", 0) - deblurred}
+    parts |= {STATE_WORDS[state]: counts.get(state, 0) for state in STATES[1:]}
+    return ", ".join(f"{count} {words}" for words, count in parts.items() if count)
 
 
 def _motion_words(frames: Sequence[FrameFacts]) -> str:
@@ -322,7 +344,7 @@ def _motion_words(frames: Sequence[FrameFacts]) -> str:
 
 def _shares(counts: Mapping[str, int]) -> tuple[Stretch, ...]:
     """The counts as parts of a bar."""
-    total, start, parts = max(sum(counts.values()), 1), 0, []
+    total, start, parts = max(sum(counts[state] for state in STATES), 1), 0, []
     for state in STATES:
         parts.append(Stretch(state, start / total, counts[state] / total))
         start += counts[state]

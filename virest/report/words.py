@@ -84,6 +84,8 @@ CAMERA_KEYS = (
     ("scene", "depth_m"),
 )
 """Places of a profile that the page shows in any case."""
+DEFAULTS = {"gyro_bias_rad_s": [0.0, 0.0, 0.0], "clock_skew": 0.0, "exposure_scale": 1.0}
+"""Values that a profile has without stating them: nobody can tell who gave them."""
 SHOWN_COMPONENTS = 4
 
 Mapped = Mapping[str, Any]
@@ -170,7 +172,8 @@ def _inside(mapping: Any, keys: Sequence[str]) -> Any:
 def _camera_value(name: str, value: Any, estimate: Any, profile_source: str) -> CameraValue:
     title = PARAMETER_WORDS.get(name, name)
     if not isinstance(estimate, Mapping):
-        source = "not known" if value is None else f"given by {profile_source}"
+        given = f"given by {profile_source}" if value != DEFAULTS.get(name) else f"{profile_source}, or the default"
+        source = "not known" if value is None else given
         return CameraValue(title, with_deviation(name, value).replace("_", " "), source, False)
     text = with_deviation(name, estimate.get("value"), estimate.get("std"))
     return CameraValue(title, text, str(estimate.get("source") or "estimated"), True)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +18,18 @@ LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
 """Part of what is not clipped that lies clear of clipped light, from which on restoring begins, and is all taken;
 seen over so many pixels and the path to both sides."""
 
+PLACES = 4
+"""Parts of the picture each way whose own blur path is used."""
+TOUCHED = 2e-3
+"""Part of the light of a path that counts as touching."""
+
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:
     """1 where the blur path touches clipped light, falling to 0 over a path's length beyond; None: nothing clipped."""
     holes = blurred.holes
     if holes is None:
         return None
-    touched = cv2.dilate(holes.astype(np.uint8), _path_reach(blurred))
+    touched = _along_paths(holes.astype(np.uint8), blurred, cv2.dilate)
     side = 2 * int(np.ceil(blurred.longest_px / 2 + CODEC_REACH_PX)) + 1
     around = cv2.dilate(touched, np.ones((side, side), np.uint8)).astype(np.float32)
     return cv2.blur(around, (side, side))
@@ -62,10 +71,9 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     """1 where a channel's light is censored, dark or clipped, with all its neighbours along the path; None: nowhere."""
     if all(mask is None for mask in (*blurred.dark, *blurred.clipped)):
         return [None] * len(blurred.light)
-    reach = _path_reach(blurred)
     masks: list[NDArray[np.uint8] | None] = []
     for pair in zip(blurred.dark, blurred.clipped, strict=True):
-        eroded = [cv2.erode(mask.astype(np.uint8), reach) for mask in pair if mask is not None]
+        eroded = [_along_paths(mask.astype(np.uint8), blurred, cv2.erode) for mask in pair if mask is not None]
         masks.append(np.maximum.reduce(eroded) if eroded else None)
     return masks
 
@@ -89,8 +97,29 @@ def unseen_kept(sharp: LevelsOfRows, recorded: NDArray[np.uint8], blurred: Blurr
     return kept
 
 
-def _path_reach(blurred: BlurredPicture) -> NDArray[np.uint8]:
-    """The blur path at the picture's middle, to both sides, as a structuring element."""
-    height, width = blurred.light[0].shape
-    path = blurred.field(np.array([[(width - 1) / 2, (height - 1) / 2]])).arrays(positive=True)[0]
-    return (path + path[::-1, ::-1] > 2e-3).astype(np.uint8)
+def _along_paths(
+    mask: NDArray[np.uint8], blurred: BlurredPicture, operation: Callable[[Any, Any], Any]
+) -> NDArray[np.uint8]:
+    """A mask (height, width) dilated or eroded along the blur path of each place, to both sides.
+
+    Paths change over a picture by the rows' times and the lens: each of PLACES x PLACES parts takes that of its middle.
+    Parts in which the mask is the same all over, with the path's length around them, stay as they are.
+    """
+    height, width = mask.shape
+    rows, columns = (np.linspace(0, length, PLACES + 1).astype(int) for length in (height, width))
+    parts = [
+        (slice(top, bottom), slice(left, right))
+        for top, bottom in pairwise(rows.tolist())
+        for left, right in pairwise(columns.tolist())
+    ]
+    middles = [[(c.start + c.stop - 1) / 2, (r.start + r.stop - 1) / 2] for r, c in parts]
+    paths = blurred.field(np.array(middles)).arrays(positive=True)
+    found, margin = mask.copy(), len(paths[0])
+    for (r, c), path in zip(parts, paths, strict=True):
+        top, left = max(r.start - margin, 0), max(c.start - margin, 0)
+        around = mask[top : r.stop + margin, left : c.stop + margin]
+        if around.size and around.min() < around.max():
+            reach = (path + path[::-1, ::-1] > TOUCHED).astype(np.uint8)
+            inner = slice(r.start - top, r.stop - top), slice(c.start - left, c.stop - left)
+            found[r, c] = operation(around, reach)[inner]
+    return found

@@ -428,7 +428,7 @@ def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> 
         return plan
     if not estimate.determined:
         warning = f"time offset not determined ({estimate.reason})"
-        plan = replace(plan, profile=replace(plan.profile, time_offset_s=0.0), warnings=(*plan.warnings, warning))
+        plan = replace(plan, warnings=(*plan.warnings, warning))
         return plan if plan.copy_reason else replace(plan, copy_reason="time offset not determined: virest calibrate")
     offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
     profile = plan.profile.with_estimate(

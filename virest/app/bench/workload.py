@@ -170,10 +170,12 @@ def _shortened(workload: Workload, frames: int) -> Workload:
 
 
 def simulated(work: Path, name: str, **options: Any) -> Path:
-    """Simulate a capture below ``work``; one of that name is used again."""
+    """Simulate a capture below ``work``; one of that name that was made of the same options is used again."""
     folder = work / "captures" / name
-    if not folder.is_dir():
-        simulate_command(folder, **options)
+    made_of = folder.with_name(f".{name}.options")
+    if not (folder.is_dir() and made_of.is_file() and made_of.read_text(encoding="utf-8") == repr(options)):
+        simulate_command(folder, overwrite=folder.is_dir(), **options)
+        made_of.write_text(repr(options), encoding="utf-8")
     return folder
 
 

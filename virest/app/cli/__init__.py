@@ -100,8 +100,10 @@ def _hide_types(command: Any) -> None:
 def run(arguments: list[str] | None = None) -> int:
     """Run one command and turn whatever happens into an exit code."""
     command = program()
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    go_on = "; finished work is kept, --resume continues from there" if "process" in words[:1] else ""
     try:
-        with command.make_context("virest", list(sys.argv[1:] if arguments is None else arguments)) as context:
+        with command.make_context("virest", list(words)) as context:
             code = command.invoke(context)
         return code if isinstance(code, int) else 0
     except typer.Exit as leaving:
@@ -110,10 +112,10 @@ def run(arguments: list[str] | None = None) -> int:
         _report_usage(error)
         return USAGE
     except _Terminated:
-        console.CONSOLE.line("terminated; finished work is kept, --resume continues from there")
+        console.CONSOLE.line(f"terminated{go_on}")
         return TERMINATED
     except (KeyboardInterrupt, typer.Abort):
-        console.CONSOLE.line("interrupted; finished work is kept, --resume continues from there")
+        console.CONSOLE.line(f"interrupted{go_on}")
         return INTERRUPTED
     except BrokenPipeError:
         console.silence_stdout()

@@ -33,6 +33,8 @@ FAR_PX = 3.0
 """A common shift beyond this is taken out before the fits, in reduced pixels: tiles then show the same again."""
 RIVAL_PEAK = 0.8
 """Of two agreements nearly as good the one nearer to the prediction is taken: periodic texture has many."""
+CLIPPED_LIGHT = 0.95
+"""Tiles with brighter places are not judged: light that was clipped cannot be blurred again."""
 LEAST_COHERENCE = 0.5
 """Tiles whose spectra agree less, Σ|Re A*B| over Σ|A||B|, show different things."""
 HUBER = 1.5
@@ -142,8 +144,9 @@ def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Ima
     kernels = _kernel_spectra(view, tops_lefts, times)
     if kernels is None:
         return None
-    b = _spectra(_seen(view, second, tops_lefts, np.zeros(2), times))
-    left, used = [], np.ones(len(tops_lefts), bool)
+    there = _seen(view, second, tops_lefts, np.zeros(2), times)
+    b, left = _spectra(there), []
+    used = np.maximum(_cut(first, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT
     for picture in (first, sharp):
         a = _spectra(_cut(picture, tops_lefts)) * kernels[1]
         shift, precision = _tile_shifts(a, b, np.zeros(2))

@@ -1,0 +1,170 @@
+"""Frames and their neighbours: where the picture really moved, what deblurring gains, and frames restored together."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from virest.app.evaluation_captures import TrueCapture, open_true_capture
+from virest.app.simulate import simulate_command
+from virest.evaluation.fidelity import psnr_db
+from virest.motion.integration import integrate_gyro
+from virest.motion.optics import moving_lens
+from virest.restoration.capture import RestorationPlan, restore_frames
+from virest.restoration.neighbours.sights import Sight, light_of, turn_between, with_neighbours
+from virest.restoration.settings import PRESETS
+from virest.simulation.phone_isp import PhoneIsp
+
+SIZE = {"width": 320, "height": 384, "focal_px": 350.0, "exposure_ms": 14.0, "rate_rad_s": 1.4, "frames": 8}
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., TrueCapture]:
+    """A small shaken capture with truth; options as simulate_command takes them, and ``config``."""
+    made: dict[str, Path] = {}
+
+    def make(config: bool = False, **options: object) -> TrueCapture:
+        key = repr(sorted(options.items(), key=str))
+        if key not in made:
+            made[key] = tmp_path_factory.mktemp("neighbours") / "shaken"
+            simulate_command(made[key], **{**SIZE, "seed": 31, **options})  # type: ignore[arg-type]
+        folder = made[key]
+        return open_true_capture(folder, folder / "truth" / "camera.yaml" if config else None)
+
+    return make
+
+
+def _gains(capture: TrueCapture, plan: RestorationPlan) -> np.ndarray:
+    """PSNR of each frame by a plan over straightening alone by the same plan."""
+    alone = replace(plan, settings=replace(plan.settings, deblur="none"))
+    base = {r.frame.index: r for r in capture.restored(alone)}
+    found = []
+    for restored in capture.restored(plan):
+        number = restored.frame.index
+        truth, valid = capture.truth(number), base[number].valid_px
+        found.append(psnr_db(restored.picture, truth, valid) - psnr_db(base[number].picture, truth, valid))
+    return np.array(found)
+
+
+def test_a_turn_that_the_profile_lacks_is_measured_between_two_frames(simulated):
+    """An added turn rate comes back with its sign, within four deviations, from frames that are blurred."""
+    capture = simulated()
+    plan = capture.plan(replace(PRESETS["fast"], deblur="none"))
+    motions, pictures = capture.motions(plan), dict(capture.recorded())
+    trajectory = integrate_gyro(capture.capture.imu, plan.profile)
+    lens = moving_lens(trajectory, plan.profile)
+    frames = sorted(pictures, key=lambda frame: frame.index)
+    sights = [Sight(f, pictures[f], motions[f.index]) for f in frames[2:4]]
+    true = turn_between(*sights, *map(light_of, sights), trajectory, lens)
+    rate = np.array([0.11, -0.07, 0.16])
+    wrong = replace(plan.profile, gyro_bias_rad_s=tuple(-plan.profile.rotation_cam_imu.T @ rate))
+    wrongly = integrate_gyro(capture.capture.imu, wrong)
+    told = turn_between(*sights, *map(light_of, sights), wrongly, moving_lens(wrongly, wrong))
+    assert true is not None and told is not None
+    deviations = np.sqrt(np.diag(told.covariance))
+    assert np.all(np.abs(true.rate_rad_s) < 4 * np.sqrt(np.diag(true.covariance)))
+    assert np.all(np.abs(told.rate_rad_s + rate) < 4 * deviations)
+    assert np.all(deviations < 0.05)
+
+
+def test_a_right_prediction_is_left_as_it_is(simulated):
+    """Where neighbours agree with the gyroscope nothing is corrected."""
+    assert simulated().plan(PRESETS["fast"]).missing_turn is None
+
+
+@pytest.mark.scenario
+@pytest.mark.parametrize(
+    "isp",
+    [PhoneIsp(offset_s=0.004), PhoneIsp(gyro_lowpass_hz=25.0, gyro_noise=0.001, tone=0.3, sharpen=0.5)],
+    ids=["offset", "processed"],
+)
+def test_frames_are_corrected_by_their_neighbours(simulated, isp):
+    """What no profile says spoils no frame, and deblurring gains where it would lose as predicted."""
+    capture = simulated(isp=isp)
+    plan = capture.plan(PRESETS["balanced"])
+    assert plan.missing_turn is not None
+    gains = _gains(capture, plan)
+    uncorrected = _gains(capture, replace(plan, missing_turn=None, settings=replace(plan.settings, neighbours=0)))
+    assert gains.min() > -0.1
+    assert gains.mean() > uncorrected.mean() + 0.3
+
+
+@pytest.mark.scenario
+def test_frames_restored_together_are_better_than_each_alone(simulated):
+    """Neighbours blurred along other paths bring back what a frame's own path cancels; none makes a frame worse."""
+    capture = simulated()
+    plan = capture.plan(PRESETS["balanced"])
+    single = _gains(capture, replace(plan, settings=replace(plan.settings, neighbours=0)))
+    joint = _gains(capture, plan)
+    assert np.all(joint > single - 0.1)
+    assert joint.mean() > single.mean() + 0.5
+
+
+def test_a_neighbour_that_shows_something_else_is_left_out(simulated):
+    """A picture of another scene in a neighbour's place takes nothing away from the frame."""
+    capture = simulated()
+    plan = replace(capture.plan(PRESETS["balanced"]), confirmed=None)
+    frames = list(capture.recorded())
+    foreign = frames[0][1][::-1, ::-1].copy()
+    mixed = [(frame, picture if k != 4 else foreign) for k, (frame, picture) in enumerate(frames)]
+    alone = next(restore_frames([frames[3]], capture.capture.imu, plan))
+    beside = next(restore_frames(mixed[3:5], capture.capture.imu, plan, {frames[3][0].index}))
+    truth = capture.truth(frames[3][0].index)
+    assert psnr_db(beside.picture, truth, alone.valid_px) > psnr_db(alone.picture, truth, alone.valid_px) - 0.1
+
+
+def test_a_frame_does_not_depend_on_how_the_movie_is_cut(simulated):
+    """The bytes of a frame are the same from the whole movie and from its neighbours alone."""
+    capture = simulated()
+    plan = capture.plan(PRESETS["balanced"])
+    frames = list(capture.recorded())
+    whole = {r.frame.index: r for r in restore_frames(frames, capture.capture.imu, plan)}
+    number = frames[4][0].index
+    part = list(restore_frames(frames[4 - plan.reach : 5 + plan.reach], capture.capture.imu, plan, {number}))
+    assert [r.frame.index for r in part] == [number]
+    np.testing.assert_array_equal(part[0].picture, whole[number].picture)
+    assert part[0].parameters["deblur"] == whole[number].parameters["deblur"]
+
+
+def test_a_promise_that_no_neighbour_confirms_is_null(simulated):
+    """A single picture has no confirmed gain; a movie's frames have one with its deviation."""
+    capture = simulated()
+    plan = capture.plan(PRESETS["fast"])
+    confirmed = [r.parameters["deblur"] for r in capture.restored(plan)]
+    alone = [r.parameters["deblur"] for r in capture.restored(replace(plan, confirmed=None))]
+    deblurred = [d for d in confirmed if d["method"] != "none"]
+    assert deblurred and all(d["expected_gain_db"] > 0 and d["expected_gain_std_db"] >= 0 for d in deblurred)
+    assert all(d["expected_gain_db"] is None for d in alone if d["method"] != "none")
+
+
+def test_nothing_is_deblurred_where_neighbours_see_no_gain(simulated):
+    """A share of nothing leaves every frame undeblurred, and the log gives the figure."""
+    capture = simulated()
+    plan = capture.plan(PRESETS["fast"])
+    assert plan.confirmed is not None
+    refused = list(capture.restored(replace(plan, confirmed=replace(plan.confirmed, share=0.0))))
+    assert all(r.parameters["deblur"]["method"] == "none" for r in refused)
+    assert any("0.00 dB" in text for r in refused for text in r.warnings)
+
+
+@pytest.mark.parametrize("reach", [0, 1, 3])
+def test_each_frame_comes_once_with_those_around_it(reach):
+    """Windows are cut at both ends and lose no frame."""
+    sights = [Sight(None, np.zeros((k + 1, 1), np.uint8), None) for k in range(6)]  # type: ignore[arg-type]
+    seen = [([len(s.picture) for s in b], len(h.picture), [len(s.picture) for s in a])
+            for b, h, a in with_neighbours(sights, reach)]  # fmt: skip
+    assert [here for _, here, _ in seen] == [1, 2, 3, 4, 5, 6]
+    assert all(before == list(range(max(here - reach, 1), here)) for before, here, _ in seen)
+    assert all(after == list(range(here + 1, min(here + reach, 6) + 1)) for _, here, after in seen)
+
+
+@pytest.mark.scenario
+@pytest.mark.parametrize(("rate", "exposure_ms"), [(0.3, 5.0), (1.5, 8.0)], ids=["gentle", "fast"])
+def test_a_known_defocus_never_spoils_a_frame(simulated, rate, exposure_ms):
+    """A Gaussian passes next to nothing at high frequencies: what is recorded there is no picture (once: -20 dB)."""
+    capture = simulated(True, effects=["defocus=1.8"], rate_rad_s=rate, exposure_ms=exposure_ms)
+    gains = _gains(capture, capture.plan(replace(PRESETS["balanced"], neighbours=0)))
+    assert gains.min() > -0.1
+    assert gains.mean() > 0.5
