@@ -133,6 +133,14 @@ def test_an_import_never_replaces_what_is_not_its_own(tmp_path: Path) -> None:
     assert json.loads(json.dumps((tmp_path / "out" / "notes.txt").read_text())) == "mine"
 
 
+@pytest.mark.parametrize("kind", ["ros1", "ros2"])
+def test_a_bag_in_place_of_a_capture_says_what_to_do(tmp_path: Path, kind: str) -> None:
+    """The command that unpacks it is named."""
+    with pytest.raises(CaptureError) as caught:
+        read_capture(write_bag(tmp_path / "walk", kind, "rgb8"))
+    assert "virest import" in str(caught.value)
+
+
 def test_wrong_topics_and_damaged_bags_are_one_line(tmp_path: Path) -> None:
     """A topic that is not there is answered by those that are; what is not a bag is said to be none."""
     bag = write_bag(tmp_path / "walk", "ros1", "rgb8")

@@ -96,9 +96,7 @@ def _notes(facts: Json) -> list[str]:
     """What would be slow or fail, and why."""
     notes = []
     if facts["cores"] == 1:
-        notes.append(
-            "one core: frames are restored one after the other; --preset fast is about 24 times as fast as best"
-        )
+        notes.append("one core: frames are restored one after the other; --preset fast is many times as fast as best")
     memory = facts["memory_bytes"]
     if memory is not None and facts["cores"] * PER_WORKER_BYTES > 0.8 * memory:
         jobs = max(int(0.8 * memory / PER_WORKER_BYTES), 1)

@@ -19,11 +19,16 @@ from virest.app.outputs import write_whole
 from virest.app.pictures import compact
 from virest.app.simulate import simulate_command
 from virest.diagnosis.catalogue import CATALOGUE
-from virest.diagnosis.findings import BLUR, GEOMETRY, PHOTOMETRY
+from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.ladder import diagnose_capture
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 11
-EVIDENCE = {GEOMETRY: "tracked points", PHOTOMETRY: "brightness along tracks", BLUR: "blur of image regions"}
+EVIDENCE = {
+    GEOMETRY: "tracked points",
+    PHOTOMETRY: "brightness along tracks",
+    BLUR: "blur of image regions",
+    EDGES: "edges",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +68,7 @@ CASES: dict[str, Case] = {
     "vignetting": Case("0.3", "points that darken towards the corners"),
     "flicker": Case("0.15,100", "bright and dark bands across the rows, moving from frame to frame"),
     "gain_drift": Case("0.03", "frames that are brighter or darker than exposure × ISO says"),
+    "sharpening": Case("0.9,1.2", "overshoot beside edges: the phone sharpens; blur paths stay as predicted"),
     "defocus": Case("1.6", "blur that is as strong along the motion as across it"),
 }
 

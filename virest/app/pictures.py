@@ -16,19 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.app import api
 from virest.app.console import emit
 from virest.app.outputs import write_whole
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
-from virest.capture.folder import Capture, read_capture, resolve_profile
-from virest.capture.video import probe_movie, read_frames
+from virest.capture.folder import Capture
 from virest.degradation.blur import tile_grid
 from virest.degradation.kernels import blur_chords, kernel_field
 from virest.degradation.row_motion import row_motion
 from virest.motion.integration import integrate_gyro
 from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_figure
-from virest.restoration.capture import RestorationPlan, restore_frames
-from virest.restoration.settings import PRESETS
 
 Picture = NDArray[np.uint8]
 COLOURS = 192
@@ -95,15 +93,13 @@ def _board(work: Path) -> _Shot:
 
 
 def _shot(folder: Path, frame: int) -> _Shot:
-    capture = read_capture(folder)
-    profile = resolve_profile(capture)[0]
-    plan = RestorationPlan(profile, PRESETS["best"])
-    index, picture = next(read_frames(capture.movie, probe_movie(capture.movie), frame, frame))
-    restored = next(restore_frames([(capture.frames[index], picture)], capture.imu, plan)).picture
+    capture = api.open(folder)
+    restored = capture.restore(frame, "best").picture
     truth = cv2.imread(str(folder / "truth" / "frames" / f"{frame:06d}.png"))
-    if picture is None or restored is None or truth is None:
+    if restored is None or truth is None:
         raise RuntimeError(f"{folder}: frame {frame} was not restored")
-    return _Shot(capture, profile, frame, picture, restored, np.ascontiguousarray(truth[..., ::-1]))
+    sharp = np.ascontiguousarray(truth[..., ::-1])
+    return _Shot(capture.record, capture.profile, frame, capture.read_frame(frame), restored, sharp)
 
 
 def _before_after(shot: _Shot, side: int = 330, corner: tuple[int, int] = (600, 352)) -> bytes:

@@ -21,7 +21,7 @@ from virest.app.finish import FinishWishes
 from virest.app.jobs import PictureWishes, prepare_worker
 from virest.app.outputs import Mode, RunFolder, check_run, file_facts, plain
 from virest.camera.profile import CameraProfile, profile_mapping
-from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
+from virest.capture.folder import Capture, Frame, read_capture, resolve_profile, unpack_hint
 from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
@@ -191,7 +191,8 @@ def _require_capture(path: str) -> None:
         what = "is not a folder" if place.exists() else "no such folder"
     except (OSError, ValueError) as fault:  # a name too long, an address that does not answer
         what = getattr(fault, "strerror", None) or str(fault)
-    raise CaptureError(f"{shown(path)}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
+    hint = unpack_hint(path) or "pass the folder that holds movie.mp4 and the sensor logs"
+    raise CaptureError(f"{shown(path)}: {what}", hint=hint)
 
 
 def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> Job:

@@ -35,6 +35,7 @@ from virest.capture.opencamera_sensors import is_opencamera_sensors, read_openca
 from virest.capture.picture_folder import IMU_FILES, read_picture_folder
 from virest.capture.pictures import MOVIE_SUFFIXES, find_picture_source
 from virest.capture.records import Note
+from virest.capture.rosbag import is_bag
 from virest.capture.sensor_logger import is_sensor_logger, read_sensor_logger
 from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source, list_names
 from virest.capture.stray_scanner import is_stray_scanner, read_stray_scanner
@@ -58,6 +59,8 @@ def choose_reader(folder: Path) -> Reader:
     reader = _choose(folder, set(names))
     if reader is not None:
         return reader
+    if is_bag(folder):
+        raise CaptureError(f"{folder.name}: is a ROS 2 bag", hint="unpack it first: virest import BAG FOLDER")
     shown = ", ".join(names[:6]) or "nothing"
     text = f"{folder.name}: holds no {MOVIE} and no {GYRO} (but {shown})"
     raise CaptureError(text, hint=HINT)

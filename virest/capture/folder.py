@@ -30,6 +30,7 @@ from virest.capture.join import (
 from virest.capture.location import locate
 from virest.capture.profile_source import default_profile, resolve_profile
 from virest.capture.records import NO_STAMP, STALL, STARTUP, Capture, CaptureMetadata, Frame, Note
+from virest.capture.rosbag import ENDINGS as BAG_ENDINGS
 from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source
 from virest.capture.tables import GyroTable, MetadataTable, StampTable
 from virest.capture.video import read_gray
@@ -127,6 +128,11 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     )
 
 
+def unpack_hint(path: str | Path) -> str:
+    """What to do with a bag that was given in place of a capture; empty for anything else."""
+    return "unpack it first: virest import BAG FOLDER" if str(path).lower().endswith(BAG_ENDINGS) else ""
+
+
 def require_folder(path: Path) -> Path:
     """The folder, resolved, so that `.` has a name. Raises CaptureError if it is missing or no folder."""
     try:
@@ -138,7 +144,7 @@ def require_folder(path: Path) -> Path:
     except (OSError, RuntimeError, ValueError) as fault:
         reason = getattr(fault, "strerror", None) or str(fault)
         raise CaptureError(f"{path}: {reason}", hint="check the path and its links") from None
-    raise CaptureError(f"{path}: is not a folder", hint="pass the folder that holds movie.mp4")
+    raise CaptureError(f"{path}: is not a folder", hint=unpack_hint(path) or "pass the folder that holds movie.mp4")
 
 
 def _note_movie(files: Source, notes: list[Note]) -> None:
