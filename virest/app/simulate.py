@@ -13,6 +13,7 @@ from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure
 from virest.simulation.effects import EffectContext, hide_effects
+from virest.simulation.hidden import NOTHING, Hidden
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import Session, SessionSettings, nominal_camera, plan_session
 
@@ -50,6 +51,7 @@ def simulate_command(
     reference: str = "exposure-start",
     overwrite: bool = False,
     profile: CameraProfile | None = None,
+    hidden: Hidden = NOTHING,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Simulate a recording and write it to ``out``; returns a summary for ``--json``.
@@ -61,6 +63,7 @@ def simulate_command(
     upright picture and top_to_bottom for one on its side, unless given.  depth_m: distance of the scene's plane, None
     for infinity.
     effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), hidden from everything but ``truth/``.
+    hidden: effects that have no name, for tests.
     reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  profile: use this camera as the nominal
     one; width, height, focal_px, distortion, readout_ms, direction and response are then taken from it.
     """
@@ -94,7 +97,7 @@ def simulate_command(
     )
     context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
     true, applied = hide_effects(nominal, list(effects), context)
-    session = plan_session(nominal, true, settings)
+    session = plan_session(nominal, true, settings, hidden=hidden)
     options = RecordingOptions(layout, clock, bitrate_bits_per_px, crf, middle_truth=reference == "frame-middle")
     folder = write_recording(
         session, Path(out), applied=applied, options=options, overwrite=overwrite, progress=progress

@@ -26,6 +26,8 @@ from virest.restoration.frame import (
 )
 from virest.restoration.settings import RestorationSettings
 
+UNTRUSTED = "the inertial log does not follow the camera"
+BRIDGE_SLACK_S = 1e-3
 FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
 
 
@@ -81,12 +83,31 @@ def restore_frames(
         if outside:
             yield RestoredFrame(frame, "skipped", None, (outside[1],), parameters=unknown_parameters(profile))
             continue
+        if plan.copy_reason is None and (where := untrusted_part(profile, motion.start_s, end_s)) is not None:
+            said = degradation_parameters(motion, trajectory, plan.settings)
+            yield copied_frame(frame, picture, profile, f"{UNTRUSTED} from {where[0]:.3f} to {where[1]:.3f} s", said)
+            continue
         if plan.copy_reason:
             said = degradation_parameters(motion, trajectory, plan.settings)
             yield copied_frame(frame, picture, profile, plan.copy_reason, said)
             continue
         seen = None if plan.contradicted is None else moved(plan.contradicted)
         yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen)
+
+
+def unbridged(profile: CameraProfile) -> tuple[tuple[float, float], ...]:
+    """Stretches of the inertial log that are not trusted and that no field of the rate over time bridges."""
+    bridges = [f.knots[0] for f in profile.fields if f.kind == "rate" and f.covariates == ("time",)]
+    return tuple(
+        (start, end)
+        for start, end in profile.imu_untrusted_s
+        if not any(knots[0] <= start + BRIDGE_SLACK_S and knots[-1] >= end - BRIDGE_SLACK_S for knots in bridges)
+    )
+
+
+def untrusted_part(profile: CameraProfile, start_s: float, end_s: float) -> tuple[float, float] | None:
+    """The first stretch without a bridge that a frame's rows [start_s, end_s] reach into; None: there is none."""
+    return next((part for part in unbridged(profile) if start_s < part[1] and end_s > part[0]), None)
 
 
 def moved_over_frame(

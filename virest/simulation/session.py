@@ -22,6 +22,7 @@ from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
+from virest.simulation.hidden import NOTHING, Hidden, gyro_reading
 from virest.simulation.scenes import Scene, make_scene
 from virest.simulation.sensor import eight_bit, grey_of_light, sensor_light
 
@@ -99,6 +100,8 @@ class Session:
     """(captures,) stamp of every capture from stamp_0, camera clock; None: even, at the settings' frame rate."""
     recorded_imu: ImuLog | None = None
     """Samples of a phone, to be written as they are; None: worked out from the motion."""
+    hidden: Hidden = NOTHING
+    """Effects that no profile names."""
 
     def logged_exposure_s(self, capture: int) -> float:
         """Exposure that the log gives for a capture."""
@@ -170,6 +173,7 @@ def plan_session(
     *,
     scene: Scene | None = None,
     motion: HandMotion | None = None,
+    hidden: Hidden = NOTHING,
 ) -> Session:
     """Draw scene and motion (unless given) and lay out the times. The same seed gives the same session."""
     _require_sizes(true, settings)
@@ -198,9 +202,12 @@ def plan_session(
     base_ns = 1_000 * int(np.random.default_rng([settings.seed, 2]).integers(40_000_000_000, 60_000_000_000))
     ticks = np.array([_stamp_tick(k, settings.fps) for k in range(settings.frames)])
     stamps = base_ns + np.array([round(_stamp_s(k, settings.fps) * 1e9) for k in range(settings.frames)])
-    view = make_view(true, motion, rest_s=span[0])
+    view = make_view(true, motion, rest_s=span[0], hidden=hidden)
     exposures = _plan_exposures(settings, shows)
-    return Session(nominal, true, settings, scene, motion, view, ticks, stamps.astype(np.int64), shows, span, exposures)
+    return Session(
+        nominal, true, settings, scene, motion, view, ticks, stamps.astype(np.int64), shows, span, exposures,
+        hidden=hidden,
+    )  # fmt: skip
 
 
 def render_picture(session: Session, slot: int) -> Picture:
@@ -237,10 +244,12 @@ def sample_imu(session: Session) -> ImuLog:
     time_s: Array = time_ns.astype(float) * 1e-9
     rng = np.random.default_rng([settings.seed, 4])
     imu_from_cam = np.array(true.r_cam_imu).T
-    gyro = session.motion.rate_rad_s(time_s) @ imu_from_cam.T
-    gyro = gyro * true.gyro_scale + true.gyro_bias_rad_s + settings.gyro_noise_rad_s * rng.normal(size=gyro.shape)
-    force = session.motion.specific_force_m_s2(time_s, np.array(true.p_cam_imu_m), GRAVITY_WORLD_M_S2)
-    force = force @ imu_from_cam.T + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
+    rate = session.motion.rate_rad_s(time_s) @ imu_from_cam.T
+    force = session.motion.specific_force_m_s2(time_s, np.array(true.p_cam_imu_m), GRAVITY_WORLD_M_S2) @ imu_from_cam.T
+    gyro = gyro_reading(true, time_s, rate, force) + settings.gyro_noise_rad_s * rng.normal(size=rate.shape)
+    if session.hidden.gyro is not None:
+        gyro = session.hidden.gyro(time_s, gyro, force)
+    force = force + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
     return ImuLog(int(session.stamp_ns[0]) + time_ns, gyro, force)
 
 
