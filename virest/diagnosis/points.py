@@ -14,6 +14,8 @@ from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.degradation.light import flicker
 from virest.diagnosis.candidates import FarClock
+from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges
+from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
@@ -87,10 +89,18 @@ class TrackedPoints:
         return again
 
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
-        evidence = make_evidence(self.capture.imu, observed)
-        return climb(
+        doubtful = doubtful_pairs(observed, self.capture, self.start)
+        rest = observed.chosen(~doubtful.hit) if doubtful.sets_aside else observed
+        evidence = make_evidence(self.capture.imu, rest)
+        found = climb(
             evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each
         )
+        if not self.rungs_allowed:
+            return found
+        found = with_fields(found, evidence, self.capture)
+        if doubtful.sets_aside:
+            with_bridges(found, observed, doubtful, self.capture)
+        return found
 
 
 def _together(difference_px: Array, group: NDArray[np.intp]) -> float:
