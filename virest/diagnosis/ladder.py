@@ -15,6 +15,7 @@ from virest.calibration.start_up import lag_schedules
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
+from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
 from virest.diagnosis.light_values import settle_light
@@ -189,6 +190,7 @@ class _Story:
         findings = [*self.findings, *(finding for look in looks for finding in look.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         left = remaining_structure(self.geometric, self.light)
+        fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         first, observed = self.first, self.points.observed
         extended = self.curve.profile
         # a lens's lean belongs to the start of this log; a process that begins later must not have it
@@ -199,7 +201,7 @@ class _Story:
             observed.tracks, stamps,
         )  # fmt: skip
         return Diagnosis(
-            UNEXPLAINED if left.significant else EXPLAINED if findings else CONSISTENT,
+            UNEXPLAINED if left.significant else EXPLAINED if findings or fields else CONSISTENT,
             nominal,
             tuple(findings),
             left,
@@ -208,6 +210,7 @@ class _Story:
             (*self.geometric.rungs, *(rung for look in looks for rung in look.rungs)),
             {"before": residuals(first, True), "after": residuals(self.geometric, False)},
             (*self.notes, *self.geometric.notes, *(note for look in looks for note in look.notes)),
+            tuple(fields),
         )
 
 

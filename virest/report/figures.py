@@ -29,15 +29,15 @@ def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -
 
     image_format: one of FORMATS.  Returns the file's bytes.
     """
-    figure = _canvas(11.0, 7.5)
+    figure = canvas(11.0, 7.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.3, 1.0))
     _draw_curve(figure.add_subplot(grid[:, 0]), fit, title)
     _draw_residuals(figure.add_subplot(grid[0, 1]), fit)
     _draw_pictures(figure.add_subplot(grid[1, 1]), fit)
-    return _as_file(figure, image_format)
+    return as_file(figure, image_format)
 
 
-def _literal(text: str) -> str:
+def literal(text: str) -> str:
     """Text that is drawn as it stands: no formula, one line."""
     return "".join(c if c.isprintable() else "?" for c in text).replace("$", r"\$")
 
@@ -59,7 +59,7 @@ def _draw_curve(axes: Any, fit: CurveFit, title: str) -> None:
     axes.set_ylim(-5, 260)
     axes.set_xlabel("exposure, the curve's own unit")
     axes.set_ylabel("grey level")
-    axes.set_title(f"{_literal(title)}  rms {fit.rms_grey_levels:.2f} levels".strip())
+    axes.set_title(f"{literal(title)}  rms {fit.rms_grey_levels:.2f} levels".strip())
     axes.legend(loc="upper left")
 
 
@@ -88,7 +88,7 @@ def _draw_pictures(axes: Any, fit: CurveFit) -> None:
     reach = max(0.05, 1.15 * max(abs(e) for e in errors))
     axes.set_ylim(-reach, reach)
     labels = [p.file if len(p.file) <= 18 else "…" + p.file[-17:] for p in fit.pictures]
-    axes.set_xticks(range(len(errors)), [_literal(text) for text in labels], rotation=60, ha="right",
+    axes.set_xticks(range(len(errors)), [literal(text) for text in labels], rotation=60, ha="right",
                     fontsize=8)  # fmt: skip
     axes.set_ylabel("listed / true exposure, EV")
     axes.set_title("exposure error of each picture")
@@ -104,14 +104,14 @@ def comparison_figure(
 
     Pictures (h, w) or (h, w, 3) of 8 bits.  The difference is of luma, all on one scale; its rms stands above.
     """
-    figure = _canvas(11.0, 0.6 + 3.0 * len(rows))
+    figure = canvas(11.0, 0.6 + 3.0 * len(rows))
     axes = figure.subplots(len(rows), 3, squeeze=False)
     differences = [_luma(measured) - _luma(simulated) for _, measured, simulated in rows]
     reach = max(1.0, *(float(np.percentile(np.abs(d), 99)) for d in differences))
     for line, (label, measured, simulated), difference in zip(axes, rows, differences, strict=True):
         for place, picture, name in zip(line, (measured, simulated), ("measured", f"simulated, {label}"), strict=False):
             place.imshow(picture, cmap="gray", vmin=0, vmax=255)
-            place.set_title(_literal(name), fontsize=9)
+            place.set_title(literal(name), fontsize=9)
         shown = line[2].imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
         rms = float(np.sqrt(np.mean(difference**2)))
         line[2].set_title(f"measured − simulated, rms {rms:.1f} levels", fontsize=9)
@@ -119,8 +119,8 @@ def comparison_figure(
         for place in line:
             place.set_xticks([])
             place.set_yticks([])
-    figure.suptitle(_literal(title))
-    return _as_file(figure, image_format)
+    figure.suptitle(literal(title))
+    return as_file(figure, image_format)
 
 
 def residual_figure(
@@ -131,7 +131,7 @@ def residual_figure(
     before, after: covariate name → (n,), and ``x_px``, ``y_px`` (n,).
     """
     names = [name for name in COVARIATES if name in before or name in after]
-    figure = _canvas(3.4 * max(len(names), 1), 5.6)
+    figure = canvas(3.4 * max(len(names), 1), 5.6)
     axes = figure.subplots(2, max(len(names), 1), squeeze=False, sharey="row")
     for line, component in zip(axes, RESIDUALS, strict=True):
         for place, name in zip(line, names, strict=False):
@@ -143,8 +143,8 @@ def residual_figure(
         line[0].set_ylabel(f"residual along {component[0]}, px")
     if axes[0][0].get_legend_handles_labels()[0]:
         axes[0][0].legend(loc="upper right", fontsize=8)
-    figure.suptitle(_literal(title))
-    return _as_file(figure, image_format)
+    figure.suptitle(literal(title))
+    return as_file(figure, image_format)
 
 
 def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str = "png") -> bytes:
@@ -152,12 +152,12 @@ def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str 
 
     rungs: (quantity, before, {name: after}, entered or None).
     """
-    figure = _canvas(4.2 * max(len(rungs), 1), 0.9 + 0.26 * max([8, *(len(tried) for _, _, tried, _ in rungs)]))
+    figure = canvas(4.2 * max(len(rungs), 1), 0.9 + 0.26 * max([8, *(len(tried) for _, _, tried, _ in rungs)]))
     axes = figure.subplots(1, max(len(rungs), 1), squeeze=False)[0]
     for number, (place, rung) in enumerate(zip(axes, rungs, strict=False), start=1):
         _draw_rung(place, number, rung)
-    figure.suptitle(_literal(title))
-    return _as_file(figure, image_format)
+    figure.suptitle(literal(title))
+    return as_file(figure, image_format)
 
 
 def _draw_rung(axes: Any, number: int, rung: RungBars) -> None:
@@ -166,13 +166,13 @@ def _draw_rung(axes: Any, number: int, rung: RungBars) -> None:
     names = [name for _, name in known]
     colours = ["steelblue" if name == entered else "0.75" for name in names]
     axes.barh(range(len(names)), [after for after, _ in known], color=colours)
-    axes.set_yticks(range(len(names)), [_literal(name) for name in names], fontsize=8)
+    axes.set_yticks(range(len(names)), [literal(name) for name in names], fontsize=8)
     axes.invert_yaxis()
     if np.isfinite(before):
         axes.axvline(before, color="crimson", lw=1.2, label=f"before: {before:.3g}")
         axes.legend(loc="lower right", fontsize=8)
-    axes.set_xlabel(f"{_literal(quantity)}, held-out frames")
-    axes.set_title(_literal(f"{number}. {entered or 'nothing gains enough'}"), fontsize=10)
+    axes.set_xlabel(f"{literal(quantity)}, held-out frames")
+    axes.set_title(literal(f"{number}. {entered or 'nothing gains enough'}"), fontsize=10)
 
 
 def _draw_binned(axes: Any, along: Array, residual: Array, label: str, colour: str) -> None:
@@ -197,7 +197,7 @@ def _luma(picture: Picture) -> Array:
     return values if values.ndim == 2 else values @ np.array([0.299, 0.587, 0.114])
 
 
-def _canvas(width_in: float, height_in: float) -> Any:
+def canvas(width_in: float, height_in: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -206,7 +206,7 @@ def _canvas(width_in: float, height_in: float) -> Any:
     return figure
 
 
-def _as_file(figure: Any, image_format: str) -> bytes:
+def as_file(figure: Any, image_format: str) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=image_format, dpi=DPI, metadata={} if image_format == "png" else None)
     return buffer.getvalue()

@@ -27,7 +27,7 @@ LEAST_PAIRS_LEFT = 20
 MAX_P = 1e-3
 """One-sided, that points in doubtful stretches lie no further off than elsewhere."""
 LEFT_PART, LEFT_RATIO = 0.2, 1.5
-"""A bridge holds where at most this part of the excess is left, or points are off by so many times the others' noise."""
+"""A bridge holds where at most this part of the excess is left, or points are off by so many times the noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +86,7 @@ def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Do
     if good:
         _take_over(found, evidence.observed.chosen(trusted), good, model, capture)
     untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
-    profile = replace(
-        found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns
-    )  # fmt: skip
+    profile = replace(found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
     found.model = replace(found.model, profile=profile)
     found.fields.append(
         Distrusted(
@@ -99,7 +97,7 @@ def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Do
             _rms(held_out[hit]) * typical,
             rest * typical,
             profile,
-        )  # fmt: skip
+        )
     )
 
 
@@ -131,7 +129,7 @@ def _take_over(
     table = evidence.table(model, FINAL_POINTS)
     bridged = _bridged(
         evidence, model, table.chosen(touching(observed, stretches, to_imu)[table.pair]), stretches, capture
-    )  # fmt: skip
+    )
     form = bridging_form(stretches, capture.stamp_0_ns)
     whole = replace(_with_scene(evidence, bridged, table), terms=(*found.model.terms, form.term))
     fitted = fit_model(capture.imu, whole, whole.terms, table)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +153,7 @@ def _summed(name: str, design: Array, frame: Array, error: Array, of_row: Index,
     pull = np.stack([np.bincount(of_row, column * error, count) for column in own.T], axis=-1)
     order = np.argsort(of_row, kind="stable")
     edges = np.searchsorted(of_row[order], np.arange(count + 1))
-    curvature = np.stack([own[order[a:b]].T @ own[order[a:b]] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    curvature: Array = np.stack([own[order[a:b]].T @ own[order[a:b]] for a, b in pairwise(edges)])
     return _Block(name, pull, curvature, over_time)
 
 
@@ -181,4 +182,4 @@ def _held_out(entry: _Block, fold: Index) -> Array:
 
 def _solver(curvature: Array) -> Array:
     ridge = RIDGE * max(float(np.diag(curvature).max(initial=0.0)), 1e-12)
-    return np.linalg.inv(curvature + ridge * np.eye(len(curvature)))
+    return np.asarray(np.linalg.inv(curvature + ridge * np.eye(len(curvature))))

@@ -79,7 +79,7 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
                 before.rms * typical,
                 after.rms * typical,
                 fitted,
-            )  # fmt: skip
+            )
         )
         log.debug("field: %s, p %.2g, beside %s", form.name, selection.best.p_value, selection.rivals)
     if not fields:
@@ -111,8 +111,9 @@ def _asked_for(
     block = table.pair // PAIRS_IN_BLOCK
     if len(np.unique(block)) < MIN_BLOCKS:
         return None
-    own = [term for term in model.terms if term.name not in {t.name for t in ()}]
-    tangent = np.concatenate([seen.tangent(), seen.effect(own)], axis=-1) if own else seen.tangent()
+    tangent = seen.tangent()
+    if model.terms:
+        tangent = np.concatenate([tangent, seen.effect(model.terms)], axis=-1)
     designs = [(form.name, seen.effect((form.term,)), form.over_time) for form in forms]
     scored = score_forms(seen.left, seen.weight, tangent, designs, block)
     for entry in scored:

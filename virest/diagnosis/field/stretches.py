@@ -73,7 +73,7 @@ def bridging_form(stretches: Iterable[Stretch], stamp_0_ns: int) -> FieldForm:
     """Rates over time within the stretches, nought at their ends, on the axes that are not trusted."""
     fields, bases = [], []
     for stretch in stretches:
-        inner = max(int(round((stretch.to_s - stretch.from_s) / KNOT_STEP_S)), 1)
+        inner = max(round((stretch.to_s - stretch.from_s) / KNOT_STEP_S), 1)
         knots = tuple(float(t) for t in np.round(np.linspace(stretch.from_s, stretch.to_s, inner + 2), 6))
         fields.append(Field("rate", ("time",), (knots,), ((0.0,) * 3,) * len(knots), (), stamp_0_ns))
         bases.append(np.kron(np.eye(len(knots))[:, 1:-1], np.eye(3)[:, list(stretch.axes)]))
@@ -91,7 +91,7 @@ def _straight(imu: ImuSamples) -> list[Stretch]:
         return []
     least = int(np.ceil(np.log(CHANCE / len(time_s)) / np.log(chance)))
     stretches = []
-    for first, last in _runs(small.all(axis=1)):
+    for first, last in _runs(np.asarray(small.all(axis=1))):
         from_s, to_s = float(time_s[first]), float(time_s[last + 2])
         if last - first + 1 >= least and to_s - from_s >= LEAST_STRAIGHT_S:
             stretches.append(Stretch(STRAIGHT, from_s, to_s, (0, 1, 2)))
@@ -102,7 +102,7 @@ def _clipped(imu: ImuSamples, axis: int) -> list[Stretch]:
     """Runs of readings at the axis' largest value, where they pile up there."""
     size = np.abs(imu.gyro_rad_s[:, axis])
     limit = float(size.max())
-    at_limit = size >= (1 - PILE_PART) * limit
+    at_limit: Mask = np.asarray(size >= (1 - PILE_PART) * limit)
     below = int(((size >= (1 - 2 * PILE_PART) * limit) & ~at_limit).sum())
     runs = _runs(at_limit)
     longest = max((last - first + 1 for first, last in runs), default=0)
@@ -110,10 +110,14 @@ def _clipped(imu: ImuSamples, axis: int) -> list[Stretch]:
         return []
     return [
         Stretch(
-            CLIPPED, float(imu.time_s[max(first - 1, 0)]), float(imu.time_s[min(last + 1, len(size) - 1)]), (axis,), limit
+            CLIPPED,
+            float(imu.time_s[max(first - 1, 0)]),
+            float(imu.time_s[min(last + 1, len(size) - 1)]),
+            (axis,),
+            limit,
         )
         for first, last in runs
-    ]  # fmt: skip
+    ]
 
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:
