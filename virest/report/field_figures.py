@@ -1,4 +1,4 @@
-"""Pictures of fields: values with their deviations over a covariate, arrows over the picture, residuals before and after.
+"""Pictures of fields: values with their deviations, or arrows over the picture, and residuals before and after.
 
 Residuals are root mean squares of the points in equal shares of the covariate, nominal model and extended one.
 """

@@ -198,6 +198,7 @@ def _luma(picture: Picture) -> Array:
 
 
 def canvas(width_in: float, height_in: float) -> Any:
+    """An empty figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -207,6 +208,7 @@ def canvas(width_in: float, height_in: float) -> Any:
 
 
 def as_file(figure: Any, image_format: str) -> bytes:
+    """The figure as a file's bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=image_format, dpi=DPI, metadata={} if image_format == "png" else None)
     return buffer.getvalue()

@@ -150,7 +150,7 @@ def _summed(name: str, design: Array, frame: Array, error: Array, of_row: Index,
     basis = (whiten @ turn)[:, share > OWN_PART]
     own = own @ basis
     count = int(of_row.max()) + 1
-    pull = np.stack([np.bincount(of_row, column * error, count) for column in own.T], axis=-1)
+    pull: Array = np.stack([np.bincount(of_row, column * error, count) for column in own.T], axis=-1).astype(float)
     order = np.argsort(of_row, kind="stable")
     edges = np.searchsorted(of_row[order], np.arange(count + 1))
     curvature: Array = np.stack([own[order[a:b]].T @ own[order[a:b]] for a, b in pairwise(edges)])
