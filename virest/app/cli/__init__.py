@@ -12,6 +12,7 @@ import typer
 from virest.app import console
 from virest.app.cli.calibrate import calibrate
 from virest.app.cli.calibrate_curve import calibrate_curve
+from virest.app.cli.criticise import criticise
 from virest.app.cli.diagnose import diagnose
 from virest.app.cli.evaluate import evaluate
 from virest.app.cli.export import export
@@ -53,7 +54,7 @@ def _virest(version: Version = False) -> None:
     pass
 
 
-for command in (process, inspect, simulate, calibrate, diagnose, report, export):
+for command in (process, inspect, simulate, calibrate, diagnose, criticise, report, export):
     app.command()(command)
 app.command("calibrate-curve")(calibrate_curve)
 app.add_typer(evaluate, name="evaluate")

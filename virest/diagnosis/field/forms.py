@@ -200,7 +200,8 @@ def _rate_form(imu: ImuSamples, profile: CameraProfile) -> FieldForm:
     for axis, name in enumerate(RATES):
         reading = (imu.gyro_rad_s[:, axis] - profile.gyro_bias_rad_s[axis]) / profile.gyro_scale[axis]
         reach = max(float(np.abs(reading).max()), 0.1)
-        field = _zero("rate", (name,), [np.linspace(-reach, reach, RATE_KNOTS).astype(np.float64)])
+        knots = np.linspace(-1.0, 1.0, RATE_KNOTS) * reach
+        field = _zero("rate", (name,), [knots])
         at, before, after = (cardinal_weights(field.knots[0], r) for r in (0.0, -0.01 * reach, 0.01 * reach))
         own = np.zeros((3, 1))
         own[axis] = 1.0

@@ -33,7 +33,7 @@ MIN_T = 3.0
 """Least ratio of the held-out gain to its standard error."""
 RIVAL_T = 2.0
 """Forms whose gains differ by less than this many standard errors cannot be told apart."""
-ALIKE_PART = 0.8
+ALIKE_PART = 0.9
 """Nor can one that gains this part of the best's gain be ruled out: its covariate goes together with the best's."""
 MIN_STABLE = 0.7
 """Least part of the draws in which the form, or one that cannot be told from it, is the best."""

@@ -22,6 +22,9 @@ ALIKE = 0.95
 """Part of a field's variance that a shape must explain to name it."""
 STEP_SPAN, STEP_PART = 0.25, 0.8
 """A step: this part of the change within this part of the range."""
+SHAPE_PART = 0.9
+"""The same for a displacement over the picture."""
+OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
 SAMPLES = 101
 INERTIAL = "inertial_rows"
 
@@ -88,7 +91,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     factor, unit = UNIT_SCALES[form.kind]
     said = f"{size * factor:.3g} {unit}"
     sentence = pattern.sentence.format(
-        size=said, shape=shape, where=_where(fields[0]), lateness=_lateness(fields[0]), lens=_lens_words(shape)
+        size=said, shape=shape, where=_where(fields[0]), lateness=_lateness(fields[0]), lens=lens_words(shape)
     )
     rms = f" (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out)"
     beside = f"; in this capture {' and '.join(entry.rivals)} would explain it as well" if entry.rivals else ""
@@ -162,10 +165,13 @@ def shape_of(field: Field) -> str:
         return _shape_over_picture(field)
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     values = field.at(along)
-    curve = values[:, int(np.argmax(np.ptp(values, axis=0)))]
+    return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates == ("time",))
+
+
+def curve_shape(curve: Array, over_time: bool = False) -> str:
+    """What a curve (SAMPLES,) at even steps of its covariate does."""
     u = np.linspace(-1, 1, SAMPLES)
-    spread = float(np.var(curve))
-    if not spread:
+    if not float(np.var(curve)):
         return "nothing"
     if _unexplained(curve, [u]) < 1 - ALIKE:
         return "a straight line"
@@ -173,9 +179,9 @@ def shape_of(field: Field) -> str:
         return "a step"
     if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
         monotone = np.all(np.diff(curve) >= 0) or np.all(np.diff(curve) <= 0)
-        return "levelling off" if monotone and field.covariates == ("time",) else "a parabola"
+        return "levelling off" if monotone and over_time else "a parabola"
     slope = np.abs(np.diff(curve))
-    if field.covariates == ("time",) and slope[: SAMPLES // 4].sum() > 2 * slope[-SAMPLES // 4 :].sum():
+    if over_time and slope[: SAMPLES // 4].sum() > 2 * slope[-SAMPLES // 4 :].sum():
         return "levelling off"
     if _unexplained(curve, [u, u**3]) < 1 - ALIKE:
         return "an S"
@@ -206,31 +212,36 @@ def _is_step(curve: Array) -> bool:
 def _shape_over_picture(field: Field) -> str:
     """Which of a lens's simple faults explains a displacement: off centre, other scales along x and y, or neither."""
     x, y = np.meshgrid(*(np.linspace(k[0], k[-1], 21) for k in field.knots), indexing="ij")
-    middle, half = (0.5 * (field.knots[0][-1]), 0.5 * (field.knots[1][-1])), 0.5 * field.knots[0][-1]
+    middle = [0.5 * (k[0] + k[-1]) for k in field.knots]
+    half = 0.5 * (field.knots[0][-1] - field.knots[0][0])
     u, v = (x - middle[0]) / half, (y - middle[1]) / half
     values = field.at(x, y)
+    values = (values - values.mean(axis=(0, 1))).ravel()
 
-    def part(columns: list[tuple[Array, Array]]) -> float:
+    def explained(columns: list[tuple[Array, Array]]) -> bool:
+        one, nothing = np.ones_like(u), np.zeros_like(u)
+        columns = [(one, nothing), (nothing, one), *columns]
         design = np.stack([np.stack(pair, -1).ravel() for pair in columns], axis=-1)
-        left = values.ravel() - design @ np.linalg.lstsq(design, values.ravel(), rcond=None)[0]
-        return float((left**2).sum() / max(float((values**2).sum()), 1e-300))
+        left = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+        return bool((left**2).sum() < (1 - SHAPE_PART) * (values**2).sum())
 
     r2, nothing = u * u + v * v, np.zeros_like(u)
     off_centre = [(2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v)]
-    sheared = [(u, -v), (v, u)]
-    if part(off_centre) < 1 - 0.9:
-        return "growing with its square"
-    if part(sheared) < 1 - 0.9:
-        return "linear"
-    if part([*off_centre, *sheared, (u**2, nothing), (nothing, u**2), (u * v, nothing), (v**2, nothing)]) < 1 - 0.9:
-        return "of second order"
-    return "a smooth map"
+    linear = [(u, nothing), (v, nothing), (nothing, u), (nothing, v)]
+    radial = [(r2 * u, r2 * v), (r2**2 * u, r2**2 * v), (u, v)]
+    if explained(linear):
+        return LINEAR
+    if explained(off_centre) or explained([*off_centre, *linear]):
+        return OFF_CENTRE
+    return RADIAL if explained(radial) else "a smooth map"
 
 
-def _lens_words(shape: str) -> str:
+def lens_words(shape: str) -> str:
+    """What a displacement of this shape says of the lens."""
     return {
-        "growing with its square": "a lens that is not centred (tangential distortion)",
-        "linear": "the picture is stretched or sheared",
+        OFF_CENTRE: "a lens that is not centred (tangential distortion)",
+        LINEAR: "the picture is scaled, turned, stretched or sheared",
+        RADIAL: "the radial distortion is another",
     }.get(shape, "a lens that the model's distortion does not describe")
 
 
