@@ -105,6 +105,16 @@ class Field:
         rows = tuple(map(tuple, np.asarray(values).tolist()))
         return replace(self, values=rows, std=() if std is None else tuple(map(tuple, np.asarray(std).tolist())))
 
+    def rounded(self, digits: int = 5) -> Field:
+        """The field with so many significant digits, as it is written."""
+        rows = (tuple(tuple(float(f"{v:.{digits}g}") for v in row) for row in part) for part in (self.values, self.std))
+        values, std = rows
+        return replace(self, values=values, std=std)
+
+    def is_in_place_of(self, other: Field) -> bool:
+        """Whether two fields are the same but for their values."""
+        return (self.kind, self.covariates, self.knots) == (other.kind, other.covariates, other.knots)
+
     def later(self, seconds: float) -> Field:
         """The field with times counted from so much later."""
         if self.covariates == ("time",):

@@ -193,6 +193,9 @@ class _Story:
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         first, observed = self.first, self.points.observed
         extended = self.curve.profile
+        stated = [entry for field in fields for entry in field.fields]
+        with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in extended.fields]
+        extended = extended.with_fields([held.rounded() for held in with_std])
         # a lens's lean belongs to the start of this log; a process that begins later must not have it
         unleaning = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
         stamps = sum(NO_STAMP not in frame.skip_codes for frame in self.capture.frames)

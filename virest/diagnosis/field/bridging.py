@@ -133,7 +133,11 @@ def _take_over(
     form = bridging_form(stretches, capture.stamp_0_ns)
     whole = replace(_with_scene(evidence, bridged, table), terms=(*found.model.terms, form.term))
     fitted = fit_model(capture.imu, whole, whole.terms, table)
-    found.model = replace(whole, profile=fitted.profile, scene=fitted.scene)
+    part = fitted.slices[form.name]
+    deviations = form.filled(np.zeros(part.stop - part.start), fitted.covariance[part, part])
+    bridges = {field.knots: field.std for field in deviations}
+    held = [replace(field, std=bridges.get(field.knots, field.std)) for field in fitted.profile.fields]
+    found.model = replace(whole, profile=fitted.profile.with_fields(held), scene=fitted.scene)
     found.fit, found.table = fitted, table
     found.final_rms_px = capped_rms(fitted.distance) * evidence.typical_px
     found.noise_px = evidence.noise_px(fitted)

@@ -38,8 +38,8 @@ MAX_FIELDS = 3
 SEARCH_POINTS, JUDGE_POINTS = 6000, 4000
 PAIRS_IN_BLOCK = 3
 """Neighbouring pairs share a frame, and so its tracking errors: blocks of three share them at their ends only."""
-MIN_SIZE_PX = 0.05
-"""Smaller structure may be tracking's own bias."""
+MIN_SIZE_PX = 0.025
+"""Structure below 0.02 px may be tracking's own bias."""
 MIN_BLOCKS = 8
 
 
