@@ -33,7 +33,7 @@ KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
 """Unit, number of components and possible covariates of each kind."""
 UNITS = {"row": "1", "x": "px", "y": "px", "time": "s", "focus": "1/m"}
 """Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout."""
-_FIXED_POINT_STEPS = 6
+_FIXED_POINT_STEPS = 5
 """A displacement's slope is a few per cent: each step of its inversion shrinks the error by that factor."""
 
 
@@ -84,8 +84,8 @@ class Field:
         if len(self.knots) == 1:
             return cardinal_weights(self.knots[0], covariates[0]) @ table
         first, second = (cardinal_weights(k, c) for k, c in zip(self.knots, covariates, strict=True))
-        table = table.reshape(len(self.knots[0]), len(self.knots[1]), -1)
-        return np.asarray(np.einsum("...i,...j,ijk->...k", first, second, table, optimize=True))
+        across = (first @ table.reshape(len(self.knots[0]), -1)).reshape(*first.shape[:-1], len(self.knots[1]), -1)
+        return np.asarray((second[..., None] * across).sum(axis=-2))
 
     def at_time(self, time_s: Any) -> Array:
         """Values (..., components) of a field over time, or over what is logged, at times (...), IMU clock."""

@@ -62,8 +62,8 @@ class FieldForm:
 
     @property
     def over_time(self) -> bool:
-        """Whether it can be known at times only at which it was fitted."""
-        return self.covariates == (TIME,)
+        """Whether it is one value a frame, known only where it was fitted."""
+        return self.covariates in ((TIME,), ("focus",))
 
     def values(self, numbers: Array) -> list[Array]:
         """Values (knots, components) of each field."""
@@ -188,7 +188,7 @@ def _focus_form(capture: Capture) -> FieldForm | None:
     values = np.array([value for _, value in log])
     if len(log) < 0.5 * len(capture.frames) or np.ptp(values) < LEAST_FOCUS_CHANGE:
         return None
-    knots = np.unique(np.round(np.linspace(values.min(), values.max(), FOCUS_KNOTS), 6))
+    knots: Array = np.unique(np.round(np.linspace(values.min(), values.max(), FOCUS_KNOTS), 6))
     times = tuple(float(time_s) for time_s, _ in log)
     field = _zero("scale", ("focus",), [knots], None, (times, tuple(values.tolist())))
     return FieldForm((field,), null_space(cardinal_weights(field.knots[0], values[0])[None]))

@@ -83,24 +83,34 @@ class _Block:
 
 
 def score_forms(
-    left: Array, weight: Array, tangent: Array, designs: Sequence[tuple[str, Array, bool]], block: Index, seed: int = 0
+    left: Array,
+    weight: Array,
+    tangent: Array,
+    designs: Sequence[tuple[str, Array, bool]],
+    block: Index,
+    moment: Index | None = None,
+    seed: int = 0,
 ) -> list[Scored]:
     """Score forms, best gain first.
 
     left: (n, 2) residuals in standard deviations; weight (n,); tangent (n, 2, m); designs: name, effect (n, 2, k) per
-    free number, and whether the form runs over time; block (n,) number of the block of time, rising.
+    free number, and whether the form runs over time; block (n,) number of the block of time, rising; moment (n,)
+    the same of shorter stretches within blocks, by which forms over time are tested: a few blocks hold each knot.
     """
     root = np.repeat(np.sqrt(weight), 2)[:, None]
     frame = _orthonormal(tangent.reshape(len(root), -1) * root)
     error = left.reshape(-1, 1) * root
     error = (error - frame @ (frame.T @ error))[:, 0]
-    of_row = np.repeat(np.unique(block, return_inverse=True)[1], 2)
+    moments, fine = np.unique(block if moment is None else moment, return_inverse=True)
+    coarse = np.zeros(len(moments), np.intp)
+    coarse[fine] = np.unique(block, return_inverse=True)[1]
+    of_row = np.repeat(fine, 2)
     blocks = [
         _summed(name, design.reshape(len(root), -1) * root, frame, error, of_row, over)
         for name, design, over in designs
     ]
-    signs = np.random.default_rng(seed).choice((-1.0, 1.0), (FLIPS, int(of_row.max()) + 1))
-    scored = [_scored(entry, signs, len(blocks)) for entry in blocks]
+    signs = np.random.default_rng(seed).choice((-1.0, 1.0), (FLIPS, len(moments)))
+    scored = [_scored(entry, coarse, signs, len(blocks)) for entry in blocks]
     return sorted(scored, key=lambda s: -float(s.gain.sum()))
 
 
@@ -157,17 +167,27 @@ def _summed(name: str, design: Array, frame: Array, error: Array, of_row: Index,
     return _Block(name, pull, curvature, over_time)
 
 
-def _scored(entry: _Block, signs: Array, forms: int) -> Scored:
+def _scored(entry: _Block, coarse: Index, signs: Array, forms: int) -> Scored:
+    whole = _Block(entry.name, _added(entry.pull, coarse), _added(entry.curvature, coarse), entry.over_time)
+    entry = entry if entry.over_time else whole
     count, numbers = entry.pull.shape
     total, inverse = entry.pull.sum(axis=0), _solver(entry.curvature.sum(axis=0))
-    flipped = signs @ entry.pull
+    flipped = signs[:, :count] @ entry.pull
     drawn = np.einsum("fk,kl,fl->f", flipped, inverse, flipped)
     seen = float(total @ inverse @ total)
     scale = max(float(drawn.var() / max(drawn.mean(), 1e-300)), 1e-300)
     p_value = float(stats.gamma.sf(seen, max(float(drawn.mean()) / scale, 1e-3), scale=scale))
-    gain = _held_out(entry, np.arange(count) % FOLDS)
-    parts = None if entry.over_time else _held_out(entry, np.arange(count) * PARTS // count)
+    block = np.arange(len(whole.pull))
+    gain = _held_out(whole, block % FOLDS)
+    parts = None if entry.over_time else _held_out(whole, block * PARTS // len(block))
     return Scored(entry.name, numbers, min(p_value * forms, 1.0), gain, parts)
+
+
+def _added(sums: Array, group: Index) -> Array:
+    """Sums (groups, ...) of entries (n, ...)."""
+    total = np.zeros((int(group.max()) + 1, *sums.shape[1:]))
+    np.add.at(total, group, sums)
+    return total
 
 
 def _held_out(entry: _Block, fold: Index) -> Array:

@@ -115,7 +115,7 @@ def _asked_for(
     if model.terms:
         tangent = np.concatenate([tangent, seen.effect(model.terms)], axis=-1)
     designs = [(form.name, seen.effect((form.term,)), form.over_time) for form in forms]
-    scored = score_forms(seen.left, seen.weight, tangent, designs, block)
+    scored = score_forms(seen.left, seen.weight, tangent, designs, block, table.pair)
     for entry in scored:
         log.debug(
             "%s: p %.2g, gain %.4g (t %.1f), parts t %s",

@@ -246,18 +246,22 @@ def lens_words(shape: str) -> str:
 
 
 def _size(fields: tuple[Field, ...]) -> tuple[float, float | None]:
-    """Largest value and its deviation; of a displacement its length, of proportions to a force per m/s²."""
+    """Largest value and the deviation at the knot next to it.
+
+    Of a displacement or rates the length, of a focal length the range, of proportions to a force the value per m/s².
+    """
     best, std = 0.0, None
     for field in fields:
         values = np.array(field.values)
+        length = np.linalg.norm(values, axis=1)
+        row, largest = int(np.argmax(length)), float(length.max())
         if field.kind == "scale":
-            length = np.array([np.ptp(values)])
-            row = int(np.argmax(np.abs(values)))
-        else:
-            length = np.linalg.norm(values, axis=1)
-            row = int(np.argmax(length))
-        if length.max() > best:
-            best = float(length.max())
+            largest = float(np.ptp(values))
+        elif len(field.knots) == 1:
+            along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+            largest = float(np.linalg.norm(field.at(along), axis=1).max())
+        if largest > best:
+            best = largest
             std = float(np.linalg.norm(field.std[row])) if field.std else None
     if fields[0].covariates[0] in FORCES:
         return best / FORCE_REACH_M_S2, None if std is None else std / FORCE_REACH_M_S2
