@@ -41,7 +41,7 @@ from virest.capture.location import is_unreachable
 from virest.capture.video import MovieIndex, read_frames
 from virest.errors import OutputError, RestorationError, VirestError
 from virest.motion.optics import settling_time_s
-from virest.restoration.capture import RestorationPlan, restore_frames
+from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
 
 log = logging.getLogger(__name__)
@@ -70,6 +70,8 @@ class Segment:
     """The samples that cover the frames, with a margin."""
     plan: RestorationPlan
     run: RunFolder
+    around: tuple[Frame, ...] = ()
+    """Neighbours in the movie that are decoded for these frames' sake and not restored here."""
 
     @property
     def log_path(self) -> Path:
@@ -115,7 +117,20 @@ def make_segment(
 ) -> Segment:
     """One segment as a worker takes it."""
     place, movie = RunFolder(run.path.absolute()), capture.movie.absolute()  # a worker may stand in another folder
-    return Segment(name, movie, index, frames, cut_imu(capture.imu, frames, plan), plan.of(frames), place)
+    around = _around(frames, capture, plan)
+    every = sorted((*frames, *around), key=lambda frame: frame.index)
+    return Segment(name, movie, index, frames, cut_imu(capture.imu, every, plan), plan.of(every), place, around)
+
+
+def _around(frames: tuple[Frame, ...], capture: Capture, plan: RestorationPlan) -> tuple[Frame, ...]:
+    """The usable neighbours in the movie of frames that are restored, as far as the plan looks."""
+    own = {frame.index for frame in frames}
+    restored = [frame.index for frame in frames if frame.skip_reason is None]
+    wanted = {n + k for n in restored for k in range(-plan.reach, plan.reach + 1)} - own
+    if not wanted:
+        return ()
+    every = at_true_times(capture.frames, plan.profile, capture.repeats)
+    return tuple(frame for frame in every if frame.index in wanted and frame.skip_reason is None)
 
 
 # ── the work on one segment ──────────────────────────────────────────────────────────────────────────────────────
@@ -161,9 +176,10 @@ def _without_picture(frame: Frame, status: str, reason: str) -> RestoredFrame:
 
 
 def _decoded(segment: Segment, seconds: dict[int, float]) -> Iterator[tuple[Frame, Picture | None]]:
-    """The segment's usable frames in order, each with its picture, or None where it could not be decoded."""
-    wanted = deque(frame for frame in segment.frames if frame.skip_reason is None)
-    if not wanted:
+    """The segment's usable frames and their neighbours in order, each with its picture, or None where it has none."""
+    usable = [frame for frame in segment.frames if frame.skip_reason is None]
+    wanted = deque(sorted((*usable, *segment.around), key=lambda frame: frame.index))
+    if not usable:
         return
     source = read_frames(segment.movie, segment.index, wanted[0].index, wanted[-1].index)
     began = time.perf_counter()
@@ -186,35 +202,38 @@ def _decoded(segment: Segment, seconds: dict[int, float]) -> Iterator[tuple[Fram
 def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[RestoredFrame]:
     """Restored frames, and a failed one for each frame that cannot be decoded or restored."""
     fed: deque[tuple[Frame, Picture]] = deque()
+    due = {frame.index for frame in segment.frames if frame.skip_reason is None}
     undecodable: list[Frame] = []
 
     def feed(source: Iterable[tuple[Frame, Picture | None]]) -> Iterator[tuple[Frame, Picture | None]]:
         for frame, picture in source:
-            if picture is None:
-                undecodable.append(frame)
-            else:
+            if picture is not None:
                 fed.append((frame, picture))
                 yield frame, picture
+            elif frame.index in due:
+                undecodable.append(frame)
 
     source: Iterator[tuple[Frame, Picture | None]] = _decoded(segment, decode_s)
     while True:
         try:
-            for restored in restore_frames(feed(source), segment.imu, segment.plan):
-                while fed and fed[0][0].index <= restored.frame.index:
+            for restored in restore_frames(feed(source), segment.imu, segment.plan, due.copy()):
+                due.discard(restored.frame.index)
+                while fed and fed[0][0].index < restored.frame.index - segment.plan.reach:
                     fed.popleft()
                 yield restored
             break
         except OutputError:
             raise
         except Exception as error:  # one frame's fault must not take the others along
-            if not fed or is_unreachable(error):
+            failed = next((frame for frame, _ in fed if frame.index in due), None)
+            if failed is None or is_unreachable(error):
                 raise
-            log.debug("frame %d", fed[0][0].index, exc_info=True)
-            frame, _ = fed.popleft()
-            yield _without_picture(frame, "failed", _reason(error))
-            source = chain(list(fed), source)
+            log.debug("frame %d", failed.index, exc_info=True)
+            due.discard(failed.index)
+            yield _without_picture(failed, "failed", _reason(error))
+            source = chain([one for one in fed if one[0] is not failed], source)
             fed.clear()
-    lost = [frame for frame, _ in fed]
+    lost = [frame for frame, _ in fed if frame.index in due]
     yield from (_without_picture(frame, "failed", "no result came from the restoration") for frame in lost)
     yield from (_without_picture(frame, "failed", "the frame cannot be decoded") for frame in undecodable)
 

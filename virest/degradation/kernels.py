@@ -81,45 +81,59 @@ def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inve
 
     inverse_depth: (n,) of each tile, 1/m; None: that of the frame's plane.  Flicker and defocus are the profile's.
     """
-    return _field(motion, centres_px, _path_nodes(motion, centres_px, anchor, inverse_depth), anchor)
+    return field_along(motion, centres_px, _path_nodes(motion, centres_px, anchor, inverse_depth), anchor)
 
 
 def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], KernelField]:
     """:func:`kernel_field` of any centres inside the picture, from paths worked out once at the knots of splines.
 
-    A knot for every ACROSS_PX pixels, and for every NODE_STEP_S of the readout.  Before relief paths bend at depth
-    edges, where splines would swing: each is worked out.
+    Before relief paths bend at depth edges, where splines would swing: each is worked out.
     """
     if motion.translation is not None and motion.translation.relief is not None:
         return lambda centres_px: kernel_field(motion, centres_px, anchor)
+    at = splined_nodes(motion, lambda centres_px: _path_nodes(motion, centres_px, anchor))
+    return lambda centres_px: field_along(motion, centres_px, at(centres_px), anchor)
+
+
+def splined_nodes(motion: RowMotion, nodes: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """Path nodes (n, k, 2) of any centres (n, 2) inside the picture, by splines over a few at which they are found.
+
+    A knot for every ACROSS_PX pixels, and for every NODE_STEP_S of the readout.
+    """
     profile = motion.profile
     least = [-(-length // ACROSS_PX) + 1 for length in (profile.width, profile.height)]
     along = 0 if profile.shutter.reads_columns else 1
     least[along] = max(least[along], int(np.ceil(motion.readout_time_s / NODE_STEP_S)) + 1)
     across, down = (_spline(n, max(k, MIN_KNOTS)) for n, k in zip((profile.width, profile.height), least, strict=True))
-    at_knots = _path_nodes(motion, np.stack(np.meshgrid(across.x, down.x), -1).reshape(-1, 2), anchor)
-    nodes = at_knots.reshape(len(at_knots), -1)
+    at_knots = nodes(np.stack(np.meshgrid(across.x, down.x), -1).reshape(-1, 2))
+    flat = at_knots.reshape(len(at_knots), -1)
 
-    def field(centres_px: Array) -> KernelField:
+    def splined(centres_px: Array) -> Array:
         x, y = across(centres_px[:, 0]), down(centres_px[:, 1])
         weights = (y[:, :, None] * x[:, None, :]).reshape(len(centres_px), -1)
-        return _field(motion, centres_px, (weights @ nodes).reshape(len(centres_px), *at_knots.shape[1:]), anchor)
+        return np.asarray((weights @ flat).reshape(len(centres_px), *at_knots.shape[1:]))
 
-    return field
+    return splined
+
+
+def instants(motion: RowMotion, points_px: Array) -> Array:
+    """(n, k) evenly spaced instants, ends included, of the exposures of the rows through pixels (n, 2)."""
+    count = max(MIN_NODES, int(np.ceil(motion.exposure_s / NODE_STEP_S)) + 1)
+    return np.asarray(motion.row_start_s(points_px)[:, None] + np.linspace(0.0, 1.0, count) * motion.exposure_s)
 
 
 def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float, inverse_depth: Any = None) -> Array:
     """Displacements (n, k, 2) at evenly spaced instants of the exposure, ends included: a spline's nodes."""
-    count = max(MIN_NODES, int(np.ceil(motion.exposure_s / NODE_STEP_S)) + 1)
-    part = np.linspace(0.0, 1.0, count)
-    gathered_s = motion.row_start_s(centres_px)[:, None] + part * motion.exposure_s
+    gathered_s = instants(motion, centres_px)
+    count = gathered_s.shape[1]
     points = np.broadcast_to(centres_px[:, None], (len(centres_px), count, 2))
     if inverse_depth is not None:
         inverse_depth = np.broadcast_to(np.asarray(inverse_depth, float)[..., None], gathered_s.shape)
     return seen_by_rows(motion, points, gathered_s, anchor, inverse_depth, PIXELS_WITHIN_PX) - points
 
 
-def _field(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: float) -> KernelField:
+def field_along(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: float) -> KernelField:
+    """Kernels along given path nodes (n, k, 2) of :func:`instants`; flicker and defocus are the profile's."""
     length = np.linalg.norm(np.diff(nodes_px, axis=1), axis=-1).sum(axis=1).max(initial=0.0)
     samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_PX * 1.3 * length)))
     paths_px = _between(nodes_px.shape[1], samples) @ nodes_px

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -141,6 +141,19 @@ class RowMotion:
             nearness = at_reference / np.maximum(ahead, _LEAST_DISTANCE)
         return nearness
 
+    def turned(self, rate_rad_s: Array, slope_rad_s2: Array) -> RowMotion:
+        """The motion with a further turn of the camera: x' = exp(rate τ + ½ slope τ²) x, τ from the reference time.
+
+        rate_rad_s, slope_rad_s2: (3,), camera axes.  Travel stays as it is.
+        """
+        since_s = (self.time_s - self.reference_s)[:, None]
+        further = rotation_from_vector(since_s * (rate_rad_s + 0.5 * since_s * slope_rad_s2))
+        turned = further @ rotation_from_vector(self.rotation_vector)
+        shift = self.translation_m
+        if shift is not None:
+            shift = np.squeeze(further @ shift[..., None], -1)
+        return replace(self, rotation_vector=vector_from_rotation(turned), translation_m=shift)
+
     @property
     def _step_s(self) -> float:
         return float(self.time_s[1] - self.time_s[0])
@@ -164,8 +177,44 @@ def row_motion(
     exposure_s = profile.shutter.true_exposure_s(logged_exposure_s or 0.0)
     readout_s = profile.shutter.readout_time_s
     start_s, reference_s = frame_times_s(profile, stamp_s, logged_exposure_s, reference)
-    first_s = start_s - OUTSIDE_FRACTION * readout_s - STEP_S
-    last_s = start_s + (1 + OUTSIDE_FRACTION) * readout_s + exposure_s + STEP_S
+    if lens is None and profile.intrinsics is not None:
+        lens = moving_lens(trajectory, profile)
+    span_s = start_s, start_s + readout_s + exposure_s
+    return _tabulated(trajectory, span_s, start_s, exposure_s, reference_s, profile, lens, translation)
+
+
+def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, lens: MovingLens) -> RowMotion:
+    """The motion of one frame, tabulated over the rows of another frame too; its row clock and reference stay.
+
+    lens: of the whole trajectory.  Travel goes on with the frame's own acceleration.
+    """
+    ends = [m.start_s + m.readout_time_s + m.exposure_s for m in (motion, other)]
+    span_s = min(motion.start_s, other.start_s), max(ends)
+    return _tabulated(
+        trajectory, span_s, motion.start_s, motion.exposure_s, motion.reference_s, motion.profile, lens,
+        motion.translation,
+    )  # fmt: skip
+
+
+def with_row_clock_of(motion: RowMotion, other: RowMotion) -> RowMotion:
+    """The same motion about the same reference time, its rows read and exposed when another frame's are."""
+    return replace(motion, start_s=other.start_s, exposure_s=other.exposure_s, readout_time_s=other.readout_time_s)
+
+
+def _tabulated(
+    trajectory: Trajectory,
+    span_s: tuple[float, float],
+    start_s: float,
+    exposure_s: float,
+    reference_s: float,
+    profile: CameraProfile,
+    lens: MovingLens | None,
+    translation: FrameTranslation | None,
+) -> RowMotion:
+    """A motion's table over a span, and what points just outside the picture need."""
+    readout_s = profile.shutter.readout_time_s
+    first_s = span_s[0] - OUTSIDE_FRACTION * readout_s - STEP_S
+    last_s = span_s[1] + OUTSIDE_FRACTION * readout_s + STEP_S
     steps = np.arange(int(np.ceil((last_s - first_s) / STEP_S)) + 2, dtype=np.float64)
     time_s = first_s + STEP_S * steps
     r_world_ref = trajectory.orientation(reference_s)
@@ -174,8 +223,6 @@ def row_motion(
     shift = None
     if translation is not None:
         shift = -np.squeeze(r_t_ref @ translation.position_m(time_s - reference_s)[..., None], -1)
-    if lens is None and profile.intrinsics is not None:
-        lens = moving_lens(trajectory, profile)
     if lens is not None:
         lens = lens.between(float(time_s[0]), float(time_s[-1]))
     vector = vector_from_rotation(r_t_ref)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.degradation.blur import Image
+from virest.degradation.kernel_spread import KernelSpread
 from virest.degradation.kernels import KernelField
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
@@ -54,6 +55,8 @@ class BlurredPicture:
     """1.0 where light is clipped in all channels, and in any beside such; None: nowhere; see :func:`_holes`."""
     curve: ResponseCurve
     """Takes light back to grey levels."""
+    spread: KernelSpread | None = None
+    """How well the kernels are known; None: as if exactly."""
     kept: Image | None = None
     """Vignetting (height, width) that the restored picture has and ``light`` has not; None: none."""
 
@@ -179,4 +182,5 @@ def reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
         statistics=blurred.statistics.scaled(1 / times),
         field=field,
         longest_px=blurred.longest_px / times,
+        spread=None if blurred.spread is None else blurred.spread.scaled(1 / times),
     )

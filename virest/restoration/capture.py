@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,8 @@ from virest.restoration.frame import (
     restore_frame,
     unknown_parameters,
 )
+from virest.restoration.neighbours.refinement import MissingTurn
+from virest.restoration.neighbours.sights import FrameTurns, Sight, with_neighbours
 from virest.restoration.settings import RestorationSettings
 
 UNTRUSTED = "the inertial log does not follow the camera"
@@ -52,6 +53,14 @@ class RestorationPlan:
     """The profile as the pictures have it, where they contradict a stated value: no step is taken that would be a loss
     by it; None: they do not."""
 
+    missing_turn: MissingTurn | None = None
+    """What neighbouring frames show that the predicted turns lack; None: nothing, or it could not be measured."""
+
+    @property
+    def reach(self) -> int:
+        """Neighbours of a frame on each side that its restoration looks at."""
+        return 0 if self.missing_turn is None or self.copy_reason is not None else 1
+
     def of(self, frames: Iterable[Frame]) -> RestorationPlan:
         """The plan as a worker needs it who has these frames only."""
         if self.translations is None:
@@ -61,27 +70,43 @@ class RestorationPlan:
 
 
 def restore_frames(
-    frames: Iterable[tuple[Frame, NDArray[np.uint8] | None]], imu: ImuSamples, plan: RestorationPlan
+    frames: Iterable[tuple[Frame, NDArray[np.uint8] | None]],
+    imu: ImuSamples,
+    plan: RestorationPlan,
+    only: Collection[int] | None = None,
 ) -> Iterator[RestoredFrame]:
-    """Restore frames one by one; ``imu`` covers them. Frames without a picture are passed over."""
+    """Restore frames one by one; ``imu`` covers them. Frames without a picture are passed over.
+
+    frames: in the movie's order.  only: numbers of those that are restored, the others being there as their neighbours;
+    None: all.
+    """
     profile = plan.profile
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
     lens = moving_lens(trajectory, profile) if trajectory is not None else None
-    translations = plan.translations or {}
-    for frame, picture in frames:
-        if picture is None:
-            continue
+    translations, turns = plan.translations or {}, None
+    if trajectory is not None and lens is not None and plan.missing_turn is not None:
+        turns = FrameTurns(trajectory, lens, plan.missing_turn)
+
+    def sight(frame: Frame, picture: NDArray[np.uint8]) -> Sight:
         if trajectory is None:
-            yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN)
-            continue
-        moved = partial(
-            moved_over_frame, trajectory, lens, frame, plan.settings.reference, translations.get(frame.index)
+            return Sight(frame, picture, None)
+        motion = moved_over_frame(
+            trajectory, lens, frame, plan.settings.reference, translations.get(frame.index), profile
         )
-        motion = moved(profile)
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, imu.time_s, plan.imu_gaps_s)
-        if outside:
-            yield RestoredFrame(frame, "skipped", None, (outside[1],), parameters=unknown_parameters(profile))
+        return Sight(frame, picture, motion, outside[1] if outside else "")
+
+    sights = (sight(frame, picture) for frame, picture in frames if picture is not None)
+    for before, here, after in with_neighbours(sights, plan.reach):
+        frame, picture, motion = here.frame, here.picture, here.motion
+        if only is not None and frame.index not in only:
+            continue
+        if motion is None or trajectory is None:
+            yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN)
+            continue
+        if here.outside:
+            yield RestoredFrame(frame, "skipped", None, (here.outside,), parameters=unknown_parameters(profile))
             continue
         if plan.copy_reason is None and (where := untrusted_part(profile, motion.start_s, end_s)) is not None:
             said = degradation_parameters(motion, trajectory, plan.settings)
@@ -91,8 +116,12 @@ def restore_frames(
             said = degradation_parameters(motion, trajectory, plan.settings)
             yield copied_frame(frame, picture, profile, plan.copy_reason, said)
             continue
-        seen = None if plan.contradicted is None else moved(plan.contradicted)
-        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen)
+        seen = None
+        if plan.contradicted is not None:
+            moved = translations.get(frame.index)
+            seen = moved_over_frame(trajectory, lens, frame, plan.settings.reference, moved, plan.contradicted)
+        refined = turns.refined(before, here, after) if turns is not None else None
+        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined)
 
 
 def unbridged(profile: CameraProfile) -> tuple[tuple[float, float], ...]:

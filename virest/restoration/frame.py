@@ -15,6 +15,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
 from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
+from virest.degradation.kernel_spread import kernel_spread
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
@@ -25,10 +26,12 @@ from virest.restoration.clipped_light import measured_share, near_clipped, unsee
 from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
+from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.records import PictureStatistics, falling_power
+from virest.restoration.statistics.rings import SIDE
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
 
 LOG_TILE_PX = 128
@@ -50,6 +53,8 @@ PART_STEP_PX = 80
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
+_LEAST_FALL = 2.0
+"""The power of pictures falls with frequency at least so steeply: f⁻² is that of edges alone, without texture."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -81,13 +86,17 @@ def restore_frame(
     trajectory: Trajectory,
     settings: RestorationSettings,
     seen: RowMotion | None = None,
+    refined: RefinedMotion | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
     picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
-    pictures' own account, where that contradicts the profile's.
+    pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
+    is then taken.
     """
     clock = _Clock()
+    if refined is not None:
+        motion = refined.motion
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     parameters = degradation_parameters(motion, trajectory, settings)
@@ -103,7 +112,10 @@ def restore_frame(
     restored: NDArray[Any] = picture
     parameters["deblur"] = {"method": "none"}
     if method != "none":
-        restored, parameters["deblur"], why_not = _deblurred(picture, motion, settings, anchor, longest_px, light)
+        covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
+        restored, parameters["deblur"], why_not = _deblurred(
+            picture, motion, settings, anchor, longest_px, light, covariance_px2
+        )
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
     clock.lap("deblur")
@@ -261,6 +273,7 @@ def _deblurred(
     anchor: float,
     longest_px: float,
     light: FrameLight | None,
+    covariance_px2: NDArray[np.float64],
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
@@ -269,11 +282,14 @@ def _deblurred(
     tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
     field = smooth_field(motion, anchor)
     luma, chroma = _measured(picture, field(centres_px), curve, tiles)
-    share = 1.0 if anchor != 0.5 else _trusted_share(luma)
-    why_not = _too_little_to_gain(luma)
+    spread = kernel_spread(field, width, height, covariance_px2)
+    luma_model = luma if spread is None else luma.doubted(spread.variance(SIDE))
+    share = 1.0 if anchor != 0.5 else _trusted_share(luma_model)
+    why_not = _too_little_to_gain(luma_model)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
+    blurred = replace(blurred, spread=spread)
     if light is not None:
         blurred = _evened(blurred, light)
     recorded = picture
@@ -294,7 +310,8 @@ def _deblurred(
         "strength": settings.strength,
         "tile_px": settings.tile_px,
         "noise_grey_levels": luma.noise_levels,
-        "expected_gain_db": luma.expected_gain_db,
+        "expected_gain_db": luma_model.expected_gain_db,
+        "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
@@ -326,19 +343,28 @@ def _measured(
 
 
 def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics:
-    """Spectra of the picture before a Gaussian came over it; where that left less than the noise, S falls as f⁻³."""
+    """Spectra of the picture before a Gaussian came over it.
+
+    The Gaussian leaves next to nothing of high frequencies, and what is recorded there divided by next to nothing is no
+    picture: no scene's power falls slower than f⁻².  So S is held to that law ring by ring, and what was recorded
+    beyond it counts as noise; where less than the noise is left, S falls as f⁻³.
+    """
     if not sigma_px or not defocused.measured:
         return defocused
     frequency = defocused.frequency
     left = np.exp(-((2 * np.pi * sigma_px * frequency) ** 2))
-    signal = defocused.signal / left
-    drowned = np.flatnonzero(defocused.passed * defocused.signal < defocused.noise)
+    through = defocused.passed * defocused.signal
+    rise, signal = frequency**_LEAST_FALL, defocused.signal / left
+    signal[1:] = np.minimum.accumulate((signal * rise)[1:]) / rise[1:]
+    passed = defocused.passed * left
+    noise = np.maximum(defocused.noise, through - passed * signal)
+    drowned = np.flatnonzero(passed * signal < noise)
     drowned = drowned[drowned > 0]
     if len(drowned):
         last = drowned[0] - 1
-        signal[last + 1 :] = falling_power(frequency, signal, last)[last + 1 :]
+        signal[last + 1 :] = np.minimum(signal, falling_power(frequency, signal, last))[last + 1 :]
     places = defocused.places and defocused.places.after(left)
-    return replace(defocused, signal=signal, passed=defocused.passed * left, places=places)
+    return replace(defocused, signal=signal, noise=noise, passed=passed, places=places)
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:

@@ -16,6 +16,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import Capture, Frame
+from virest.capture.join import outside_reason
 from virest.degradation.row_motion import FrameTranslation, frame_times_s
 from virest.motion.alignment import (
     AGREEMENT_SLACK_S,
@@ -33,6 +34,8 @@ from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame, unbridged
+from virest.restoration.neighbours.sights import Sight
+from virest.restoration.neighbours.survey import kept_lumas, survey_runs, survey_turns
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import RestorationSettings
 
@@ -76,8 +79,11 @@ def plan_restoration(
     runs = choose_runs(frames) if _wants_translation(profile, capture) else []
     powers: dict[int, TilePowers] = {}
     curve = profile.response or ResponseCurve("srgb")
-    looked_at = _looked_at(capture, profile, chosen) if settings.deblur != "none" else ()
-    all_pairs = track_pairs(kept_powers(read_gray(sorted(chosen.union(runs))), looked_at, curve, powers))
+    path_px = _rough_paths_px(capture, profile, chosen)
+    looked_at = telling(list(path_px), np.array(list(path_px.values()))) if settings.deblur != "none" else ()
+    surveyed, lumas = survey_runs(path_px, path_px), dict[int, NDArray[np.uint8]]()
+    pictures = kept_lumas(read_gray(sorted(chosen.union(runs))), {n for run in surveyed for n in run}, lumas)
+    all_pairs = track_pairs(kept_powers(pictures, looked_at, curve, powers))
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
         plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))
@@ -100,7 +106,8 @@ def plan_restoration(
         return plan
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
-    return _with_seen_paths(plan, profile, capture, powers)
+    plan = _with_seen_paths(plan, profile, capture, powers)
+    return _with_missing_turn(plan, capture, surveyed, lumas)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
@@ -161,17 +168,48 @@ def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: f
     return replace(plan, warnings=(*plan.warnings, said), contradicted=contradicted)
 
 
-def _looked_at(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> tuple[int, ...]:
-    """Frames, of those chosen, in which the length of the blur is best seen."""
+def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> dict[int, float]:
+    """About how long the blur path is in those of the chosen frames whose exposure is known, by movie index."""
     frames = [capture.frames[index] for index in sorted(chosen) if capture.frames[index].exposure_s]
     if not frames:
-        return ()
+        return {}
     rate_rad_s = np.linalg.norm(capture.imu.gyro_rad_s - profile.gyro_bias_rad_s, axis=1)
     offset_s = profile.time_offset_s or 0.0
     at_frames = np.interp([f.time_s + offset_s for f in frames], capture.imu.time_s, rate_rad_s)
     exposure_s = np.array([profile.shutter.true_exposure_s(f.exposure_s) for f in frames])
     focal_px = profile.intrinsics.fx_px if profile.intrinsics else GUESSED_FOCAL * max(profile.width, profile.height)
-    return telling([f.index for f in frames], focal_px * at_frames * exposure_s)
+    return dict(zip((f.index for f in frames), (focal_px * at_frames * exposure_s).tolist(), strict=True))
+
+
+def _with_missing_turn(
+    plan: RestorationPlan,
+    capture: Capture,
+    runs: Sequence[Sequence[int]],
+    lumas: Mapping[int, NDArray[np.uint8]],
+) -> RestorationPlan:
+    """What neighbouring frames show that the predicted turns lack, so that each frame's paths can be corrected."""
+    profile = plan.profile
+    if not lumas or profile.intrinsics is None:
+        return plan
+    trajectory = integrate_gyro(capture.imu, profile)
+    lens, known = moving_lens(trajectory, profile), plan.translations or {}
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    sights = {}
+    for number, luma in lumas.items():
+        motion = moved_over_frame(
+            trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile
+        )
+        end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
+        outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
+        sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
+    missing = survey_turns(runs, sights, trajectory, lens)
+    if missing is None:
+        return plan
+    said = (
+        f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
+        "each frame's motion is corrected by its neighbours"
+    )
+    return replace(plan, missing_turn=missing, notes=(*plan.notes, said))
 
 
 def _with_seen_paths(

@@ -8,7 +8,7 @@ from virest.degradation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.blurred import BlurredPicture
 from virest.restoration.settings import RestorationSettings
-from virest.restoration.statistics.on_tiles import on_spectrum
+from virest.restoration.statistics.on_tiles import on_spectrum, packed
 from virest.restoration.statistics.records import PictureStatistics
 
 Surroundings = tuple[float, int, int]
@@ -79,7 +79,9 @@ def tile_deconvolution(
     field = blurred.field((grid.centres_px + 0.5) * scale - 0.5)
     kernels = field.scaled(1 / scale).arrays()
     held = kernels.shape[1] // 2 + 1 - (0 if around is FULL_MARGIN else grid.side // 2)
-    return tiles.TileDeconvolution(grid, kernels, max(margin, held), bridge)
+    spread = blurred.spread
+    variance = None if spread is None else lambda size: packed(spread.variance(size, 1 / scale))
+    return tiles.TileDeconvolution(grid, kernels, max(margin, held), bridge, variance)
 
 
 def noise_to_signal(

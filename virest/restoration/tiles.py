@@ -36,8 +36,18 @@ class TileDeconvolution:
     Methods that give spectra give them one by one: a tile that is filtered and blended at once stays in the cache.
     """
 
-    def __init__(self, grid: TileGrid, kernels: Image, margin: int, bridge: int | None = None) -> None:
-        """bridge: its least length; None: the margin's."""
+    def __init__(
+        self,
+        grid: TileGrid,
+        kernels: Image,
+        margin: int,
+        bridge: int | None = None,
+        variance: Callable[[int], Image] | None = None,
+    ) -> None:
+        """bridge: its least length; None: the margin's.  variance: Var K on a packed spectrum; None: kernels are known.
+
+        With E[K] for K and E|K|² for |K|², all that follows minimises the expected data term.
+        """
         self.grid = grid
         self.margin = margin
         self.patch = grid.side + 2 * margin
@@ -55,10 +65,12 @@ class TileDeconvolution:
         self.kernels = np.empty((len(kernels), self.size, self.size), np.float32)
         """Packed spectra, (tiles, size, size): of the flipped kernels, see :func:`_kernel_spectra`."""
         self.powers = np.empty_like(self.kernels)
-        """Their |K|², as real factors."""
+        """Their E|K|², as real factors."""
         for _ in map(_power_inside, _kernel_spectra(kernels, self.size, self.kernels), self.powers):
             pass
         _power_at_ends(self.kernels, self.powers)
+        if variance is not None:
+            self.powers += variance(self.size)
         self._tamed: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
         self._lamps: dict[int, tuple[Image, Image]] = {}

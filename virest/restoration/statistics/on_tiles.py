@@ -23,6 +23,15 @@ def packed_frequency(size: int) -> NDArray[np.float32]:
     return packed.astype(np.float32)
 
 
+def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Real values over all frequencies (size, size), even about zero, on OpenCV's packed spectrum."""
+    size = len(values)
+    index = (np.arange(size) + 1) // 2
+    found = values[:, index]
+    found[:, 0], found[:, -1] = values[index, 0], values[index, size // 2]
+    return found
+
+
 def on_spectrum(
     statistics: PictureStatistics, ring_values: Array, size: int, scale: float = 1.0, by_place: bool = True
 ) -> NDArray[np.float32]:

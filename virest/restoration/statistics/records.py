@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.restoration.statistics.rings import RINGS, place_ring
+from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 
 Array = NDArray[np.float64]
 LUMA_RED, LUMA_BLUE = 0.299, 0.114
@@ -110,6 +110,13 @@ class PictureStatistics:
             noise=scale**2 * self.noise,
             noise_levels=scale * self.noise_levels,
         )
+
+    def doubted(self, variance: NDArray[np.float32]) -> PictureStatistics:
+        """With kernels of some variance over a spectrum (SIDE, SIDE): what it leaves unknown of S counts as noise."""
+        over_places = variance[:, 1 : SIDE // 2]
+        sums = np.bincount(place_ring().ravel(), over_places.ravel(), RINGS)
+        in_ring = sums / np.maximum(np.bincount(place_ring().ravel(), minlength=RINGS), 1)
+        return replace(self, noise=self.noise + in_ring * self.signal)
 
     @property
     def expected_gain_db(self) -> float:

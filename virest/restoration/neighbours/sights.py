@@ -1,0 +1,123 @@
+"""Frames as they pass, each with its neighbours in the movie."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.response import ResponseCurve
+from virest.capture.folder import Frame
+from virest.degradation.blur import Image
+from virest.degradation.neighbour import neighbour_view
+from virest.degradation.row_motion import RowMotion
+from virest.motion.optics import MovingLens
+from virest.motion.trajectory import Trajectory
+from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
+from virest.restoration.neighbours.registration import PairTurn, pair_turn, reduced_light
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One frame, decoded, and how the camera is predicted to have moved."""
+
+    frame: Frame
+    picture: NDArray[np.uint8]
+    """(height, width, 3) RGB, or the luma alone, (height, width)."""
+    motion: RowMotion | None
+    """None: no focal length."""
+    outside: str = ""
+    """Why its motion is not known, where it reaches beyond the inertial data."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether it tells its neighbours anything."""
+        return self.motion is not None and not self.outside and self.motion.exposure_s > 0
+
+
+def with_neighbours(sights: Iterable[Sight], reach: int) -> Iterator[tuple[tuple[Sight, ...], Sight, tuple[Sight, ...]]]:
+    """Each frame with up to ``reach`` before and after it, in order; holds 2 reach + 1 at a time."""
+    window: deque[Sight] = deque()
+    here = 0
+    for sight in sights:
+        window.append(sight)
+        if len(window) - here > reach:
+            yield _around(window, here, reach)
+            here += 1
+        if here > reach:
+            window.popleft()
+            here -= 1
+    for last in range(here, len(window)):
+        yield _around(window, last, reach)
+
+
+def _around(window: Sequence[Sight], here: int, reach: int) -> tuple[tuple[Sight, ...], Sight, tuple[Sight, ...]]:
+    sights = tuple(window)
+    return sights[max(here - reach, 0) : here], sights[here], sights[here + 1 : here + 1 + reach]
+
+
+class FrameTurns:
+    """Motions of passing frames, with the turn that each one's neighbours show to be missing.
+
+    A pair is compared once, for the frame before it and for the one after it.
+    """
+
+    def __init__(self, trajectory: Trajectory, lens: MovingLens, missing: MissingTurn) -> None:
+        """lens: of the whole trajectory."""
+        self._trajectory, self._lens, self._missing = trajectory, lens, missing
+        self._light: dict[int, Image] = {}
+        self._turns: dict[int, PairTurn | None] = {}
+
+    def refined(self, before: Sequence[Sight], here: Sight, after: Sequence[Sight]) -> RefinedMotion:
+        """The frame's motion by its neighbours; one that does not follow in the movie tells nothing."""
+        assert here.motion is not None
+        self._forget_before(here.frame.index - 1)
+        turns = [self._turn(before[-1], here) if before else None, self._turn(here, after[0]) if after else None]
+        return self._missing.refined(here.motion, *turns)
+
+    def _turn(self, first: Sight, second: Sight) -> PairTurn | None:
+        number = first.frame.index
+        if second.frame.index != number + 1:
+            return None
+        if number not in self._turns:
+            self._turns[number] = turn_between(
+                first, second, self._light_of(first), self._light_of(second), self._trajectory, self._lens
+            )
+        return self._turns[number]
+
+    def _light_of(self, sight: Sight) -> Image:
+        if sight.frame.index not in self._light:
+            self._light[sight.frame.index] = light_of(sight)
+        return self._light[sight.frame.index]
+
+    def _forget_before(self, number: int) -> None:
+        for kept in (self._light, self._turns):
+            for old in [n for n in kept if n < number]:
+                del kept[old]  # type: ignore[attr-defined]
+
+
+def light_of(sight: Sight) -> Image:
+    """A frame's luma in linear light, reduced."""
+    assert sight.motion is not None
+    luma = sight.picture if sight.picture.ndim == 2 else cv2.cvtColor(sight.picture, cv2.COLOR_RGB2GRAY)
+    return reduced_light(luma, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
+
+
+@lru_cache(maxsize=4)
+def _linear(curve: ResponseCurve) -> NDArray[np.float32]:
+    return curve.linear_table()
+
+
+def turn_between(
+    first: Sight, second: Sight, first_light: Image, second_light: Image, trajectory: Trajectory, lens: MovingLens
+) -> PairTurn | None:
+    """The turn rate missing between two frames; None where one of them tells nothing. lens: of the trajectory."""
+    if not first.usable or not second.usable:
+        return None
+    assert first.motion is not None and second.motion is not None
+    return pair_turn(neighbour_view(first.motion, second.motion, trajectory, lens), first_light, second_light)

@@ -1,0 +1,67 @@
+"""What a capture's neighbouring frames show of the prediction, asked once at planning on a few runs of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.degradation.row_motion import RowMotion
+from virest.motion.optics import MovingLens
+from virest.motion.trajectory import Trajectory
+from virest.restoration.neighbours.refinement import MissingTurn, missing_turn
+from virest.restoration.neighbours.registration import PairTurn
+from virest.restoration.neighbours.sights import Sight, light_of, turn_between
+
+RUN_FRAMES = 4
+"""Three pairs: what linear interpolation leaves of the middle one shows."""
+MOST_RUNS = 4
+Picture = NDArray[np.uint8]
+
+
+def survey_runs(numbers: Iterable[int], path_px: Mapping[int, float]) -> list[tuple[int, ...]]:
+    """Runs of consecutive frames among those at hand: the most blurred of each unbroken stretch, evenly over these.
+
+    path_px: about how long the blur path of each frame is.
+    """
+    ordered = np.array(sorted(numbers), np.intp)
+    if not len(ordered):
+        return []
+    runs = []
+    for stretch in np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1):
+        pieces = np.array_split(stretch, max(1, min(len(stretch) // RUN_FRAMES, MOST_RUNS)))
+        for piece in pieces if len(stretch) <= MOST_RUNS * RUN_FRAMES else [stretch]:
+            starts = range(max(len(piece) - RUN_FRAMES + 1, 1))
+            blur = [sum(path_px.get(int(n), 0.0) for n in piece[k : k + RUN_FRAMES]) for k in starts]
+            best = int(np.argmax(blur))
+            runs.append(tuple(int(n) for n in piece[best : best + RUN_FRAMES]))
+    chosen = np.unique(np.linspace(0, len(runs) - 1, min(len(runs), MOST_RUNS)).round().astype(int))
+    return [runs[k] for k in chosen if len(runs[k]) > 1]
+
+
+def kept_lumas(
+    pictures: Iterable[tuple[int, Picture]], wanted: Iterable[int], into: dict[int, Picture]
+) -> Iterator[tuple[int, Picture]]:
+    """Pass lumas on by their index, and keep those that are wanted."""
+    chosen = set(wanted)
+    for index, luma in pictures:
+        if index in chosen:
+            into[index] = luma
+        yield index, luma
+
+
+def survey_turns(
+    runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], trajectory: Trajectory, lens: MovingLens
+) -> MissingTurn | None:
+    """What the predicted turns lack by these runs of frames; None: nothing of significance, or it cannot be told."""
+    light = {number: light_of(sight) for number, sight in sights.items() if sight.usable}
+    motions: list[RowMotion] = [s.motion for s in sights.values() if s.usable and s.motion is not None]
+
+    def between(first: int, second: int) -> PairTurn | None:
+        if first not in light or second not in light:
+            return None
+        return turn_between(sights[first], sights[second], light[first], light[second], trajectory, lens)
+
+    turns = [[between(a, b) for a, b in zip(run, run[1:], strict=False)] for run in runs]
+    return missing_turn(turns, motions)
