@@ -41,7 +41,7 @@ def warming(time_s):
 
 def focus_dioptres(time_s):
     """A refocus in the middle of the capture."""
-    return 0.5 + 2 / (1 + np.exp(-(time_s - 1.2) / 0.35))
+    return 0.5 + 2 / (1 + np.exp(-(time_s - 1.0) / 0.3))
 
 
 def filled(from_s, to_s):
@@ -126,14 +126,14 @@ def test_a_focal_length_that_settles_is_a_scale_over_time() -> None:
 def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival() -> None:
     """What goes together in a capture is said to."""
     breathing = Strange(
-        longer=lambda t: 0.01 * (focus_dioptres(t) - focus_dioptres(0.0)), focus_dioptres=focus_dioptres
+        longer=lambda t: 0.02 * (focus_dioptres(t) - focus_dioptres(0.0)), focus_dioptres=focus_dioptres
     )
     phone = StrangePhone(replace(HAND, seed=75), breathing)
     _, (field,) = judged(phone, phone.profile)
     assert field.covariates == ("focus",)
     assert field.confounded == ("scale over time",)
     assert "scale over time would explain it as well" in field.sentence
-    assert field.size == pytest.approx(0.02, rel=0.1)
+    assert field.size == pytest.approx(0.04, rel=0.1)
     assert not field.fields[0].belongs_to_one_capture
 
 

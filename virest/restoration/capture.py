@@ -108,13 +108,10 @@ def restore_frames(
         if here.outside:
             yield RestoredFrame(frame, "skipped", None, (here.outside,), parameters=unknown_parameters(profile))
             continue
-        if plan.copy_reason is None and (where := untrusted_part(profile, motion.start_s, end_s)) is not None:
+        reason = plan.copy_reason or untrusted_reason(motion)
+        if reason:
             said = degradation_parameters(motion, trajectory, plan.settings)
-            yield copied_frame(frame, picture, profile, f"{UNTRUSTED} from {where[0]:.3f} to {where[1]:.3f} s", said)
-            continue
-        if plan.copy_reason:
-            said = degradation_parameters(motion, trajectory, plan.settings)
-            yield copied_frame(frame, picture, profile, plan.copy_reason, said)
+            yield copied_frame(frame, picture, profile, reason, said)
             continue
         seen = None
         if plan.contradicted is not None:
@@ -130,13 +127,15 @@ def unbridged(profile: CameraProfile) -> tuple[tuple[float, float], ...]:
     return tuple(
         (start, end)
         for start, end in profile.imu_untrusted_s
-        if not any(knots[0] <= start + BRIDGE_SLACK_S and knots[-1] >= end - BRIDGE_SLACK_S for knots in bridges)
+        if not any(max(abs(knots[0] - start), abs(knots[-1] - end)) < BRIDGE_SLACK_S for knots in bridges)
     )
 
 
-def untrusted_part(profile: CameraProfile, start_s: float, end_s: float) -> tuple[float, float] | None:
-    """The first stretch without a bridge that a frame's rows [start_s, end_s] reach into; None: there is none."""
-    return next((part for part in unbridged(profile) if start_s < part[1] and end_s > part[0]), None)
+def untrusted_reason(motion: RowMotion) -> str | None:
+    """Why a frame whose rows reach into a stretch without a bridge is left alone; None: it does not."""
+    end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
+    parts = (part for part in unbridged(motion.profile) if motion.start_s < part[1] and end_s > part[0])
+    return next((f"{UNTRUSTED} from {start:.3f} to {end:.3f} s" for start, end in parts), None)
 
 
 def moved_over_frame(
