@@ -50,7 +50,11 @@ def read_columns(path: Path) -> dict[str, Any]:
 def _nearest(columns: dict[str, Any]) -> str:
     """The column that may be meant by a missing one."""
     missing = [name for name in NEEDED if name not in columns]
-    near = [difflib.get_close_matches(name, columns, n=1, cutoff=0.4) for name in missing]
+    spare = [name for name in columns if name not in NEEDED]
+    near = [
+        [s for s in spare if s.startswith(name)][:1] or difflib.get_close_matches(name, spare, n=1, cutoff=0.4)
+        for name in missing
+    ]
     pairs = [f"'{found[0]}' for '{name}'" for name, found in zip(missing, near, strict=True) if found]
     return f"rename {', '.join(pairs)}?" if pairs else ""
 

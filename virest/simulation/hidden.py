@@ -79,6 +79,6 @@ def gyro_reading(profile: CameraProfile, time_s: Array, rate_rad_s: Array, force
     Along rates a field runs over the reading itself, less bias and over scale: found in a few steps.
     """
     reading = rate_rad_s
-    for _ in range(4 if any(field.kind == "rate" for field in profile.extensions.field) else 0):
+    for _ in range(10 if any(field.kind == "rate" for field in profile.extensions.field) else 0):
         reading = rate_rad_s - missing_rate_rad_s(profile, time_s, reading, force_m_s2)
     return np.asarray(reading * profile.gyro_scale + profile.gyro_bias_rad_s)
