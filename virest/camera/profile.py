@@ -28,6 +28,8 @@ from virest.errors import SettingsError
 MAX_PROFILE_BYTES = 1_000_000
 MAX_SIDE_PX = 20_000
 MAX_DEPTH = 20
+BRIDGE_SLACK_S = 1e-3
+"""A bridge may end this far from its stretch, as either is rounded."""
 LARGEST = 1e12
 """No value of a profile is larger: between clocks of different epochs lie 2e9 s.  Far beyond, products overflow."""
 MAX_DIGITS = 250
@@ -108,6 +110,13 @@ class CameraProfile:
         lens = self.intrinsics
         own = (self.shutter.uneven, None if lens is None else lens.displaced)
         return (*(f for f in own if f is not None), *self.extensions.field)
+
+    @property
+    def unbridged_s(self) -> tuple[tuple[float, float], ...]:
+        """Untrusted stretches of the inertial log that no field of the rate over their time bridges."""
+        knots = [f.knots[0] for f in self.extensions.field if f.kind == "rate" and f.covariates == ("time",)]
+        bridged = np.array([(k[0], k[-1]) for k in knots]).reshape(-1, 2)
+        return tuple(s for s in self.imu_untrusted_s if not np.any(np.abs(bridged - s).max(axis=1) < BRIDGE_SLACK_S))
 
     def with_fields(self, fields: Sequence[ModelField]) -> CameraProfile:
         """The profile with these fields and no others. Raises SettingsError for two of a kind of which one is held."""

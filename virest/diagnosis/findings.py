@@ -82,8 +82,8 @@ class FieldFinding:
     unit: str
     std: float | None
     held_out: HeldOutGain
-    p_value: float
-    """For the whole set of forms that were asked."""
+    p_value: float | None
+    """For the whole set of forms that were asked; None: none can be given."""
     confounded: tuple[str, ...]
     """Forms over other covariates that this capture cannot tell from it."""
     stability: float | None

@@ -14,7 +14,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.degradation.light import flicker
 from virest.diagnosis.candidates import FarClock
-from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges
+from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges, with_description
 from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
@@ -100,6 +100,8 @@ class TrackedPoints:
         found = with_fields(found, evidence, self.capture)
         if doubtful.sets_aside:
             with_bridges(found, observed, doubtful, self.capture)
+        elif doubtful.hit.any():
+            with_description(found, evidence, doubtful, self.capture)
         return found
 
 

@@ -28,7 +28,6 @@ from virest.restoration.neighbours.sights import FrameTurns, Sight, with_neighbo
 from virest.restoration.settings import RestorationSettings
 
 UNTRUSTED = "the inertial log does not follow the camera"
-BRIDGE_SLACK_S = 1e-3
 FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
 
 
@@ -121,20 +120,10 @@ def restore_frames(
         yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined)
 
 
-def unbridged(profile: CameraProfile) -> tuple[tuple[float, float], ...]:
-    """Stretches of the inertial log that are not trusted and that no field of the rate over time bridges."""
-    bridges = [f.knots[0] for f in profile.fields if f.kind == "rate" and f.covariates == ("time",)]
-    return tuple(
-        (start, end)
-        for start, end in profile.imu_untrusted_s
-        if not any(max(abs(knots[0] - start), abs(knots[-1] - end)) < BRIDGE_SLACK_S for knots in bridges)
-    )
-
-
 def untrusted_reason(motion: RowMotion) -> str | None:
     """Why a frame whose rows reach into a stretch without a bridge is left alone; None: it does not."""
     end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
-    parts = (part for part in unbridged(motion.profile) if motion.start_s < part[1] and end_s > part[0])
+    parts = (part for part in motion.profile.unbridged_s if motion.start_s < part[1] and end_s > part[0])
     return next((f"{UNTRUSTED} from {start:.3f} to {end:.3f} s" for start, end in parts), None)
 
 

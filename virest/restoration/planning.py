@@ -33,7 +33,7 @@ from virest.motion.observed_tracks import observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
-from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame, unbridged
+from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.neighbours.sights import Sight
 from virest.restoration.neighbours.survey import kept_lumas, survey_runs, survey_turns
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
@@ -342,7 +342,7 @@ def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
         f"defocus of {ext.defocus_sigma_px:g} px: undone with the blur": ext.defocus_sigma_px,
     }
     lines |= {f"field of {field.kind} over {', '.join(field.covariates)}: followed": 1 for field in profile.fields}
-    bridged = len(profile.imu_untrusted_s) - len(unbridged(profile))
+    bridged = len(profile.imu_untrusted_s) - len(profile.unbridged_s)
     lines[f"{bridged} stretches of an inertial log that is not trusted: bridged from the pictures"] = bridged
     return tuple(line for line, size in lines.items() if size)
 

@@ -101,6 +101,21 @@ def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Do
     )
 
 
+def with_description(found: GeometricVerdict, evidence: Evidence, doubtful: Doubtful, capture: Capture) -> None:
+    """Describe stretches that are too many to be set aside; their frames cannot be judged without them."""
+    hit = doubtful.hit[found.table.pair]
+    p_value = _further_off(found.fit.distance, found.table, doubtful.hit) if not hit.all() else None
+    if p_value is not None and p_value > MAX_P:
+        return
+    untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
+    profile = replace(found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
+    found.model = replace(found.model, profile=profile)
+    off_px, rest_px = (_rms(found.fit.distance[part]) * evidence.typical_px for part in (hit, ~hit))
+    found.fields.append(
+        Distrusted(doubtful.stretches, (False,) * len(doubtful.stretches), p_value, off_px, off_px, rest_px, profile)
+    )
+
+
 def _with_scene(evidence: Evidence, model: Model, table: TrackTable) -> Model:
     """The model with a scene for this table's windows."""
     scene = model.scene

@@ -46,8 +46,8 @@ class Distrusted:
     stretches: tuple[Stretch, ...]
     bridged: tuple[bool, ...]
     """Whether the points tell the rates there."""
-    p_value: float
-    """That points there lie no further off than elsewhere."""
+    p_value: float | None
+    """That points there lie no further off than elsewhere; None: there is no elsewhere."""
     before_px: float
     """Rms of the points of frames that reach into a stretch."""
     after_px: float

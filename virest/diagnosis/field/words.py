@@ -136,6 +136,8 @@ def _distrusted(entry: Distrusted) -> FieldFinding:
         following = "look at the raw log for rows with equal steps, and record with less load on the phone"
     bridged = "bridged from the points" if all(entry.bridged) else "left alone by process"
     said = f"{sentence} (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out; {bridged})"
+    if not any(entry.bridged):
+        said = f"{sentence} (points {entry.before_px:.3g} px off there; {bridged})"
     bridges = tuple(
         f for f in entry.profile.fields if f.kind == "rate" and f.covariates == ("time",) and f.belongs_to_one_capture
     )
