@@ -53,7 +53,9 @@ def kernel_spread(
     at = field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
     samples = at.paths_px.shape[1]
     since = ((np.arange(samples) + 0.5) / samples - at.anchor)[:, None]
-    ends = [sign * np.sqrt(2 * max(v, 0.0)) * axis for v, axis in zip(variances, axes.T, strict=True) for sign in (1, -1)]
+    ends = [
+        sign * np.sqrt(2 * max(v, 0.0)) * axis for v, axis in zip(variances, axes.T, strict=True) for sign in (1, -1)
+    ]
     return KernelSpread(tuple(replace(at, paths_px=at.paths_px + since * end) for end in ends))
 
 

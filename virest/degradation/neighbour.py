@@ -53,9 +53,12 @@ class NeighbourView:
         first, second = (m.start_s + 0.5 * (m.readout_time_s + m.exposure_s) for m in (self.frame, self.neighbour))
         return first, second
 
-    def map_px(self) -> NDArray[np.float32]:
-        """:meth:`places_px` of every pixel, (height, width, 2), as cv2.remap takes it."""
-        return grid_filled(self.frame, self.places_px)
+    def map_px(self, moved: Callable[[Array], Array] = lambda points_px: points_px) -> NDArray[np.float32]:
+        """:meth:`places_px` of every pixel, (height, width, 2), as cv2.remap takes it.
+
+        moved: where pixels (..., 2) are looked for instead, a smooth map.
+        """
+        return grid_filled(self.frame, lambda points_px: self.places_px(moved(points_px)))
 
     def field(self) -> Callable[[Array], KernelField]:
         """Kernels of the neighbour's picture once it is brought to the frame's pixels, at any centres (n, 2)."""
@@ -72,10 +75,20 @@ class NeighbourView:
 
 
 def neighbour_view(
-    frame: RowMotion, neighbour: RowMotion, trajectory: Trajectory, lens: MovingLens, anchor: float = 0.5
+    frame: RowMotion,
+    neighbour: RowMotion,
+    trajectory: Trajectory,
+    lens: MovingLens,
+    anchor: float = 0.5,
+    turn: tuple[Array, Array] | None = None,
 ) -> NeighbourView:
-    """Look from one frame at another; lens: of the whole trajectory."""
+    """Look from one frame at another; lens: of the whole trajectory.
+
+    turn: rate and slope, as :meth:`RowMotion.turned` takes them, that the trajectory lacks over both frames.
+    """
     both = covering_both(frame, neighbour, trajectory, lens)
+    if turn is not None:
+        both = both.turned(*turn)
     return NeighbourView(both, with_row_clock_of(both, neighbour), anchor)
 
 

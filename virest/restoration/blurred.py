@@ -14,6 +14,7 @@ from virest.camera.response import ResponseCurve
 from virest.degradation.blur import Image
 from virest.degradation.kernel_spread import KernelSpread
 from virest.degradation.kernels import KernelField
+from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
 CLIPPED_LEVELS = 2.0
@@ -57,6 +58,8 @@ class BlurredPicture:
     """Takes light back to grey levels."""
     spread: KernelSpread | None = None
     """How well the kernels are known; None: as if exactly."""
+    neighbours: tuple[NeighbourPicture, ...] = ()
+    """Further measurements of the same sharp luma."""
     kept: Image | None = None
     """Vignetting (height, width) that the restored picture has and ``light`` has not; None: none."""
 
@@ -182,5 +185,6 @@ def reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
         statistics=blurred.statistics.scaled(1 / times),
         field=field,
         longest_px=blurred.longest_px / times,
+        neighbours=(),
         spread=None if blurred.spread is None else blurred.spread.scaled(1 / times),
     )

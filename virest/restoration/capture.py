@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,10 @@ from virest.restoration.frame import (
     restore_frame,
     unknown_parameters,
 )
+from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.refinement import MissingTurn
-from virest.restoration.neighbours.sights import FrameTurns, Sight, with_neighbours
-from virest.restoration.settings import RestorationSettings
+from virest.restoration.neighbours.sights import FrameNeighbours, Sight, with_neighbours
+from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 
 UNTRUSTED = "the inertial log does not follow the camera"
 FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
@@ -55,10 +57,21 @@ class RestorationPlan:
     missing_turn: MissingTurn | None = None
     """What neighbouring frames show that the predicted turns lack; None: nothing, or it could not be measured."""
 
+    confirmed: ConfirmedGain | None = None
+    """How much of a promised gain neighbouring frames confirm; None: they could not tell."""
+
     @property
     def reach(self) -> int:
         """Neighbours of a frame on each side that its restoration looks at."""
-        return 0 if self.missing_turn is None or self.copy_reason is not None else 1
+        if self.copy_reason is not None:
+            return 0
+        joined = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
+        return max(joined, 0 if self.missing_turn is None else 1)
+
+    def joined(self, before: Sequence[Sight], after: Sequence[Sight]) -> tuple[Sight, ...]:
+        """Those of a frame's neighbours that are restored with it, in order."""
+        count = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
+        return (*before[len(before) - count :], *after[:count]) if count else ()
 
     def of(self, frames: Iterable[Frame]) -> RestorationPlan:
         """The plan as a worker needs it who has these frames only."""
@@ -82,9 +95,9 @@ def restore_frames(
     profile = plan.profile
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
     lens = moving_lens(trajectory, profile) if trajectory is not None else None
-    translations, turns = plan.translations or {}, None
-    if trajectory is not None and lens is not None and plan.missing_turn is not None:
-        turns = FrameTurns(trajectory, lens, plan.missing_turn)
+    translations, neighbours = plan.translations or {}, None
+    if trajectory is not None and lens is not None and plan.reach:
+        neighbours = FrameNeighbours(trajectory, lens, plan.missing_turn)
 
     def sight(frame: Frame, picture: NDArray[np.uint8]) -> Sight:
         if trajectory is None:
@@ -116,8 +129,11 @@ def restore_frames(
         if plan.contradicted is not None:
             moved = translations.get(frame.index)
             seen = moved_over_frame(trajectory, lens, frame, plan.settings.reference, moved, plan.contradicted)
-        refined = turns.refined(before, here, after) if turns is not None else None
-        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined)
+        refined, pictures = None, None
+        if neighbours is not None:
+            refined = neighbours.refined(before, here, after)
+            pictures = partial(neighbours.pictures, plan.joined(before, after), here, refined)
+        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures)
 
 
 def untrusted_reason(motion: RowMotion) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,6 +27,8 @@ from virest.restoration.clipped_light import measured_share, near_clipped, unsee
 from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
+from virest.restoration.neighbours.confirmation import ConfirmedGain
+from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
@@ -53,6 +56,11 @@ PART_STEP_PX = 80
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
+CURVE_SLOPE_STD = 0.1
+"""One standard deviation of the real tone curve's slope over the profile's, from one brightness to another.
+
+No phone keeps to a curve that nobody measured on it.  A slope that differs by ε makes an error of ε times the picture's
+own detail wherever brightness changes, blurred or not: ε² S beside the noise."""
 _LEAST_FALL = 2.0
 """The power of pictures falls with frequency at least so steeply: f⁻² is that of edges alone, without texture."""
 MIN_RELIGHT = 0.002
@@ -87,12 +95,15 @@ def restore_frame(
     settings: RestorationSettings,
     seen: RowMotion | None = None,
     refined: RefinedMotion | None = None,
+    confirmed: ConfirmedGain | None = None,
+    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
     picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
     pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
-    is then taken.
+    is then taken.  confirmed: how much of a promised gain neighbours confirm.  neighbours:
+    brings those to the frame that it is restored with.
     """
     clock = _Clock()
     if refined is not None:
@@ -114,7 +125,7 @@ def restore_frame(
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
         restored, parameters["deblur"], why_not = _deblurred(
-            picture, motion, settings, anchor, longest_px, light, covariance_px2
+            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed, neighbours
         )
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
@@ -137,6 +148,27 @@ def restore_frame(
     return RestoredFrame(
         frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds
     )
+
+
+def deblurred_luma(
+    luma: NDArray[np.uint8], motion: RowMotion, settings: RestorationSettings, refined: RefinedMotion | None
+) -> tuple[NDArray[np.uint8], float] | None:
+    """A luma (height, width) deblurred, its rows at the middles of their exposures, and the gain promised for it in dB.
+
+    None where it is left alone.
+    """
+    height, width = luma.shape
+    grid = tile_grid(height, width, LOG_TILE_PX, 0)
+    longest_px = float(np.linalg.norm(blur_chords(motion, grid.centres_px), axis=-1).max())
+    longest_px = float(equivalent_length_px(motion.profile, longest_px))
+    if _deblur_method(motion, settings, longest_px)[0] == "none":
+        return None
+    covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
+    picture = cv2.merge([luma] * 3)
+    sharp, details, _ = _deblurred(picture, motion, settings, 0.5, longest_px, None, covariance_px2, None)
+    if details["method"] == "none":
+        return None
+    return rounded(np.ascontiguousarray(sharp[..., 1])), float(details["promised_gain_db"])
 
 
 def _limits(motion: RowMotion) -> tuple[str, ...]:
@@ -274,6 +306,8 @@ def _deblurred(
     longest_px: float,
     light: FrameLight | None,
     covariance_px2: NDArray[np.float64],
+    confirmed: ConfirmedGain | None,
+    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
@@ -285,11 +319,15 @@ def _deblurred(
     spread = kernel_spread(field, width, height, covariance_px2)
     luma_model = luma if spread is None else luma.doubted(spread.variance(SIDE))
     share = 1.0 if anchor != 0.5 else _trusted_share(luma_model)
-    why_not = _too_little_to_gain(luma_model)
+    promised_db = luma_model.expected_gain_db
+    expected_db = promised_db if confirmed is None else confirmed.expected_db(promised_db)
+    why_not = _too_little_to_gain(luma_model, expected_db)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    blurred = replace(blurred, spread=spread)
+    joined = neighbours() if neighbours is not None and light is None and anchor == 0.5 else ()
+    longest_px = max((longest_px, *(one.longest_px for one in joined)))
+    blurred = replace(blurred, spread=spread, neighbours=joined, longest_px=longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
     recorded = picture
@@ -310,8 +348,11 @@ def _deblurred(
         "strength": settings.strength,
         "tile_px": settings.tile_px,
         "noise_grey_levels": luma.noise_levels,
-        "expected_gain_db": luma_model.expected_gain_db,
+        "expected_gain_db": None if confirmed is None else expected_db,
+        "expected_gain_std_db": None if confirmed is None else confirmed.std_db,
+        "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
+        "neighbours": [{"frame": one.number, "weight": float(one.weights.mean())} for one in joined],
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
@@ -339,7 +380,8 @@ def _measured(
     luma, chroma = measure_picture(
         picture, replace(field, defocus_sigma_px=0.0), curve, clipped_anywhere(picture, curve), most_tiles
     )
-    return _focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px)
+    focused = (_focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px))
+    return focused[0].with_error_share(CURVE_SLOPE_STD**2), focused[1].with_error_share(CURVE_SLOPE_STD**2)
 
 
 def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics:
@@ -364,7 +406,16 @@ def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics
         last = drowned[0] - 1
         signal[last + 1 :] = np.minimum(signal, falling_power(frequency, signal, last))[last + 1 :]
     places = defocused.places and defocused.places.after(left)
-    return replace(defocused, signal=signal, noise=noise, passed=passed, places=places)
+    real, cells = defocused.real, defocused.cells
+    return replace(
+        defocused,
+        signal=signal,
+        noise=noise,
+        passed=passed,
+        places=places,
+        real=None if real is None else real * np.sqrt(left),
+        cells=None if cells is None else (cells[0], cells[1] * left[:, None]),
+    )
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
@@ -404,12 +455,12 @@ def _mixed(
     return mixed
 
 
-def _too_little_to_gain(luma: PictureStatistics) -> str:
+def _too_little_to_gain(luma: PictureStatistics, expected_db: float) -> str:
     """Why the picture is better left as it was recorded; empty: it is not."""
     if not luma.measured:
         return "picture too small, or its blur too long, for its noise to be measured: left alone"
-    if luma.expected_gain_db < MIN_GAIN_DB:
-        return f"deblurring is expected to gain only {luma.expected_gain_db:.2f} dB, left alone"
+    if expected_db < MIN_GAIN_DB:
+        return f"deblurring is expected to gain only {max(expected_db, 0.0):.2f} dB, left alone"
     return ""
 
 

@@ -34,10 +34,11 @@ from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
+from virest.restoration.frame import deblurred_luma
 from virest.restoration.neighbours.sights import Sight
-from virest.restoration.neighbours.survey import kept_lumas, survey_runs, survey_turns
+from virest.restoration.neighbours.survey import kept_lumas, survey_gain, survey_runs, survey_turns
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
-from virest.restoration.settings import RestorationSettings
+from virest.restoration.settings import PRESETS, RestorationSettings
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
 MAX_OFFSET_STD_S = 0.003
@@ -107,7 +108,7 @@ def plan_restoration(
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
     plan = _with_seen_paths(plan, profile, capture, powers)
-    return _with_missing_turn(plan, capture, surveyed, lumas)
+    return _with_neighbours(plan, capture, surveyed, lumas)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
@@ -181,13 +182,13 @@ def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[i
     return dict(zip((f.index for f in frames), (focal_px * at_frames * exposure_s).tolist(), strict=True))
 
 
-def _with_missing_turn(
+def _with_neighbours(
     plan: RestorationPlan,
     capture: Capture,
     runs: Sequence[Sequence[int]],
     lumas: Mapping[int, NDArray[np.uint8]],
 ) -> RestorationPlan:
-    """What neighbouring frames show that the predicted turns lack, so that each frame's paths can be corrected."""
+    """What neighbouring frames show that the predicted turns lack, and how much of a promised gain they confirm."""
     profile = plan.profile
     if not lumas or profile.intrinsics is None:
         return plan
@@ -196,20 +197,29 @@ def _with_missing_turn(
     frames = at_true_times(capture.frames, profile, capture.repeats)
     sights = {}
     for number, luma in lumas.items():
-        motion = moved_over_frame(
-            trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile
-        )
+        motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
     missing = survey_turns(runs, sights, trajectory, lens)
-    if missing is None:
+    if missing is not None:
+        said = (
+            f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
+            "each frame's motion is corrected by its neighbours"
+        )
+        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, said))
+    if plan.settings.deblur == "none":
         return plan
-    said = (
-        f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
-        "each frame's motion is corrected by its neighbours"
+    quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
+    confirmed = survey_gain(
+        runs,
+        sights,
+        missing,
+        trajectory,
+        lens,
+        lambda luma, motion, refined: deblurred_luma(luma, motion, quick, refined),
     )
-    return replace(plan, missing_turn=missing, notes=(*plan.notes, said))
+    return replace(plan, confirmed=confirmed)
 
 
 def _with_seen_paths(

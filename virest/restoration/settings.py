@@ -13,6 +13,8 @@ DEBLUR_METHODS = (
     "hyper-laplacian",
     "hyper-laplacian-global",
 )
+JOINT_METHODS = ("gradient-wiener", "hyper-laplacian", "hyper-laplacian-global")
+"""Those that restore a frame together with its neighbours."""
 SHUTTER_METHODS = ("none", "perspective", "rowwise")
 REFERENCES = ("exposure-start", "frame-middle")
 FEW_ITERATIONS = 2
@@ -40,14 +42,18 @@ class RestorationSettings:
     """Multiplies the measured noise in the regularisation: 1 trusts it, more is smoother."""
     min_blur_px: float = 1.0
     """Frames whose longest blur path is shorter are not deblurred."""
+    neighbours: int = 0
+    """Neighbours on each side that a frame is restored together with."""
     keep_start_up: bool = False
     """Process the frames of the recorder's start-up too, although their content is later than their stamps."""
 
 
 PRESETS: dict[str, RestorationSettings] = {
     "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=176, strength=0.8),
-    "balanced": RestorationSettings("balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0),
+    "balanced": RestorationSettings(
+        "balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=1
+    ),
     "best": RestorationSettings(
-        "best", "hyper-laplacian-global", iterations=8, inner_iterations=6, tile_px=104, strength=1.0
+        "best", "hyper-laplacian-global", iterations=8, inner_iterations=6, tile_px=104, strength=1.0, neighbours=2
     ),
 }

@@ -71,6 +71,8 @@ class TileDeconvolution:
         _power_at_ends(self.kernels, self.powers)
         if variance is not None:
             self.powers += variance(self.size)
+        self._joined: Image | None = None
+        """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra."""
         self._tamed: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
         self._lamps: dict[int, tuple[Image, Image]] = {}
@@ -96,7 +98,30 @@ class TileDeconvolution:
             np.multiply(_inner_numbers(spectrum), _inner_numbers(self.kernels[number]), out=inner)
             ends[number] = _ends(spectrum)
         _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
+        if self._joined is not None:
+            projected += self._joined
         return projected
+
+    def join(self, channel: Image, kernels: Image, weights: NDArray[np.float64], sharpness: Image) -> None:
+        """Take a further picture (height, width) of the same scene into account, with a weight for each tile.
+
+        kernels: (tiles, k, k).  sharpness: what its uncertain place leaves of it on average, a packed real factor;
+        the power |K|² stays, as in any expected data term.
+        """
+        if self._joined is None:
+            self._joined = np.zeros_like(self.kernels)
+        padded = self.padded(channel)
+        one = np.empty((self.size, self.size), np.float32)
+        tiles = zip(self.grid.corners(), weights.tolist(), _kernel_spectra(kernels, self.size), strict=True)
+        for number, ((top, left), weight, kernel) in enumerate(tiles):
+            if not weight:
+                continue
+            spectrum = cv2.dft(self.periodic(padded, top, left), self._spectrum)
+            back = cv2.mulSpectrums(spectrum, kernel, 0)
+            cv2.scaleAdd(cv2.multiply(back, sharpness, back), weight, self._joined[number], self._joined[number])
+            _power_inside(kernel, one)
+            _power_at_ends(kernel[None], one[None])
+            cv2.scaleAdd(one, weight, self.powers[number], self.powers[number])
 
     def touched(self, mask: Image) -> list[int]:
         """Numbers of the tiles that see anything of a mask (height, width)."""

@@ -61,8 +61,8 @@ class MissingTurn:
             slope, rate, covariance = np.zeros(3), rates[0], covariances[0]
             bend = self.bend_rad_s / HALF_SPACING
         scatter = float(np.mean([t.scatter_px_s for t in (before, after) if t is not None]))
-        turned = motion.turned(rate + slope * (motion.reference_s - middle_s), slope)
-        return RefinedMotion(turned, covariance + bend**2 * np.eye(3), scatter)
+        turn = rate + slope * (motion.reference_s - middle_s), slope
+        return RefinedMotion(motion.turned(*turn), covariance + bend**2 * np.eye(3), scatter, turn)
 
     def _likely(self, turn: PairTurn) -> bool:
         spread = turn.covariance + self.rate_rad_s**2 * np.eye(3)
@@ -78,6 +78,8 @@ class RefinedMotion:
     """(3, 3) of the turn rate, (rad/s)²."""
     scatter_px_s: float
     """One standard deviation, each axis, of parts of the picture about it."""
+    turn: tuple[Array, Array] | None = None
+    """Rate and slope that were added to the predicted motion, (3,) each; None: it stays as predicted."""
 
     def path_covariance_px2(self) -> Array:
         """(2, 2) covariance of the blur path's end over its start, at the picture's middle, x then y."""

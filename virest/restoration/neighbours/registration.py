@@ -95,13 +95,77 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
     return _turn(view, tops_lefts, times, shift + apart, precision)
 
 
-def _tiles(height: int, width: int) -> NDArray[np.intp]:
-    """(n, 2) top and left of at most MOST_TILES tiles, evenly over a picture."""
+@dataclass(frozen=True, slots=True)
+class TileAgreement:
+    """How a neighbour's tiles agree with a frame's, each blurred as the other was and shifted onto it."""
+
+    centres_px: Array
+    """(n, 2) in the frame."""
+    shift_px: Array
+    """(n, 2): the neighbour shows at a predicted place what the frame has so far on."""
+    precision: Array
+    """(n,) of the shifts, relative; 0: the tile shows something else."""
+    error: Array
+    """(n,) mean square difference, in light over its mean."""
+    signal: Array
+    """(n,) mean square of what both show."""
+    gain: float
+    """The neighbour's light over the frame's."""
+
+
+def tile_agreement(view: NeighbourView, first: Image, second: Image) -> TileAgreement | None:
+    """Compare all tiles of two reduced pictures; None where a path does not fit into a tile."""
+    times = view.frame.profile.height / first.shape[0]
+    tops_lefts = _tiles(*first.shape, most=first.size)
+    kernels = _kernel_spectra(view, tops_lefts, times)
+    if kernels is None:
+        return None
+    here, there = _cut(first, tops_lefts), _seen(view, second, tops_lefts, np.zeros(2), times)
+    a, b = _spectra(here) * kernels[1], _spectra(there) * kernels[0]
+    shift, precision = _tile_shifts(a, b, np.zeros(2))
+    wx, wy = _frequencies()
+    ahead = shift[:, 0, None, None].astype(np.float32) * wx + shift[:, 1, None, None].astype(np.float32) * wy
+    error = (np.abs(a * np.exp(1j * ahead) - b) ** 2).mean(axis=(1, 2))
+    gain = float(np.median(there.mean(axis=(1, 2)) / np.maximum(here.mean(axis=(1, 2)), 1e-6)))
+    centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)
+    return TileAgreement(centres_px, shift * times, precision, error, (np.abs(b) ** 2).mean(axis=(1, 2)), gain)
+
+
+def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Image) -> tuple[float, float] | None:
+    """How far a frame, as recorded and as restored, is from its neighbour once each is blurred as that one was.
+
+    Mean squares over spectra of light over its mean; what only shifts a tile is no error of the blur.  All pictures
+    are reduced; None where a path does not fit into a tile or the frames show different things.
+    """
+    times = view.frame.profile.height / first.shape[0]
+    tops_lefts = _tiles(*first.shape)
+    kernels = _kernel_spectra(view, tops_lefts, times)
+    if kernels is None:
+        return None
+    b = _spectra(_seen(view, second, tops_lefts, np.zeros(2), times))
+    left, used = [], np.ones(len(tops_lefts), bool)
+    for picture in (first, sharp):
+        a = _spectra(_cut(picture, tops_lefts)) * kernels[1]
+        shift, precision = _tile_shifts(a, b, np.zeros(2))
+        used &= precision > 0
+        wx, wy = _frequencies()
+        ahead = shift[:, 0, None, None] * wx + shift[:, 1, None, None] * wy
+        left.append((np.abs(a * np.exp(1j * ahead) - b) ** 2).mean(axis=(1, 2)))
+    if np.count_nonzero(used) < LEAST_TILES:
+        return None
+    return float(left[0][used].mean()), float(left[1][used].mean())
+
+
+def _tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
+    """(n, 2) top and left of at most so many tiles, evenly over a picture."""
     tops, lefts = (
-        np.linspace(0, length - TILE, max(1, length // TILE)).astype(np.intp) for length in (height, width)
+        np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(
+            np.intp
+        )
+        for length in (height, width)
     )
     corners = np.stack(np.meshgrid(tops, lefts, indexing="ij"), -1).reshape(-1, 2)
-    chosen = np.unique(np.linspace(0, len(corners) - 1, min(len(corners), MOST_TILES)).round().astype(np.intp))
+    chosen = np.unique(np.linspace(0, len(corners) - 1, min(len(corners), most)).round().astype(np.intp))
     return np.asarray(corners[chosen])
 
 
@@ -110,7 +174,9 @@ def _full_px(tops_lefts: NDArray[np.intp], times: float, at: float) -> Array:
     return np.asarray((tops_lefts[:, ::-1] + at + 0.5) * times - 0.5)
 
 
-def _kernel_spectra(view: NeighbourView, tops_lefts: NDArray[np.intp], times: float) -> list[NDArray[np.complex64]] | None:
+def _kernel_spectra(
+    view: NeighbourView, tops_lefts: NDArray[np.intp], times: float
+) -> list[NDArray[np.complex64]] | None:
     """Transposes of the kernels of the frame and of its neighbour, (n, TILE, TILE / 2 + 1) each.
 
     None where a path does not fit into half a tile.

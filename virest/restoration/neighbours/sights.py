@@ -18,8 +18,10 @@ from virest.degradation.neighbour import neighbour_view
 from virest.degradation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
+from virest.restoration.neighbours.joint import NeighbourPicture, neighbour_picture
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
-from virest.restoration.neighbours.registration import PairTurn, pair_turn, reduced_light
+from virest.restoration.neighbours.registration import PairTurn, pair_turn, reduced_light, tile_agreement
+from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +42,9 @@ class Sight:
         return self.motion is not None and not self.outside and self.motion.exposure_s > 0
 
 
-def with_neighbours(sights: Iterable[Sight], reach: int) -> Iterator[tuple[tuple[Sight, ...], Sight, tuple[Sight, ...]]]:
+def with_neighbours(
+    sights: Iterable[Sight], reach: int
+) -> Iterator[tuple[tuple[Sight, ...], Sight, tuple[Sight, ...]]]:
     """Each frame with up to ``reach`` before and after it, in order; holds 2 reach + 1 at a time."""
     window: deque[Sight] = deque()
     here = 0
@@ -61,24 +65,42 @@ def _around(window: Sequence[Sight], here: int, reach: int) -> tuple[tuple[Sight
     return sights[max(here - reach, 0) : here], sights[here], sights[here + 1 : here + 1 + reach]
 
 
-class FrameTurns:
-    """Motions of passing frames, with the turn that each one's neighbours show to be missing.
+class FrameNeighbours:
+    """What passing frames' neighbours tell: the turn that the prediction lacks, and further measurements.
 
     A pair is compared once, for the frame before it and for the one after it.
     """
 
-    def __init__(self, trajectory: Trajectory, lens: MovingLens, missing: MissingTurn) -> None:
-        """lens: of the whole trajectory."""
+    def __init__(self, trajectory: Trajectory, lens: MovingLens, missing: MissingTurn | None) -> None:
+        """lens: of the whole trajectory.  missing: what the capture usually lacks; None: nothing."""
         self._trajectory, self._lens, self._missing = trajectory, lens, missing
         self._light: dict[int, Image] = {}
         self._turns: dict[int, PairTurn | None] = {}
 
-    def refined(self, before: Sequence[Sight], here: Sight, after: Sequence[Sight]) -> RefinedMotion:
+    def refined(self, before: Sequence[Sight], here: Sight, after: Sequence[Sight]) -> RefinedMotion | None:
         """The frame's motion by its neighbours; one that does not follow in the movie tells nothing."""
         assert here.motion is not None
-        self._forget_before(here.frame.index - 1)
+        self._forget_before(here.frame.index - max(len(before), 1))
+        if self._missing is None:
+            return None
         turns = [self._turn(before[-1], here) if before else None, self._turn(here, after[0]) if after else None]
         return self._missing.refined(here.motion, *turns)
+
+    def pictures(
+        self, around: Sequence[Sight], here: Sight, refined: RefinedMotion | None
+    ) -> tuple[NeighbourPicture, ...]:
+        """The usable ones of a frame's neighbours, brought to its pixels."""
+        assert here.motion is not None
+        found = []
+        for other in around:
+            if not other.usable or other.motion is None or other.frame.index == here.frame.index:
+                continue
+            turn = None if refined is None else refined.turn
+            view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, turn=turn)
+            agreement = tile_agreement(view, self._light_of(here), self._light_of(other))
+            if agreement is not None:
+                found.append(neighbour_picture(view, other.frame.index, _luma_light(other), agreement))
+        return tuple(one for one in found if one is not None and one.weights.any())
 
     def _turn(self, first: Sight, second: Sight) -> PairTurn | None:
         number = first.frame.index
@@ -106,6 +128,14 @@ def light_of(sight: Sight) -> Image:
     assert sight.motion is not None
     luma = sight.picture if sight.picture.ndim == 2 else cv2.cvtColor(sight.picture, cv2.COLOR_RGB2GRAY)
     return reduced_light(luma, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
+
+
+def _luma_light(sight: Sight) -> Image:
+    """Luma of a frame's light, (height, width)."""
+    assert sight.motion is not None
+    light = cv2.LUT(sight.picture, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
+    weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
+    return np.asarray(cv2.transform(light, weights), np.float32)
 
 
 @lru_cache(maxsize=4)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.degradation.neighbour import neighbour_view
 from virest.degradation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
-from virest.restoration.neighbours.refinement import MissingTurn, missing_turn
-from virest.restoration.neighbours.registration import PairTurn
-from virest.restoration.neighbours.sights import Sight, light_of, turn_between
+from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
+from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion, missing_turn
+from virest.restoration.neighbours.registration import PairTurn, predicted_error
+from virest.restoration.neighbours.sights import FrameNeighbours, Sight, light_of, turn_between
 
 RUN_FRAMES = 4
 """Three pairs: what linear interpolation leaves of the middle one shows."""
@@ -65,3 +68,38 @@ def survey_turns(
 
     turns = [[between(a, b) for a, b in zip(run, run[1:], strict=False)] for run in runs]
     return missing_turn(turns, motions)
+
+
+def survey_gain(
+    runs: Sequence[Sequence[int]],
+    sights: Mapping[int, Sight],
+    missing: MissingTurn | None,
+    trajectory: Trajectory,
+    lens: MovingLens,
+    deblurred: Callable[[Picture, RowMotion, RefinedMotion | None], tuple[Picture, float] | None],
+) -> ConfirmedGain | None:
+    """What deblurring gains by the neighbours' account.
+
+    deblurred: the sharp luma of a frame, at the middle of its exposures, and the gain in dB that is promised for it;
+    None: it is left alone.  The most blurred inner frame of each run is restored and held against both its neighbours.
+    """
+    found = []
+    turns = FrameNeighbours(trajectory, lens, missing) if missing is not None else None
+    for run in runs:
+        around = [sights[n] for n in run if n in sights and sights[n].usable]
+        for before, here, after in zip(around, around[1:], around[2:], strict=False):
+            assert here.motion is not None
+            refined = turns.refined((before,), here, (after,)) if turns is not None else None
+            motion = here.motion if refined is None else refined.motion
+            sharp = deblurred(here.picture, motion, refined)
+            if sharp is None:
+                continue
+            restored = light_of(replace(here, picture=sharp[0]))
+            for other in (before, after):
+                assert other.motion is not None
+                view = neighbour_view(motion, other.motion, trajectory, lens)
+                errors = predicted_error(view, light_of(here), restored, light_of(other))
+                if errors is not None and min(errors) > 0:
+                    found.append((sharp[1], float(10 * np.log10(errors[0] / errors[1]))))
+            break
+    return confirmed_gain(found)

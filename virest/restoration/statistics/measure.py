@@ -46,6 +46,7 @@ def measure_picture(
     chosen = _least_clipped(clipped, corners, most_tiles)
     kernels = field.chosen(chosen).arrays()
     passed = np.stack([passed_power(kernel) for kernel in kernels])
+    real = 0.5 * (1 + passed - np.stack([passed_power(_less_one(kernel)) for kernel in kernels]))
     known = [
         None if clipped is None else known_part(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)
     ]
@@ -67,7 +68,12 @@ def measure_picture(
     of_light, of_luma, of_chroma = fit_rings(
         (light, cells, white_levels), (grey, cells, white_levels), (colour, cells_of_colour, white_noise(red))
     )
-    of_luma = replace(of_luma, noise_levels=of_light.noise_levels)
+    of_luma = replace(
+        of_luma,
+        noise_levels=of_light.noise_levels,
+        real=_ring_means(cells, real),
+        cells=(cells.count, cells.passed),
+    )
     weight = unevenness(of_luma, grey, passed)
     if not weight:
         return of_luma, of_chroma
@@ -75,6 +81,19 @@ def measure_picture(
         replace(of_luma, places=place_statistics(of_luma, grey, passed, weight)),
         replace(of_chroma, places=place_statistics(of_chroma, colour, passed[::2], weight)),
     )
+
+
+def _less_one(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A kernel less the one that leaves all as it is."""
+    left = kernel.copy()
+    left[kernel.shape[0] // 2, kernel.shape[1] // 2] -= 1
+    return left
+
+
+def _ring_means(cells: RingCells, values: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(RINGS,) means of values at the places of the cells; ½ in rings without any, which then count for nothing."""
+    count = cells.count.sum(axis=1)
+    return np.where(count > 0, (cells.count * cells.means(values)).sum(axis=1) / np.maximum(count, 1), 0.5)
 
 
 def _some_rows(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

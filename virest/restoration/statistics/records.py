@@ -67,6 +67,10 @@ class PictureStatistics:
     """RMS of the natural logarithm of |G|² over the fit's |K|² S + N, cell by cell."""
     places: PlaceStatistics | None = None
     """Of a picture that the rings do not fit; None: they do."""
+    real: Array | None = None
+    """(RINGS,) mean real part of the kernels' spectra: what of the picture stays in its place; None: √passed."""
+    cells: tuple[Array, Array] | None = None
+    """Places (RINGS, cells), and their |K|², which a ring's mean hides; None: the mean alone."""
 
     @property
     def unevenness(self) -> float:
@@ -111,6 +115,19 @@ class PictureStatistics:
             noise_levels=scale * self.noise_levels,
         )
 
+    def with_error_share(self, share: float) -> PictureStatistics:
+        """With an error of so much of S beside the noise: what the model of light is known to be wrong by."""
+        if not self.measured:
+            return self
+        noise = self.noise + share * self.signal
+        through = self.frequency * self.passed * self.signal
+        before, after = (
+            np.sum(through * n * n / (self.passed * self.signal + n) ** 2)
+            / np.sum(through * n / (self.passed * self.signal + n) ** 2)
+            for n in (self.noise, noise)
+        )
+        return replace(self, noise=noise, noise_levels=self.noise_levels * float(np.sqrt(after / before)))
+
     def doubted(self, variance: NDArray[np.float32]) -> PictureStatistics:
         """With kernels of some variance over a spectrum (SIDE, SIDE): what it leaves unknown of S counts as noise."""
         over_places = variance[:, 1 : SIDE // 2]
@@ -120,16 +137,21 @@ class PictureStatistics:
 
     @property
     def expected_gain_db(self) -> float:
-        """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured."""
+        """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured.
+
+        Left as it is, a picture misses (1 − K) F, |1 − K|² = 1 − 2 Re K + |K|²; where a path reverses a frequency that is
+        more than all of it.
+        """
         if not self.measured:
             return 0.0
         if self.places is not None:
             return self.places.expected_gain_db(self.signal, self.noise)
-        area = self.frequency
-        through = self.passed * self.signal
-        left = np.sum(area * ((1 - np.sqrt(self.passed)) ** 2 * self.signal + self.noise))
-        restored = np.sum(area * self.signal * self.noise / (through + self.noise))
-        return float(10 * np.log10(left / restored))
+        real = np.sqrt(self.passed) if self.real is None else self.real
+        left = np.sum(self.frequency * ((1 - 2 * real + self.passed) * self.signal + self.noise))
+        count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
+        signal, noise = self.signal[:, None], self.noise[:, None]
+        wrong = (count * signal * noise / (passed * signal + noise)).sum(axis=1) / np.maximum(count.sum(axis=1), 1)
+        return max(float(10 * np.log10(left / np.sum(self.frequency * wrong))), 0.0)
 
 
 def falling_power(frequency: Array, signal: Array, ring: int) -> Array:

@@ -1,0 +1,107 @@
+"""A frame's neighbours as further measurements of its sharp picture.
+
+Each neighbour, brought to the frame's pixels, is a blur of the same sharp picture along another path, with noise of
+its own: Σ_k ‖w_k (A_k x − y_k)‖² has in each tile the numerator Σ w K_k* Y_k and the denominator Σ w E|K_k|², and what
+one path cancels another passes (Delbracio & Sapiro 2015, doi:10.1109/CVPR.2015.7298855, weigh by the pictures' own
+spectra instead).  What a neighbour shows otherwise, blurred as the frame is and the frame as it, is noise of its own:
+things that move, parallax, shadows.  Its weight is the frame's noise over that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.degradation.blur import Image
+from virest.degradation.neighbour import NeighbourView
+from virest.degradation.kernels import KernelField
+from virest.restoration.neighbours.registration import TileAgreement
+
+Array = NDArray[np.float64]
+OWN_ERROR = 0.01
+"""Part of the signal that differs in any two frames: the tone curve acts on each one's own blur."""
+LEAST_WEIGHT = 0.02
+"""A tile whose neighbour weighs less does without."""
+LEAST_SHIFTS = 6
+"""An affine field of shifts has six unknowns; as many tiles again must bear it out."""
+HUBER, ROBUST_STEPS = 1.5, 6
+
+
+@dataclass(frozen=True, slots=True)
+class NeighbourPicture:
+    """One neighbour, brought to the frame's pixels."""
+
+    number: int
+    """Index in the movie."""
+    light: Image
+    """(height, width) luma of its light, as bright as the frame's."""
+    field: Callable[[Array], KernelField]
+    """Its kernels at centres in the frame."""
+    places_px: Array
+    """(n, 2) where the weights hold."""
+    weights: Array
+    """(n,) of its squared difference, over the frame's own."""
+    shift_std_px: float
+    """How well it is known where it lies, each axis."""
+
+    @property
+    def longest_px(self) -> float:
+        """Longest of its blur paths where its weights hold."""
+        return float(self.field(self.places_px).length_px.max())
+
+    def weight_at(self, centres_px: Array, half_side_px: float) -> Array:
+        """(m,) least weight near each centre: within half a tile's side, and at the nearest place."""
+        distance = np.abs(centres_px[:, None] - self.places_px).max(axis=-1)
+        near = distance <= np.maximum(half_side_px, distance.min(axis=1, keepdims=True) + 1e-9)
+        weight = np.where(near, self.weights, np.inf).min(axis=1)
+        return np.where(weight < LEAST_WEIGHT, 0.0, weight)
+
+
+def neighbour_picture(
+    view: NeighbourView, number: int, light: Image, agreement: TileAgreement
+) -> NeighbourPicture | None:
+    """Bring a neighbour's light (height, width) to the frame's pixels; None where it does not fit.
+
+    What is left between the two after the predicted motion is a smooth field, affine over the picture.
+    """
+    used = agreement.precision > 0
+    if np.count_nonzero(used) < 2 * LEAST_SHIFTS:
+        return None
+    affine, std_px = _affine(agreement.centres_px[used], agreement.shift_px[used], agreement.precision[used])
+    height, width = light.shape
+    source = view.map_px(lambda points_px: points_px - _at(affine, points_px))
+    brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    noise = float(np.median(agreement.error[used]))
+    expected = noise + OWN_ERROR * agreement.signal
+    weights = np.where(used, expected / np.maximum(agreement.error, expected), 0.0)
+    places = view.places_px(agreement.centres_px)
+    inside = ((places > 0) & (places < (width - 1, height - 1))).all(axis=1)
+    return NeighbourPicture(
+        number,
+        brought / np.float32(agreement.gain),
+        view.field(),
+        agreement.centres_px,
+        np.where(inside, weights, 0.0),
+        std_px,
+    )
+
+
+def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array, float]:
+    """Coefficients (3, 2) of 1, x, y, by Huber's weights, and the deviation, each axis, of what they give."""
+    design = np.column_stack([np.ones(len(centres_px)), centres_px])
+    robust = np.ones(len(design))
+    for _ in range(ROBUST_STEPS):
+        root = np.sqrt(precision * robust)[:, None]
+        found = np.linalg.lstsq(root * design, root * shift_px, rcond=None)[0]
+        distance = np.linalg.norm(shift_px - design @ found, axis=1)
+        typical = max(float(np.median(distance)) / 1.1774, 1e-6)
+        robust = np.minimum(1.0, HUBER * typical / np.maximum(distance, 1e-9))
+    return found, typical
+
+
+def _at(affine: Array, points_px: Array) -> Array:
+    return np.asarray(affine[0] + points_px @ affine[1:])
