@@ -5,7 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from virest.calibration.geometry import _value
 from virest.calibration.held_fixed import BELIEVABLE, OPTIONAL, HeldValue, held_notes
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
 
 
 def held(name: str, change: Any, std: Any) -> dict[str, HeldValue]:
@@ -48,3 +51,13 @@ def test_a_fitted_values_twin_is_asked_more_strictly(change: float, std: float, 
     """Focal length and gyroscope scale make up for each other."""
     notes = held_notes(held("gyro-scale", change, std), ["focal"])
     assert [said in note for note in notes] == ([True] if said else [])
+
+
+def test_the_deviation_of_an_unknown_focal_length_is_in_pixels() -> None:
+    """What stands in a column of pixels is pixels, also where the value is not determined and not taken."""
+    lens = Intrinsics(640, 480, 520.0, 520.0, 319, 239)
+    unknown, fitted = CameraProfile(640, 480), CameraProfile(640, 480, intrinsics=lens)
+    value = _value(
+        "focal_length", unknown, unknown, fitted, {"focal_length": np.array([0.053**2])}, {"focal_length": False}
+    )
+    assert value.std == pytest.approx(0.053 * 520)

@@ -8,11 +8,18 @@ import cv2
 import numpy as np
 import pytest
 
+from virest.app.diagnose import open_source
 from virest.app.simulate import simulate_command
 from virest.camera.profile import read_profile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_frames, read_gray
-from virest.diagnosis.restoration_gain import chosen_pairs, measure_restoration_gain, shared_gradient
+from virest.diagnosis.ladder import diagnose_capture
+from virest.diagnosis.restoration_gain import (
+    chosen_pairs,
+    measure_restoration_gain,
+    pairs_to_keep_back,
+    shared_gradient,
+)
 from virest.motion.tracking import track_pairs
 
 WHOLE = (0, 0, 320, 240)
@@ -108,3 +115,34 @@ def test_the_right_blur_makes_pictures_sharper(simulated):
     assert gain.sharpness_after > 1.08 * gain.sharpness_before
     same = measure_restoration_gain(capture, nominal, nominal, *readers(capture))
     assert (same.sharpness_before, same.disagreement_before_px) == (same.sharpness_after, same.disagreement_after_px)
+
+
+def test_pairs_are_kept_back_where_there_are_frames_to_spare(simulated):
+    """A tenth of the frames at most; a capture of 14 frames spares none."""
+    capture, profile, _ = simulated["readout"]
+    assert pairs_to_keep_back(capture, profile) == []
+    frames = [dataclasses.replace(frame, skip_reason=None, skip_codes=()) for frame in capture.frames]
+    more = [dataclasses.replace(frame, index=14 + frame.index, time_s=frame.time_s) for frame in frames]
+    firsts = pairs_to_keep_back(dataclasses.replace(capture, frames=(*frames, *more)), profile)
+    assert len(firsts) == 1
+
+
+def test_no_fit_sees_the_frames_that_are_kept_back(tmp_path):
+    """Whatever those frames show, points and blur say the same; restored, they tell what the causes are worth."""
+    folder = tmp_path / "kept"
+    simulate_command(folder, width=240, height=320, frames=22, seed=3, rate_rad_s=1.0, exposure_ms=9)
+    source = open_source(folder)
+    firsts = pairs_to_keep_back(source.capture, source.profile)
+    kept_back = [first + step for first in firsts for step in (0, 1)]
+    assert kept_back
+
+    def spoilt(numbers):
+        for index, picture in source.gray(numbers):
+            yield index, picture[::-1].copy() if index in kept_back else picture
+
+    found = [
+        diagnose_capture(source.capture, source.profile, source.pictures, gray, kept_back=kept)
+        for gray, kept in ((source.gray, kept_back), (spoilt, kept_back))
+    ]
+    told = [(one.nominal.geometry_rms_px, one.nominal.blur_rms_px, len(one.causes)) for one in found]
+    assert told[0] == told[1]

@@ -24,6 +24,7 @@ from virest.errors import CalibrationError, OutputError
 from virest.motion.lively_frames import lively_frames
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.tracking import track_frames
+from virest.report.words import residual_words
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
 """What ``--with`` takes."""
@@ -192,7 +193,7 @@ def _make_folder(path: Path) -> None:
 def _profile_text(facts: Json, profile: CameraProfile) -> str:
     head = [
         f"Camera profile by virest calibrate, from {facts['capture']}: {facts['verdict']}",
-        f"residual {facts['residual_px']:.3f} px, of which tracking makes {facts['noise_px']:.3f} px",
+        f"residual {residual_words(facts['residual_px'], facts['noise_px'])}",
         *(f"note: {note}" for note in facts["notes"]),
     ]
     return "".join(f"# {_one_line(line)}\n" for line in head) + format_profile(profile)
@@ -297,8 +298,7 @@ def describe(facts: Json) -> str:
     lines = [
         f"{facts['capture']}: {facts['verdict']}",
         table(["value", "start", "calibrated", "±", "determined", "note"], rows),
-        f"residual {facts['before_px']:.3f} -> {facts['residual_px']:.3f} px, "
-        f"of which tracking makes {facts['noise_px']:.3f} px",
+        f"residual {facts['before_px']:.3f} -> {residual_words(facts['residual_px'], facts['noise_px'])}",
         f"{facts['tracks']} tracks in {facts['pairs']} pairs of frames, {share:.1f} % of them moving on their own; "
         f"the gyroscope explains {facts['explained']:.1%} of the turns",
         f"camera's translation: {_TRANSLATIONS.get(facts['translation'], facts['translation'])}",

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,11 +24,17 @@ from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames
 from virest.diagnosis.findings import CONSISTENT, Diagnosis, FieldFinding, Finding, Remaining, Rung
-from virest.diagnosis.restoration_gain import RestorationGain, chosen_pairs, measure_restoration_gain
+from virest.diagnosis.restoration_gain import (
+    RestorationGain,
+    chosen_pairs,
+    measure_restoration_gain,
+    pairs_to_keep_back,
+)
 from virest.errors import OutputError, VirestError
 from virest.motion.shared_out import Each, one_by_one
 from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
+from virest.report.words import residual_words
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.settings import PRESETS
 from virest.simulation.recreation import recreate_session
@@ -99,11 +105,14 @@ def run_diagnosis(
     folder = Path(options.out) / capture_name(path)
     require_free(folder, options.overwrite)
     source = open_source(Path(path), options.config)
-    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each)
+    firsts = pairs_to_keep_back(source.capture, source.profile)
+    kept_back = [first + step for first in firsts for step in (0, 1)]
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, kept_back)
     say("restoring", LADDER_PART)
     gain = measure_restoration_gain(
-        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray, each=each
-    )
+        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray, each=each,
+        firsts=firsts,
+    )  # fmt: skip
     say("figures", GAIN_PART)
     files, drawn = draw_figures(source.capture, found, each)
     facts = as_json(found, gain, drawn)
@@ -115,11 +124,11 @@ def run_diagnosis(
     return DiagnosisOutcome(facts, text, found.verdict)
 
 
-def climb(source: Source, progress: Progress, each: Each = one_by_one) -> Diagnosis:
-    """The ladder itself."""
+def climb(source: Source, progress: Progress, each: Each = one_by_one, kept_back: Collection[int] = ()) -> Diagnosis:
+    """The ladder itself; kept_back: movie indices of frames that no fit is to see."""
     from virest.diagnosis.ladder import diagnose_capture
 
-    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each)
+    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each, kept_back)
 
 
 def require_free(folder: Path, overwrite: bool) -> None:
@@ -390,8 +399,8 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
     """The causes as a table with a sentence each, what they do for restored frames, what remains, the verdict."""
     nominal = found.nominal
     lines = [
-        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, off by {_number(nominal.geometry_rms_px)} px, of "
-        f"which tracking makes {_number(nominal.geometry_noise_px)} px"
+        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, residual "
+        f"{residual_words(nominal.geometry_rms_px, nominal.geometry_noise_px)}"
     ]
     if found.causes:
         header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
@@ -409,7 +418,8 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
 def _rows(cause: Finding) -> list[list[str]]:
     """A row for each number or word that changed; what the cause gains stands on its first."""
     held_out = cause.held_out
-    judged = [_number(held_out.before), _number(held_out.after), f"{held_out.gain:.0%}", held_out.quantity]
+    gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
+    judged = [_number(held_out.before), _number(held_out.after), gain, held_out.quantity]
     rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals) or "-"
     first = [cause.name, [*judged, rivals]]
     values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
@@ -444,6 +454,8 @@ def _number(value: Any) -> str:
 
 
 def _gain_line(gain: RestorationGain) -> str:
+    if not gain.frames:
+        return "restored: the capture is too short to keep frames back from the fits"
     if math.isnan(gain.sharpness_after):
         return "restored: no two neighbours could be laid on each other"
     return (
@@ -457,7 +469,7 @@ def _remaining_line(left: Remaining) -> str:
     if left.significant:
         return f"unexplained: {_one_line(left.sentence) or f'{_number(left.size)} along {left.strongest_along}'}"
     unit = "px" if left.quantity.endswith("_px") else "levels"
-    return f"unexplained: nothing of size; {_number(left.size)} {unit} along {left.strongest_along}"
+    return f"no significant residual: {_number(left.size)} {unit} along {left.strongest_along}"
 
 
 def _one_line(text: str) -> str:

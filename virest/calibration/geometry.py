@@ -24,6 +24,7 @@ from virest.capture.records import Capture
 from virest.errors import CalibrationError
 from virest.motion import profile_terms as terms_of
 from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
+from virest.motion.comparable_noise import residual_px, tracking_noise_px
 from virest.motion.displacement import drift_std_m
 from virest.motion.observed_tracks import ObservedTracks, observe_tracks
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
@@ -104,9 +105,9 @@ class GeometryCalibration:
     translation: str
     """``none``, ``inertial`` (the accelerometer's path before a plane) or ``direction`` (points judged across it)."""
     residual_px: float
-    """Robust standard deviation per coordinate of tracked minus predicted points."""
+    """Robust standard deviation per coordinate of tracked minus predicted points, relief along parallax allowed for."""
     noise_px: float
-    """What tracking alone makes, measured without the model."""
+    """Tracking noise of the same kind, measured without the camera model."""
     before_px: float
     """The residual of the starting profile, at the offset found coarsely."""
     explained: float
@@ -212,7 +213,7 @@ def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) 
 
 def _with_lag(found: GeometryCalibration, lag: StartUpLag) -> GeometryCalibration:
     extensions = replace(found.profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
-    value = CalibratedValue("lag_s", 0.0, lag.lag_s, lag.std_s if lag.determined else None, lag.determined, lag.note)
+    value = CalibratedValue("lag_s", 0.0, lag.lag_s, None, lag.determined, lag.note)
     return replace(found, profile=replace(found.profile, extensions=extensions), values=(*found.values, value))
 
 
@@ -352,15 +353,16 @@ def _conclude(
     profile = right_way_round(_held_back(fit, given, start, determined))
     if not rough.direction_known and not determined["readout_time"]:
         profile = _with_given_readout(profile, given)
-    values = tuple(_value(name, given, profile, variances, determined) for name in (t.name for t in fit.terms))
+    values = tuple(_value(term.name, given, profile, fit.profile, variances, determined) for term in fit.terms)
     direction_known = rough.direction_known and determined["readout_time"]
     values = (*values[:2], _direction_value(given, profile, direction_known), *values[2:])
     profile = _with_estimates(profile, values)
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
     notes = _notes(coarse, fit, moving, astray, observed, determined)
     return GeometryCalibration(
-        profile, values, _correlations(fit, variances), _translation(fit), _robust_px(fit), noise,
-        _robust_px(rough.before), coarse.explained, moving, len(observed.pairs), observed.tracks, notes, fit,
+        profile, values, _correlations(fit, variances), _translation(fit), residual_px(fit),
+        tracking_noise_px(observed, fit), residual_px(rough.before), coarse.explained, moving,
+        len(observed.pairs), observed.tracks, notes, fit,
     )  # fmt: skip
 
 
@@ -481,19 +483,19 @@ def _value(
     name: str,
     given: CameraProfile,
     profile: CameraProfile,
+    fitted: CameraProfile,
     variances: dict[str, Array],
     determined: dict[str, bool],
 ) -> CalibratedValue:
+    """One value; fitted: the profile with what is not determined too, which turns relative deviations into units."""
     field, read = _FIELDS[name]
     std = np.sqrt(variances[name])
     before, after = read(given), read(profile)
     if name == "imu_rotation":
         turn = profile.rotation_cam_imu @ given.rotation_cam_imu.T
         before, after = [0.0, 0.0, 0.0], _rotation_vector(turn)
-    if name == "focal_length" and isinstance(after, float):
-        std = std * after
-    if name in ("gyro_scale", "exposure_time") and isinstance(after, float):
-        std = std * after
+    if name in ("focal_length", "gyro_scale", "exposure_time") and isinstance(scale := read(fitted), float):
+        std = std * abs(scale)
     if name == "readout_time" and determined[name]:
         after = profile.shutter.readout_time_s
     shown = [float(s) for s in std]
@@ -523,10 +525,6 @@ def _translation(fit: TrackFit) -> str:
     if fit.scene is None:
         return "none"
     return "inertial" if isinstance(fit.scene, InertialMotion) else "direction"
-
-
-def _robust_px(fit: TrackFit) -> float:
-    return float(np.median(np.linalg.norm(fit.difference_px, axis=-1))) / 1.1774
 
 
 def _correlations(fit: TrackFit, variances: dict[str, Array]) -> tuple[tuple[str, str, float], ...]:

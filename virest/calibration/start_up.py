@@ -17,9 +17,6 @@ from virest.motion.observed_tracks import ObservedTracks
 Array = NDArray[np.float64]
 EXTRA_PERIODS = (0.0, 0.5, 1.0, 1.5, 2.0)
 """A lag may be longer than the repeats seen use up, if the recording ends before it is over."""
-
-LAG_STD_PERIODS = 0.3
-"""A lag is told in steps of half a period."""
 LAGGING = 0.7
 """The lag is believed if turns then disagree at most this part of how much they disagree without."""
 
@@ -49,7 +46,6 @@ class StartUpLag:
 
     lag_s: float
     """Of slot 0; 0 where none is believed."""
-    std_s: float
     frames: int
     """The last lagging slot."""
     by_frame_s: tuple[float, ...]
@@ -59,8 +55,7 @@ class StartUpLag:
 
 def fit_start_up_lag(capture: Capture, observed: ObservedTracks, profile: CameraProfile) -> StartUpLag:
     """Find the schedule at which the turns of pictures and gyroscope agree best; observed: with the first frames."""
-    period_s = median_period_s(np.array([frame.time_s for frame in capture.frames]))
-    none = StartUpLag(0.0, LAG_STD_PERIODS * period_s, 0, (), False, "no picture repeats another: no lag can be told")
+    none = StartUpLag(0.0, 0, (), False, "no frame repeats another: a lag cannot be determined")
     schedules = lag_schedules(capture, capture.repeats)
     if not schedules:
         return none
@@ -70,7 +65,7 @@ def fit_start_up_lag(capture: Capture, observed: ObservedTracks, profile: Camera
     if not left[best] < LAGGING * without:
         return replace(none, note="the turns agree no better with a lag than without")
     lag_s, last, by_frame = schedules[best]
-    return StartUpLag(lag_s, none.std_s, last, by_frame, True, f"used up by frame {last}")
+    return StartUpLag(lag_s, last, by_frame, True, f"used up by frame {last}")
 
 
 def _disagreement(

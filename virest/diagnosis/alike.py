@@ -20,8 +20,13 @@ COINCIDENCE_SIGMA = 3.5
 
 
 def stamped(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
-    """At constant exposure an offset of just half or one exposure is another meaning of the stamp."""
-    if varies(exposure_s) or float(np.median(exposure_s)) <= 0:
+    """At constant exposure an offset of just half or one exposure is another meaning of the stamp.
+
+    Where exposures are unknown, points are placed at the exposure's start: an offset may be half of it.
+    """
+    if float(np.median(exposure_s)) <= 0:
+        return [_or_exposure(finding) for finding in findings]
+    if varies(exposure_s):
         return findings
     nominal = geometric.nominal.profile
     exposure = nominal.shutter.true_exposure_s(float(np.median(exposure_s)))
@@ -56,6 +61,13 @@ def stamped(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Ar
             profile=replace(geometric.model.profile, shutter=shutter, time_offset_s=nominal.time_offset_s),
         )
     return result
+
+
+def _or_exposure(finding: Finding) -> Finding:
+    """A time offset, with the unknown exposure as its rival."""
+    if finding.name != "time_offset":
+        return finding
+    return replace(finding, rivals=(Rival("exposure_time", finding.held_out.after), *finding.rivals))
 
 
 def _meaning(now: str, shift_s: float, exposure_s: float, std_s: float) -> str | None:

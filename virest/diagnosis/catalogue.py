@@ -21,6 +21,9 @@ class Cause:
     """Where a profile keeps it."""
 
 
+FALSE_ALARM = 1e-3
+"""Probability that a capture with nothing wrong has any cause named."""
+
 CATALOGUE: dict[str, Cause] = {
     "time_offset": Cause(GEOMETRY, ("time_offset_s",), "imu.time_offset_s"),
     "clock_skew": Cause(GEOMETRY, ("clock_skew",), "imu.clock_skew"),
@@ -45,3 +48,6 @@ CATALOGUE: dict[str, Cause] = {
     "gain_drift": Cause(PHOTOMETRY, ("gain",), "extensions.gain"),
     "defocus": Cause(BLUR, ("sigma_px",), "extensions.defocus"),
 }
+
+MAX_P = FALSE_ALARM / len(CATALOGUE)
+"""Probability, below which a cause's value is significant: by Bonferroni, since any cause may be the one that is."""

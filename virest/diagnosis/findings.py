@@ -23,7 +23,7 @@ class ParameterChange:
     estimate: Any
     """A number, a list of numbers, or a word."""
     std: Any
-    """Standard deviation(s); None for a word."""
+    """Standard deviation(s); None for a word or a count, and where it is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +34,20 @@ class HeldOutGain:
     """``geometry_rms_px``, ``photometric_rms`` or ``blur_rms_px``."""
     before: float
     after: float
-    noise: float
+    noise: float | None
+    """Measured without the model and its fit; None: unknown."""
 
     @property
-    def gain(self) -> float:
-        """1 − (after² − noise²) / (before² − noise²), in [0, 1]."""
-        excess_before = self.before**2 - self.noise**2
+    def gain(self) -> float | None:
+        """1 − (after² − noise²) / (before² − noise²), in [0, 1]; a lower bound, without noise, where it is unknown.
+
+        None where before is no more than the measured noise: there is no excess of which to take a part.
+        """
+        floor = (self.noise or 0.0) ** 2
+        excess_before = self.before**2 - floor
         if excess_before <= 0:
-            return 0.0
-        return min(max(1.0 - (self.after**2 - self.noise**2) / excess_before, 0.0), 1.0)
+            return None
+        return min(max(1.0 - (self.after**2 - floor) / excess_before, 0.0), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +67,8 @@ class Finding:
     parameters: dict[str, ParameterChange]
     held_out: HeldOutGain
     rivals: tuple[Rival, ...]
-    p_value: float
+    p_value: float | None
+    """Probability of so large a value, or of so even a gain, by chance; None: not computed."""
     sentence: str
     """What it means, for people."""
 
@@ -114,7 +120,8 @@ class Nominal:
 class Remaining:
     """Structure that no named cause removes."""
 
-    p_value: float
+    p_value: float | None
+    """Of no structure; None: not computed (parts of the picture that move together and were left out)."""
     strongest_along: str
     """``row``, ``time``, ``radius``, ``rate``, ``brightness`` ..."""
     size: float

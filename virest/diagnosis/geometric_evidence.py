@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.calibration.physical_limits import impossible
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.motion.comparable_noise import noise_distances
 from virest.motion.observed_tracks import ObservedTracks
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
-from virest.motion.track_model import TrackTable, centre, ground, predict, seen_s
-from virest.motion.track_noise import smooth_flow_residual
+from virest.motion.track_model import TrackTable, centre, ground, seen_s
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -55,27 +56,28 @@ class Evidence:
     """(pairs,) number of the block of time."""
 
     def noise_px(self, fitted: TrackFit) -> float:
-        """What tracking alone makes: capped rms per coordinate of what a free smooth flow leaves.
-
-        Where any depth is allowed only what lies across the parallax counts, as in the fit.
-        """
-        residual = np.concatenate(
-            [
-                smooth_flow_residual(pair) / n
-                for pair, n in zip(self.observed.pairs, self.observed.noise_px, strict=True)
-            ]
-        )
-        if isinstance(fitted.scene, DirectedMotion):
-            along = predict(fitted.ground, self.observed.table(self.observed.tracks), fitted.scene).along_px
-            assert along is not None
-            way = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
-            residual = residual - (residual * way).sum(axis=-1, keepdims=True) * way
-        return capped_rms(np.linalg.norm(residual, axis=-1)) * self.typical_px
+        """Tracking noise: capped rms per coordinate of what a free smooth flow leaves, without the camera model."""
+        return capped_rms(noise_distances(self.observed, fitted)) * self.typical_px
 
     @property
     def typical_px(self) -> float:
         """Typical noise of a step, px per coordinate."""
         return float(np.median(self.observed.noise_px))
+
+    @property
+    def period_s(self) -> float:
+        """Time between frames."""
+        stamps = self.observed.stamp_s[np.isfinite(self.observed.stamp_s)]
+        return float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+
+    @property
+    def exposure_s(self) -> float:
+        """Typical exposure as logged; 0 where unknown."""
+        return float(np.median(self.observed.exposure_s))
+
+    def impossible(self, profile: CameraProfile) -> frozenset[str]:
+        """Names of the effects whose values in a profile no camera has."""
+        return impossible(profile, self.period_s, self.exposure_s)
 
     def table(self, model: Model, max_points: int) -> TrackTable:
         """The points, with the stamps that the model gives the frames."""

@@ -9,7 +9,7 @@ what is no longer significant leaves.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from virest.calibration.geometry import right_way_round
+from virest.calibration.physical_limits import is_depth
 from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
+from virest.diagnosis.catalogue import FALSE_ALARM, MAX_P
 from virest.diagnosis.findings import GEOMETRY, JOINED, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.geometric_effects import GeometricEffect
 from virest.diagnosis.geometric_evidence import (
@@ -30,7 +33,20 @@ from virest.diagnosis.geometric_evidence import (
     capped_rms,
     depth_of,
 )
-from virest.diagnosis.trials import JUDGE_POINTS, Judged, Screened, best_of_each, judge, lagging_gain, screen, t_ratio
+from virest.diagnosis.trials import (
+    JUDGE_POINTS,
+    Judged,
+    Screened,
+    best_of_each,
+    chance_of,
+    choose,
+    judge,
+    lagging_gain,
+    promising,
+    screen,
+    t_ratio,
+)
+from virest.motion import profile_terms as terms_of
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable
@@ -41,23 +57,20 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 FINAL_POINTS = 7000
-PROMISING = 4
-MIN_T = 3.0
-"""Least ratio of the blocks' mean gain to its standard error."""
-MAX_P = 1e-5
-"""Of the value being nought, for each of some twenty causes tried."""
-SURE = 1e-12
+PROMISING = 3
+"""Causes that each fold chooses from."""
+HOLDS_P, LARGE_HOLDS_P = 0.01, 0.05
+"""The gain must hold between blocks too (one-sided t test; the cause was chosen by other blocks, so this is one test).
+A capture with nothing wrong passes both this and the value's test at most as often as the latter alone."""
+LARGE_GAIN = 0.05
+"""Above this part of the loss a gain need be less even: time blocks differ in how much they tell of a cause."""
 MIN_GAIN = 0.004
 """Least part of the loss that a cause must take away on held-out blocks."""
-LARGE_GAIN, LARGE_MIN_T = 0.05, 1.7
-"""So large a gain need not be so even (one-sided 5 %): stretches of time tell more or less of a cause."""
 FEEBLE_GAIN, ASTRAY_SCALE = 0.1, 1.25
 """A cause that takes less than this part away, while points are so many times their noise from where the model puts
 them, is not what is wrong: two that gain little alone are then tried together."""
-PAIR_FIRSTS, PAIRS_JUDGED = 8, 6
-"""The best alone, each beside all others, which it may hide; so many pairs are judged on held-out blocks."""
-PAIR_MIN_T = 2.7
-"""One-sided 5 % for the best of six."""
+PAIR_FIRSTS, PAIRS_JUDGED = 8, 4
+"""The best causes alone, each beside all others, which it may hide; pairs that each fold chooses from."""
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 MAX_RUNGS = 5
@@ -109,6 +122,10 @@ class GeometricVerdict:
     """What tracking alone makes, as an rms like the two above."""
     step_noise_px: float
     """Typical standard deviation of a tracked step, per coordinate."""
+    rival: GeometricVerdict | None = None
+    """Another end of the ladder that held-out points do not tell from this one; None: there is none."""
+    lag_std_s: float | None = None
+    """Of a start-up lag; None without one."""
     astray: float = 0.0
     """Part of the points that lie in parts of the picture that move together on their own, and were left out."""
     notes: list[str] = field(default_factory=list)
@@ -133,28 +150,105 @@ def climb(
     say = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
     start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
-    model = _refitted(evidence, start, SCREEN_POINTS)[0]
+    model, notes = _with_unknowns(evidence, start)
     nominal_model = model
-    accepted: list[Accepted] = []
-    rungs: list[Rung] = []
     course = _Course(evidence, nominal, lags, far or FarClock(), each)
     say(0.1)
-    for number in range(max_rungs):
-        step, rung = _rung(course, model, accepted)
-        rungs.append(rung)
-        say(0.1 + 0.8 * (number + 1) / MAX_RUNGS)
-        if step is None:
-            break
-        accepted += step.accepted
+    path, fork = _ascended(course, _Path(model, (), ()), max_rungs)
+    say(0.6)
+    verdict = _conclude(evidence, nominal_model, path.model, list(path.accepted), list(path.rungs), nominal)
+    if fork is not None:
+        other, _ = _ascended(course, fork, max_rungs)
+        say(0.9)
+        rival = _conclude(evidence, nominal_model, other.model, list(other.accepted), list(other.rungs), nominal)
+        verdict = _either(evidence, verdict, rival)
+    verdict.notes += notes
+    return verdict
+
+
+@dataclass(frozen=True, slots=True)
+class _Path:
+    """A way up the ladder so far."""
+
+    model: Model
+    accepted: tuple[Accepted, ...]
+    rungs: tuple[Rung, ...]
+
+    def further(self, evidence: Evidence, step: _Step, rung: Rung) -> _Path:
+        """With what enters on the next rung."""
         model, _ = _refitted(evidence, step.model, JUDGE_POINTS)
-        log.debug("rung %d: %s", number + 1, rung.entered)
-    return _conclude(evidence, nominal_model, model, accepted, rungs, nominal)
+        log.debug("rung %d: %s", len(self.rungs) + 1, _names(step))
+        entered = replace(rung, entered=_names(step))
+        return _Path(model, (*self.accepted, *step.accepted), (*self.rungs, entered))
+
+
+def _ascended(course: _Course, path: _Path, max_rungs: int) -> tuple[_Path, _Path | None]:
+    """The path to its end, and the one that leaves it where it first might as well have gone another way."""
+    fork: tuple[_Path, _Step, Rung] | None = None
+    while len(path.rungs) < max_rungs:
+        step, rival, rung = _rung(course, path.model, list(path.accepted))
+        if step is None:
+            path = replace(path, rungs=(*path.rungs, rung))
+            break
+        if rival is not None and fork is None:
+            fork = (path, rival, rung)
+        path = path.further(course.evidence, step, rung)
+    return path, None if fork is None else fork[0].further(course.evidence, *fork[1:])
+
+
+def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
+    """The better of two ends of the ladder by held-out blocks; where those do not tell, one with the other as a rival.
+
+    Which of the two was reached first may hang on rounding; which one is returned then follows from the causes' number
+    and names alone.
+    """
+    ends = [
+        Screened(Candidate("", end.model, (), None), (end.model, end.model), (0.0, 0.0), end.fit.scale, 0.0)
+        for end in (first, second)
+    ]
+    spread = max(first.fit.depth_spread_per_m, second.fit.depth_spread_per_m)
+    one, other = judge(evidence, ends, min(first.fit.scale, second.fit.scale), spread, one_by_one)
+    worse = t_ratio(other.block_loss - one.block_loss)
+    if abs(worse) >= RIVAL_T:
+        return first if worse > 0 else second
+    chosen, rival = sorted((first, second), key=lambda end: (len(end.accepted), sorted(e.name for e in end.accepted)))
+    rms = (other if rival is second else one).rms * evidence.typical_px
+    names = {entry.name for entry in chosen.accepted}
+    instead = [Rival(entry.name, rms) for entry in rival.accepted if entry.name not in names]
+    shared = names & {entry.name for entry in rival.accepted}
+    chosen.accepted = [
+        entry if entry.name in shared else replace(entry, rivals=_joined(entry.rivals, instead))
+        for entry in chosen.accepted
+    ]
+    if instead:
+        chosen.notes.append(f"{' and '.join(r.name for r in instead)} in place of others explains the points as well")
+    chosen.rival = rival
+    return chosen
+
+
+def _joined(rivals: Sequence[Rival], more: Sequence[Rival]) -> tuple[Rival, ...]:
+    known = {rival.name for rival in rivals}
+    return (*rivals, *(rival for rival in more if rival.name not in known))
+
+
+def _with_unknowns(evidence: Evidence, start: Model) -> tuple[Model, list[str]]:
+    """The model with its unknown values fitted; those that end where no camera is stay where they began."""
+    model, notes = _refitted(evidence, start, SCREEN_POINTS)[0], []
+    at_ends = evidence.impossible(model.profile) - evidence.impossible(start.profile)
+    if "readout_time" in evidence.impossible(model.profile):
+        at_ends |= {"readout_time"}
+    ended = [term.name for term in start.terms if term.name in at_ends]
+    if ended:
+        known = tuple(term for term in start.terms if term.name not in ended)
+        model = _refitted(evidence, replace(start, terms=known), SCREEN_POINTS)[0]
+        notes = [f"{name} is unknown and cannot be told from the points" for name in ended]
+    return model, notes
 
 
 def _refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:
     table = evidence.table(model, points)
     fitted = evidence.fit(model, model.terms, table)
-    return replace(model, profile=fitted.profile, scene=fitted.scene), fitted
+    return replace(model, profile=right_way_round(fitted.profile), scene=fitted.scene), fitted
 
 
 # ── one rung ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -175,11 +269,40 @@ class _Course:
         found = candidates_of(self.evidence, self.nominal, model, tried, self.lags, self.far)
         return worth_beginning(self.evidence, model, found)
 
-    def judged(self, base: Screened, better: Sequence[Screened]) -> list[Judged]:
-        """The model without and with each cause, best first; losses by the smallest scale, that all can be compared."""
-        scale = min(entry.scale for entry in (base, *better))
-        spread = (better[0] if better else base).depth_spread_per_m
-        return judge(self.evidence, [entry.candidate for entry in (base, *better)], scale, spread, self.each)
+    def judged(self, base: Screened, better: Sequence[Screened], count: int) -> Trial:
+        """The model without and with each promising cause; losses by the smallest scale, that all can be compared."""
+        allowed = promising(base, better, count)
+        kept = [entry for entry in better if entry.candidate.name in allowed[0] | allowed[1]]
+        scale = min(entry.scale for entry in (base, *kept))
+        spread = (kept[0] if kept else base).depth_spread_per_m
+        before, *judged = judge(self.evidence, [base, *kept], scale, spread, self.each)
+        return Trial(self.evidence, before, judged, allowed, scale)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """The model without and with each promising cause, on blocks that took no part in the fits."""
+
+    evidence: Evidence
+    before: Judged
+    judged: list[Judged]
+    allowed: tuple[frozenset[str], frozenset[str]]
+    """Names that each fold may choose from."""
+    scale: float
+
+    def rounds(self) -> Iterator[tuple[Judged, Judged, Array]]:
+        """(cause, what choosing one gains, gain by block), best first, each time without those before it.
+
+        The cause is the best over all blocks; what it is judged by was chosen for each block by others.
+        """
+        left = sorted(self.judged, key=lambda entry: float(entry.block_loss.mean()))
+        while left:
+            after = choose(self.evidence, [self.before, *left], self.allowed, self.scale)
+            gain = self.before.block_loss - after.block_loss
+            if left[0].candidate.name == "frame_lag":
+                gain = lagging_gain(self.evidence, self.before, left[0])
+            yield left[0], after, gain
+            left = left[1:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,51 +315,73 @@ class _Step:
     """Of the held-out loss that it takes away."""
 
 
-def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, Rung]:
+def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, _Step | None, Rung]:
+    """What enters, what might have entered as well, and the rung."""
     tried = {entry.name for entry in accepted}
     nothing = Candidate("", model, (), None)
     base, *others = screen(course.evidence, [nothing, *course.candidates(model, tried)], course.each)
-    better = [entry for entry in best_of_each(others) if entry.loss < base.loss]
-    before, *judged = course.judged(base, better[:PROMISING])
+    better = [entry for entry in best_of_each(others) if min(np.subtract(entry.losses, base.losses)) < 0]
+    trial = course.judged(base, better, PROMISING)
     typical = course.evidence.typical_px
-    rung = Rung(None, {j.candidate.name: j.rms * typical for j in judged}, before.rms * typical, GEOMETRY)
-    step = _best_single(course.evidence, model, before, judged)
+    rung = Rung(None, {j.candidate.name: j.rms * typical for j in trial.judged}, trial.before.rms * typical, GEOMETRY)
+    step, rival = _best_single(model, trial)
     feeble = step is None or step.part < FEEBLE_GAIN
     if feeble and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
         pair = _best_pair(course, model, tried, base, better)
         if pair is not None:
-            step, rung = pair, replace(rung, tried={**rung.tried, _names(pair): pair.accepted[0].after})
-    return step, rung if step is None else replace(rung, entered=_names(step))
+            step, rival = pair, None
+            rung = replace(rung, tried={**rung.tried, _names(pair): pair.accepted[0].after})
+    return step, rival, rung
+
+
+def _holds(gain: Array, part: float) -> bool:
+    """Whether a gain (blocks,), as a part of the loss, is no matter of a few blocks."""
+    return chance_of(gain) < (HOLDS_P if part < LARGE_GAIN else LARGE_HOLDS_P)
 
 
 def _names(step: _Step) -> str:
     return JOINED.join(entry.name for entry in step.accepted)
 
 
-def _best_single(evidence: Evidence, model: Model, before: Judged, judged: list[Judged]) -> _Step | None:
-    """The cause that takes most away where it was not fitted, if that holds."""
+def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None]:
+    """The cause that takes most away where it was neither fitted nor chosen, if that holds, and its strongest rival."""
+    evidence, before, judged = trial.evidence, trial.before, trial.judged
     typical = evidence.typical_px
-    for best in sorted(judged, key=lambda j: float(j.block_loss.mean())):
-        gain = before.block_loss - best.block_loss
-        if best.candidate.name == "frame_lag":
-            gain = lagging_gain(evidence, before, best)
+    for best, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
-        if part < MIN_GAIN or t_ratio(gain) < (MIN_T if part < LARGE_GAIN else LARGE_MIN_T):
+        if part < MIN_GAIN or not _holds(gain, part):
             continue
-        entered, p_value = _significant(evidence, best.candidate, model.profile)
+        entered, p_value = _significant(evidence, best.candidate, model.profile, gain)
         if entered is None:
             continue
-        rivals = tuple(
-            Rival(other.candidate.name, other.rms * typical)
-            for other in judged
-            if other is not best and t_ratio(other.block_loss - best.block_loss) < RIVAL_T
-            and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
-        )  # fmt: skip
+        others = [other for other in judged if other is not best and _rivals(before, best, other, gain)]
+        rivals = tuple(Rival(other.candidate.name, other.rms * typical) for other in others)
         cause = Accepted(
             best.candidate.name, best.candidate.effect, best.candidate.word,
-            before.rms * typical, best.rms * typical, p_value, rivals,
+            before.rms * typical, after.rms * typical, p_value, rivals,
         )  # fmt: skip
-        return _Step(entered, (cause,), part)
+        return _Step(entered, (cause,), part), _rival_step(model, trial, others, part)
+    return None, None
+
+
+def _rivals(before: Judged, best: Judged, other: Judged, gain: Array) -> bool:
+    """Whether the blocks do not prefer the best to another that gains at least half as much."""
+    apart = t_ratio(other.block_loss - best.block_loss)
+    return apart < RIVAL_T and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
+
+
+def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: float) -> _Step | None:
+    """The strongest of the rivals that is significant too."""
+    typical = trial.evidence.typical_px
+    for other in sorted(others, key=lambda entry: float(entry.block_loss.mean())):
+        gain = trial.before.block_loss - other.block_loss
+        entered, p_value = _significant(trial.evidence, other.candidate, model.profile, gain)
+        if entered is not None:
+            kind = other.candidate
+            cause = Accepted(
+                kind.name, kind.effect, kind.word, trial.before.rms * typical, other.rms * typical, p_value, ()
+            )
+            return _Step(entered, (cause,), part)
     return None
 
 
@@ -255,27 +400,32 @@ def _best_pair(
         begun = course.candidates(with_it, {*tried, first.name})
         seconds = [candidate for candidate in begun if candidate.added]
         found += [(first, second) for second in best_of_each(screen(evidence, seconds, course.each))]
-    found = sorted(found, key=lambda pair: pair[1].loss)[:PAIRS_JUDGED]
     if not found:
         return None
-    before, *judged = course.judged(base, [second for _, second in found])
-    for (first, _), pair in sorted(
-        zip(found, judged, strict=True), key=lambda known: float(known[1].block_loss.mean())
-    ):
-        gain = before.block_loss - pair.block_loss
+    members_of = {_pair_name(first, entry): (first, entry.candidate) for first, entry in found}
+    renamed = [
+        replace(entry, candidate=replace(entry.candidate, name=_pair_name(first, entry))) for first, entry in found
+    ]
+    trial = course.judged(base, sorted(renamed, key=lambda entry: entry.loss), PAIRS_JUDGED)
+    before = trial.before
+    for pair, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
-        if part < FEEBLE_GAIN or t_ratio(gain) < PAIR_MIN_T:
+        if part < FEEBLE_GAIN or not _holds(gain, part):
             continue
         entered, fitted = _with(evidence, pair.candidate)
-        members = (first, pair.candidate)
+        members = members_of[pair.candidate.name]
         p_values = [_p_value(evidence, fitted, member, entered.profile, model.profile) for member in members]
         if max(p_values) < MAX_P:
             causes = (
-                Accepted(member.name, member.effect, "", before.rms * typical, pair.rms * typical, p_value, ())
+                Accepted(member.name, member.effect, "", before.rms * typical, after.rms * typical, p_value, ())
                 for member, p_value in zip(members, p_values, strict=True)
             )
             return _Step(entered, tuple(causes), part)
     return None
+
+
+def _pair_name(first: Candidate, second: Screened) -> str:
+    return f"{first.name}{JOINED}{second.candidate.name}"
 
 
 def _with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
@@ -283,9 +433,17 @@ def _with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
     return _refitted(evidence, replace(candidate.model, terms=(*candidate.model.terms, *candidate.added)), JUDGE_POINTS)
 
 
-def _significant(evidence: Evidence, candidate: Candidate, before: CameraProfile) -> tuple[Model | None, float]:
-    """The model with the candidate in it, if its value is, and the probability that it is nought."""
+def _significant(
+    evidence: Evidence, candidate: Candidate, before: CameraProfile, gain: Array
+) -> tuple[Model | None, float]:
+    """The model with the candidate in it, if its value is significant, and the probability that it is nought.
+
+    A word has no value: its probability is that of so even a gain (blocks,) by chance.
+    """
     model, fitted = _with(evidence, candidate)
+    if candidate.name != "scene_depth" and (candidate.effect is None or candidate.effect.term is None):
+        p_value = chance_of(gain)
+        return (model if p_value < FALSE_ALARM else None), p_value
     if candidate.name == "scene_depth":
         p_value = depth_p(fitted, evidence.table(model, JUDGE_POINTS), before.depth_m)
     else:
@@ -297,29 +455,39 @@ def _p_value(
     evidence: Evidence, fitted: TrackFit, candidate: Candidate, found: CameraProfile, before: CameraProfile
 ) -> float:
     """Probability that a candidate's value is nought; 1 where no phone is like that."""
-    if candidate.effect is None or candidate.effect.term is None:
-        return SURE
-    if not is_plausible(candidate.effect, found, total_change(candidate.effect, before, found)):
+    assert candidate.effect is not None
+    return _p_if_plausible(evidence, fitted, candidate.effect, found, before)
+
+
+def _p_if_plausible(
+    evidence: Evidence, fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile
+) -> float:
+    """Probability that an effect's value is nought; 1 where it ends at, or beyond, what a phone can be."""
+    if not is_plausible(evidence, effect, found, total_change(effect, before, found)):
         return 1.0
-    return p_of(fitted, candidate.effect, found, before, evidence.typical_px)
+    return p_of(fitted, effect, found, before, evidence.typical_px)
 
 
 def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float:
-    """Probability of so large a change of the inverse depth by chance."""
+    """Probability of so large a change of the inverse depth by chance; 1 where the depth ends at its limits."""
     depth_m, std = depth_of(fitted, table)
+    if not is_depth(depth_m):
+        return 1.0
     given_m = given_m or np.inf
     nearer = 1 / depth_m - 1 / given_m
     certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
     return float(stats.chi2.sf((nearer / max(certain, 1e-9)) ** 2, 1))
 
 
-def is_plausible(effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
-    """Whether a phone can be like that: a cause beyond these bounds only stands in for another."""
+def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
+    """Whether a phone can be like that: a cause at or beyond these bounds compensates for another."""
+    if effect.name in evidence.impossible(found):
+        return False
     if effect.name == "stabilisation":
         low, high = STABILISER_CUTOFF_HZ
         extensions = found.extensions
         return 0 < extensions.stabilisation_fraction <= 1.1 and low < extensions.stabilisation_cutoff_hz < high
-    return bool(np.all(np.abs(change) <= PLAUSIBLE[effect.name]))
+    return bool(np.all(np.abs(change) < PLAUSIBLE[effect.name]))
 
 
 def p_of(
@@ -377,7 +545,23 @@ def _conclude(
     return GeometricVerdict(
         model, fitted, table, accepted, rungs, nominal_model, nominal_fit, nominal_table,
         before, capped_rms(fitted.distance) * typical, evidence.noise_px(fitted), typical,
+        lag_std_s=_lag_std_s(evidence, model, table) if model.lag else None,
     )  # fmt: skip
+
+
+def _lag_std_s(evidence: Evidence, model: Model, table: TrackTable) -> float:
+    """Deviation of a start-up lag: of an offset of the lagging pairs alone, with how far they want one.
+
+    A schedule allows for lags in steps; what lies between two steps shows as such an offset.
+    """
+    lagging = np.array([pair.first <= model.profile.extensions.frame_lag_frames for pair in evidence.observed.pairs])
+    fitted = evidence.fit(model, (terms_of.TIME_OFFSET,), table, lagging)
+    parts = (
+        fitted.value("time_offset"),
+        fitted.std("time_offset"),
+        bias_std(fitted, "time_offset", evidence.typical_px),
+    )
+    return float(np.linalg.norm(np.concatenate(parts)))
 
 
 def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted, fitted: TrackFit) -> Accepted:
@@ -388,7 +572,10 @@ def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted,
     if not _has_term(entry):
         return entry
     less, _ = _refitted(evidence, _without(model, nominal, entry), SCREEN_POINTS)
-    without_and_with = [Candidate("", m, (), None) for m in (less, model)]
+    without_and_with = [
+        Screened(Candidate("", m, (), None), (m, m), (0.0, 0.0), fitted.scale, fitted.depth_spread_per_m)
+        for m in (less, model)
+    ]
     before, after = judge(evidence, without_and_with, fitted.scale, fitted.depth_spread_per_m, one_by_one)
     return replace(entry, before=before.rms * evidence.typical_px, after=after.rms * evidence.typical_px, rivals=())
 
@@ -405,7 +592,7 @@ def _doubt(
         return depth_p(fitted, table, given.depth_m)
     if entry.effect is None or entry.effect.term is None:
         return 0.0
-    return p_of(fitted, entry.effect, found, given, evidence.typical_px)
+    return _p_if_plausible(evidence, fitted, entry.effect, found, given)
 
 
 def total_change(effect: GeometricEffect, nominal: CameraProfile, found: CameraProfile) -> Array:
@@ -468,14 +655,33 @@ def findings_of(verdict: GeometricVerdict) -> list[Finding]:
     found = []
     for entry in verdict.accepted:
         changes = changes_of(verdict, entry)
-        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, min(verdict.noise_px, verdict.final_rms_px))
+        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, verdict.noise_px)
         sentence = _sentence(entry, changes)
         found.append(Finding(entry.name, changes, held_out, entry.rivals, entry.p_value, sentence))
     return sorted(found, key=lambda f: f.held_out.after**2 - f.held_out.before**2)
 
 
 def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
-    """Parameters of one cause, before and after."""
+    """Parameters of one cause, before and after; where the ladder has two ends, with how far those are apart.
+
+    Either end is as likely: the second moment about the value told grows by half the squared difference.
+    """
+    changes = _changes_at(verdict, entry)
+    twin = next((e for e in verdict.rival.accepted if e.name == entry.name), None) if verdict.rival else None
+    if verdict.rival is None or twin is None:
+        return changes
+    there = _changes_at(verdict.rival, twin)
+    return {name: _apart(change, there[name]) for name, change in changes.items()}
+
+
+def _apart(change: ParameterChange, there: ParameterChange) -> ParameterChange:
+    if change.std is None or isinstance(change.estimate, str):
+        return change
+    off = np.subtract(change.estimate, there.estimate) / np.sqrt(2)
+    return replace(change, std=np.hypot(change.std, off).tolist())
+
+
+def _changes_at(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
     nominal, found = verdict.nominal.profile, verdict.model.profile
     if entry.name == "scene_depth":
         depth_m, std = depth_of(verdict.fit, verdict.table)
@@ -484,8 +690,8 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
     if entry.name == "frame_lag":
         extensions = found.extensions
         return {
-            "lag_s": ParameterChange(0.0, extensions.frame_lag_s, 0.3 * _period(verdict)),
-            "frames": ParameterChange(0, extensions.frame_lag_frames, 0),
+            "lag_s": ParameterChange(0.0, extensions.frame_lag_s, verdict.lag_std_s),
+            "frames": ParameterChange(0, extensions.frame_lag_frames, None),
         }
     effect = entry.effect
     assert effect is not None
@@ -507,11 +713,6 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
             moved = total_change(effect, nominal, found).tolist()
             changes = {"offset_px": replace(changes["offset_px"], estimate=moved)}
     return changes
-
-
-def _period(verdict: GeometricVerdict) -> float:
-    stamps = np.unique(verdict.table.first_stamp_s)
-    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1 / 30
 
 
 def _sentence(entry: Accepted, changes: dict[str, ParameterChange]) -> str:

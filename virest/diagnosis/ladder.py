@@ -6,7 +6,7 @@ they should be; then brightness, then blur.  What is left is tested for structur
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from virest.diagnosis.points import (
     MIN_PAIRS,
     TrackedPoints,
     at_model_times,
+    at_rest,
     evened,
     frames_to_follow,
     pulses,
@@ -37,7 +38,7 @@ from virest.motion.observed_tracks import observe_tracks
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_model import predict
-from virest.motion.tracking import track_frames, track_pairs
+from virest.motion.tracking import TrackPair, track_frames, track_pairs
 
 Progress = Callable[[str, float], None]
 MOST_TRAVEL_PX = 0.35
@@ -51,18 +52,20 @@ def diagnose_capture(
     gray: Reader,
     progress: Progress | None = None,
     each: Each = one_by_one,
+    kept_back: Collection[int] = (),
 ) -> Diagnosis:
     """Climb the ladder on one capture; pictures gives (index, RGB), gray (index, luma) of the frames asked for.
 
-    each: shares work out; gray then goes to other processes.  Raises CaptureError where there is nothing to judge by:
-    too few points.
+    kept_back: movie indices of frames that no fit of points, blur or curve is to see.  each: shares work out; gray then
+    goes to other processes.  Raises CaptureError where there is nothing to judge by: too few points.
     """
     say = progress or (lambda _text, _part: None)
     say("tracking", 0.02)
-    points, notes = _tracked(capture, profile, gray, each)
+    points, notes = _tracked(capture, profile, gray, each, frozenset(kept_back))
     say("points", 0.15)
     first = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
     story = _Story(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each)
+    story.kept_back = frozenset(kept_back)
     say("brightness", 0.5)
     story.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
     say("blur", 0.75)
@@ -74,10 +77,12 @@ def diagnose_capture(
     return story.told()
 
 
-def _tracked(capture: Capture, profile: CameraProfile, gray: Reader, each: Each) -> tuple[TrackedPoints, list[str]]:
-    """Points of the frames that are followed, those of the start-up too."""
+def _tracked(
+    capture: Capture, profile: CameraProfile, gray: Reader, each: Each, kept_back: frozenset[int]
+) -> tuple[TrackedPoints, list[str]]:
+    """Points of the frames that are followed, those of the start-up too; pairs with a frame kept back are left out."""
     indices = frames_to_follow(capture, profile)
-    observed = observe_tracks(capture, track_frames(gray, indices, each), profile)
+    observed = observe_tracks(capture, _seen(track_frames(gray, indices, each), kept_back), profile)
     start, null_terms, notes, far, follows = with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
@@ -86,13 +91,20 @@ def _tracked(capture: Capture, profile: CameraProfile, gray: Reader, each: Each)
             hint="a longer capture, or one with more texture",
         )
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
-    rungs_allowed = MAX_RUNGS if follows or schedules else 0
+    still = at_rest(observed, start)
+    rungs_allowed = MAX_RUNGS if (follows or schedules) and not still else 0
     stamped_frames = sum(NO_STAMP not in frame.skip_codes for frame in capture.frames)
     if len(indices) < stamped_frames:
         notes.append(f"points were followed in {len(indices)} of {stamped_frames} frames, runs spread over the capture")
-    if not rungs_allowed:
+    if still:
+        notes.append("the camera is at rest: points tell nothing of clocks, readout or lens")
+    elif not rungs_allowed:
         notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
     return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
+
+
+def _seen(pairs: Sequence[TrackPair], kept_back: frozenset[int]) -> list[TrackPair]:
+    return [pair for pair in pairs if not kept_back & {pair.first, pair.second}]
 
 
 @dataclass(slots=True)
@@ -111,11 +123,23 @@ class _Story:
     """Of the points, and what blur made of them."""
     notes: list[str] = field(default_factory=list)
     each: Each = one_by_one
+    kept_back: frozenset[int] = frozenset()
+    """Movie indices of frames that only brightness is to see."""
 
     @property
     def frames(self) -> list[Frame]:
         """Frames that can be looked at, with the stamps that the first model gives them."""
         return at_model_times(self.capture, self.first)
+
+    @property
+    def frames_to_fit(self) -> list[Frame]:
+        """Those that blur and curve are fitted to."""
+        return [frame for frame in self.frames if frame.index not in self.kept_back]
+
+    def _all_frames(self) -> tuple[Frame, ...]:
+        """Every frame, by movie index; those that cannot be looked at without an exposure."""
+        usable = {frame.index: frame for frame in self.frames_to_fit}
+        return tuple(usable.get(frame.index, replace(frame, exposure_s=None)) for frame in self.capture.frames)
 
     def judge_light(
         self, pictures: Reader, gray: Reader, given: CameraProfile, progress: Callable[[float], None]
@@ -127,7 +151,8 @@ class _Story:
         if points_left(self.geometric).significant and pulses(self.light.profile):
             even = evened(gray, frames, self.light.profile)
             followed = set(frames_to_follow(self.capture, given)) & {frame.index for frame in frames}
-            again = observe_tracks(self.capture, track_pairs(even(sorted(followed))), given)
+            pairs = _seen(track_pairs(even(sorted(followed))), self.kept_back)
+            again = observe_tracks(self.capture, pairs, given)
             start = self.points.start
             self.points = replace(
                 self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
@@ -146,7 +171,7 @@ class _Story:
             )
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
-            shown = replace(self.capture, frames=tuple(self.frames))
+            shown = replace(self.capture, frames=self._all_frames())
             self.blur, is_exposure = climb_blur(
                 shown, lit, integrate_gyro(self.capture.imu, lit), gray, scale, self.each
             )
@@ -172,7 +197,8 @@ class _Story:
                 )
             return
         trajectory = integrate_gyro(self.capture.imu, extended)
-        self.curve = judge_curve(extended, self.light.observations, self.frames, trajectory, pictures, self.each)
+        frames = self.frames_to_fit
+        self.curve = judge_curve(extended, self.light.observations, frames, trajectory, pictures, self.each)
 
     def settle_light(self) -> None:
         """Brightness's values once more, now that the curve and the exposure are known as well as they will be."""

@@ -24,7 +24,7 @@ from virest.diagnosis.findings import Finding
 from virest.diagnosis.photometry import Array, PhotometricObservations
 from virest.diagnosis.photometry_effects import BlackLevel, PhotometricEffect, ResponseGamma
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, pulls, significance
-from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, light_varies, sentence_of, values_of
+from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, frames_of, light_varies, sentence_of, values_of
 
 STATED_DOUBT = np.array([0.15, 0.02])
 """How far a curve that a profile states may be off: logarithm of gamma, black level."""
@@ -84,7 +84,7 @@ def _again(
     effect = next(e for e in fitted.effects if e.name == finding.name)
     nominal = {name: change.nominal for name, change in finding.parameters.items()}
     std = np.sqrt(np.diag(doubtful.of(effect.name)[1]))
-    changes = changes_of(nominal, values_of(effect, fitted.profile), std)
+    changes = changes_of(nominal, values_of(effect, fitted.profile), std, frames_of(fitted))
     p_value = significance(fitted, effect.name, observations)[1]
     return replace(finding, parameters=changes, p_value=p_value, sentence=sentence_of(effect.name, changes))
 

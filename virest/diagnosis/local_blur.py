@@ -199,11 +199,20 @@ def _measured(
             continue
         if index not in only_paired:
             edges.append(observe_picture(picture, frames[index], curve, settings))
-        kept[index] = SeenFrame(picture, tuple(frames[max(index - k, 0)] for k in range(MEMORY)))
+        kept[index] = SeenFrame(picture, _recent(frames, index))
         if index - PAIR_FRAMES in kept and index not in only_paired:
             pairs.append(observe_pair(kept[index - PAIR_FRAMES], kept[index], curve))
         kept = {k: seen for k, seen in kept.items() if k > index - PAIR_FRAMES}
     return edges, pairs
+
+
+def _recent(frames: Sequence[Frame], index: int) -> tuple[Frame, ...]:
+    """A frame and the MEMORY − 1 before it, newest first; the next one stands for a frame at no known time."""
+    recent = [frames[index]]
+    for k in range(index - 1, index - MEMORY, -1):
+        known = k >= 0 and frames[k].exposure_s is not None and frames[k].skip_reason is None
+        recent.append(frames[k] if known else recent[-1])
+    return tuple(recent)
 
 
 def _chosen(

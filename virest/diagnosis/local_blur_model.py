@@ -119,7 +119,7 @@ def transfers(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajec
     x, y = frequency.T
     form = np.maximum(tensors @ np.stack([x * x, 2 * x * y, y * y]), 0.0)
     seen = np.sinc(2.0 * np.sqrt(3.0 * form)) ** 2 @ weights
-    return np.maximum(seen, 1e-6).reshape(len(ratios), 2, MEMORY, -1)
+    return np.maximum(seen, 1e-6).reshape(len(ratios), 2, MEMORY, seen.shape[-1])
 
 
 def predicted_ratios(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory) -> Array:

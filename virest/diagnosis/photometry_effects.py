@@ -186,6 +186,11 @@ class GainDrift:
         gain = np.append(profile.extensions.gain, 1.0)
         return [np.log(gain[np.minimum(self.frames, len(gain) - 1)])]
 
+    def seen_in(self, observations: PhotometricObservations) -> GainDrift:
+        """The effect with values for those of its frames that are observed; the others' are not determined."""
+        seen = set(observations.frames.tolist())
+        return GainDrift(tuple(k for k in self.frames if k in seen), self.movie_frames)
+
     def columns(self, observations: PhotometricObservations) -> Array:
         """Derivative of the log light factor by the values, (n, k)."""
         return np.asarray((observations.frame[:, None] == np.array(self.frames)).astype(float))

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from virest.camera.profile import CameraProfile
+from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
 from virest.motion.shared_out import Each, one_by_one
@@ -108,12 +109,9 @@ class HeldOut:
     """``time``: fitted on some blocks of frames and judged on the others; ``place``: the same of places."""
 
     @property
-    def gain(self) -> float:
-        """1 − (after² − noise²)/(before² − noise²), held in [0, 1]; 0 where there is nothing to explain."""
-        excess = self.before**2 - self.noise**2
-        if excess <= 1e-9 * self.noise**2:
-            return 0.0
-        return float(np.clip(1 - max(self.after**2 - self.noise**2, 0.0) / excess, 0.0, 1.0))
+    def gain(self) -> float | None:
+        """As HeldOutGain has it; None where the measured noise leaves nothing to explain."""
+        return HeldOutGain(PHOTOMETRY, self.before, self.after, self.noise).gain
 
 
 def time_blocks(observations: PhotometricObservations) -> Indices:
@@ -133,8 +131,8 @@ def fit_photometry(
     use: Mask | None = None,
 ) -> PhotometricFit:
     """Fit all values of the effects together, from every start the effects name, and keep the best."""
-    effects = tuple(effects)
     chosen = _fitted_part(observations if use is None else observations.subset(use), effects)
+    effects = tuple(e.seen_in(chosen) if isinstance(e, GainDrift) else e for e in effects)
     all_starts = product(*(effect.starts(chosen, profile) for effect in effects))
     starts = [np.concatenate([*start, [_FIRST_MEMORY]]) for start in islice(all_starts, _MAX_STARTS)]
     values, cost = _descend(chosen, profile, effects, _best_start(chosen, profile, effects, starts))
@@ -200,8 +198,7 @@ def judge(
         after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
         noise.append(before[-1][1])
     quadratic = [float(np.sqrt(np.mean(np.square(v)))) if v else 0.0 for v in ([b[0] for b in before], after, noise)]
-    # What is left on held-out blocks contains the noise: a larger one was not noise.
-    return HeldOut(quadratic[0], quadratic[1], min(quadratic[1:]), "place" if by_place else "time")
+    return HeldOut(quadratic[0], quadratic[1], quadratic[2], "place" if by_place else "time")
 
 
 def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:
@@ -218,7 +215,8 @@ def significance(fit: PhotometricFit, effect_name: str, observations: Photometri
         trials = max(380.0 * span_s, 1.0)
         p = float(-np.expm1(trials * np.log1p(-min(np.exp(-0.5 * z2), 1 - 1e-12))))
     elif effect_name == "gain_drift":
-        p = _p_of_gains(observations, values, covariance)
+        (gains,) = (effect for effect in fit.effects if isinstance(effect, GainDrift))
+        p = _p_of_gains(observations.subset(np.isin(observations.frame, gains.frames)), values, covariance)
     else:
         off = values[0] - (1.0 if effect_name == "response_curve" else 0.0)
         z2 = off**2 / covariance[0, 0]
@@ -479,14 +477,20 @@ def _changes(observations: PhotometricObservations, effects: Sequence[Photometri
 
     0 for all other values and the memory.
     """
-    product = _per_frame(observations, observations.log_product)
-    exposed = np.abs(product - _frames_before(product, 1))
     parts, start = [], 0
     for effect in effects:
         own = values[start : start + len(effect.parameters)]
+        exposed = _exposure_steps(observations, effect.frames) if isinstance(effect, GainDrift) else own
         parts.append(np.abs(own - _frames_before(own, 1)) + exposed if effect.per_frame else np.zeros(len(own)))
         start += len(own)
     return np.concatenate([*parts, [0.0]])
+
+
+def _exposure_steps(observations: PhotometricObservations, frames: Sequence[int]) -> Array:
+    """Change (k,) of the logarithm of exposure × ISO at each of some frames, all observed, from the one before."""
+    seen = observations.subset(np.isin(observations.frame, frames))
+    product = _per_frame(seen, seen.log_product)
+    return np.abs(product - _frames_before(product, 1))
 
 
 def _centring(effects: Sequence[PhotometricEffect]) -> Array:

@@ -13,14 +13,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
+from virest.diagnosis.catalogue import MAX_P
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
-from virest.diagnosis.photometry_effects import PhotometricEffect, photometric_effects
+from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
 from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_mixing import (
     MixingEstimate,
@@ -38,7 +40,6 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
-MAX_P = 1e-5
 MIN_GAIN = 0.15
 """Least part of the excess over the noise that a cause of brightness must take away on held-out blocks."""
 LEAST_FALL = 0.02
@@ -61,7 +62,8 @@ MIXING_P = 1.5e-3
 MIXING_LEAST = {"response_curve": 0.05, "black_level": 0.02}
 """Smallest change of the curve that is named from mixing: of the logarithm of gamma, of black level."""
 MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
-BLUR_Z = 3.6
+BLUR_Z = float(stats.norm.isf(MAX_P / 2))
+"""Deviations from no change of exposure or defocus at which the two-sided probability is MAX_P."""
 MIN_DEFOCUS_PX = 0.5
 SOFT_Z = 5.0
 """A defocus that is not named, for lenses differ, is said from so many deviations on; named from twice BLUR_Z."""
@@ -222,7 +224,8 @@ def _rung(
             continue
         held_out = judge(observations, nominal, [*accepted, effect], each)
         log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
-        if held_out.gain > MIN_GAIN and held_out.after**2 < (1 - LEAST_FALL) * held_out.before**2:
+        enough = held_out.gain is None or held_out.gain > MIN_GAIN
+        if enough and held_out.after**2 < (1 - LEAST_FALL) * held_out.before**2:
             return replace(nothing, entered=name), effect, fits[name]
     return nothing, None, plain
 
@@ -249,7 +252,7 @@ def _finding(
     held: HeldOut,
 ) -> Finding:
     std = np.sqrt(np.diag(fitted.of(effect.name)[1]))
-    changes = changes_of(values_of(effect, nominal), values_of(effect, fitted.profile), std)
+    changes = changes_of(values_of(effect, nominal), values_of(effect, fitted.profile), std, frames_of(fitted))
     p_value = significance(fitted, effect.name, observations)[1]
     gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
     return Finding(effect.name, changes, gain, (), p_value, sentence_of(effect.name, changes))
@@ -271,11 +274,24 @@ def values_of(effect: PhotometricEffect, profile: CameraProfile) -> dict[str, An
     return {name: values[name] for name in effect.parameters}
 
 
-def changes_of(before: dict[str, Any], now: dict[str, Any], std: Array) -> dict[str, ParameterChange]:
-    """Values as they were and as they are, with their deviations; a gain starts from 1 in every frame."""
+def frames_of(fitted: PhotometricFit) -> Sequence[int]:
+    """Movie indices of the frames whose gains were fitted; none without gains."""
+    return next((effect.frames for effect in fitted.effects if isinstance(effect, GainDrift)), ())
+
+
+def changes_of(
+    before: dict[str, Any], now: dict[str, Any], std: Array, frames: Sequence[int] = ()
+) -> dict[str, ParameterChange]:
+    """Values as they were and as they are, with their deviations; a gain starts from 1 in every frame.
+
+    frames: movie indices that the deviations of a gain belong to; those of other frames, whose gain is taken from
+    their neighbours, are unknown (NaN).
+    """
     if "gain" in now:
         gain = now["gain"]
-        return {"gain": ParameterChange([1.0] * len(gain), gain, [float(s) for s in np.resize(std, len(gain))])}
+        spread = np.full(len(gain), np.nan)
+        spread[np.asarray(frames, np.intp)] = std
+        return {"gain": ParameterChange([1.0] * len(gain), gain, spread.tolist())}
     return {name: ParameterChange(before[name], now[name], float(s)) for name, s in zip(now, std, strict=True)}
 
 
@@ -343,7 +359,8 @@ def _is_sure(found: Mixed, name: str, profile: CameraProfile) -> bool:
     estimate, held = found
     now = _value_of_curve(profile, name)
     size = estimate.value - now if name == "black_level" else abs(np.log(estimate.value / now))
-    return bool(estimate.p_value < MIXING_P and size > MIXING_LEAST[name] and held.gain > MIN_GAIN)
+    gains = held.gain is not None and held.gain > MIN_GAIN
+    return bool(estimate.p_value < MIXING_P and size > MIXING_LEAST[name] and gains)
 
 
 def _value_of_curve(profile: CameraProfile, name: str) -> float:
@@ -371,6 +388,9 @@ def climb_blur(
     exposure_hypothesis: the exposure scale that would put an offset found at constant exposure down to the exposure.
     """
     verdict = PictureVerdict(profile)
+    if not local_blur.frames_to_read(capture):
+        verdict.notes.append("no two frames with known exposures to compare: blur not judged")
+        return verdict, False
     observations = local_blur.look_for_blur(gray, capture, profile, trajectory, each)
     if len(observations) < local_blur.MIN_EDGES:
         verdict.notes.append("too little texture to measure local blur")
@@ -397,12 +417,11 @@ def climb_blur(
         alone = tuple(effects[j] for j in named)
         before, after = local_blur_fit.held_out(observations, profile, trajectory, alone)
         changes = _blur_change(k, profile, scale, sigma, std)
-        noise = min(after, fitted.rms_px)
         z = abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / (2 * std[1])
-        p_value = float(np.exp(-0.5 * z**2))
+        p_value = float((2 if k == 0 else 1) * stats.t.sf(z, local_blur.BLOCKS - 1))
         name = effects[k].name
         verdict.findings.append(
-            Finding(name, changes, HeldOutGain(BLUR, before, after, noise), (), p_value, sentence_of(name, changes))
+            Finding(name, changes, HeldOutGain(BLUR, before, after, None), (), p_value, sentence_of(name, changes))
         )
         verdict.rungs.append(Rung(name, {name: after}, before, BLUR))
         values = np.array([scale]) if k == 0 else np.array([sigma])

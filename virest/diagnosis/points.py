@@ -184,22 +184,31 @@ def with_null_values(
     """
     terms: list[Term] = []
     notes: list[str] = []
-    if profile.intrinsics is None:
-        profile = replace(profile, intrinsics=observed.lens)
-        terms.append(terms_of.FOCAL)
-        notes.append("focal length unknown: fitted on every rung, from a guess")
-    if not profile.readout_known:
-        terms.append(terms_of.READOUT if profile.time_offset_s is None else PLAIN_READOUT)
+    unknown_lens = profile.intrinsics is None
+    profile = replace(profile, intrinsics=observed.lens)
     far = _agree_at(observed, capture, profile)
     agree = far is not None or _hardly_turns(observed, profile) or _one_axis_agrees(observed, capture, profile)
+    telling = (agree or bool(capture.repeats)) and not at_rest(observed, profile)
+    if unknown_lens:
+        terms += [terms_of.FOCAL] if telling else []
+        notes.append(f"focal length unknown: {'fitted on every rung, from a guess' if telling else 'a guess is taken'}")
+    if not profile.readout_known and telling:
+        terms.append(terms_of.READOUT if profile.time_offset_s is None else PLAIN_READOUT)
     if profile.time_offset_s is not None:
         return profile, terms, notes, far or FarClock(), agree
     if far is None:
         notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
         return replace(profile, time_offset_s=0.0), terms, notes, FarClock(), agree
-    terms.append(terms_of.TIME_OFFSET)
+    terms += [terms_of.TIME_OFFSET] if telling else []
     begun = replace(profile, time_offset_s=far.offset_s)
     return begun, terms, notes, FarClock(0.0, far.skewed_offset_s - far.offset_s, far.skew), agree
+
+
+def at_rest(observed: ObservedTracks, profile: CameraProfile) -> bool:
+    """Whether neither turns nor points move by more from frame to frame than a tracker errs: nothing can be told."""
+    steps = (np.linalg.norm(pair.points_second_px - pair.points_first_px, axis=-1) for pair in observed.pairs)
+    moved_px = np.median(np.concatenate([np.zeros(1), *steps]))
+    return bool(moved_px < MIN_MOTION_PX) and _hardly_turns(observed, profile)
 
 
 def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:

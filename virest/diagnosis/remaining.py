@@ -71,22 +71,21 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.astray)
     limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
     beyond = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
-    noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * noise
+    p_noisier, p_stray = _more_than_noise(fitted.distance, table.pair, noise / geometric.step_noise_px)
+    noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * noise and p_noisier < STRUCTURE_P
+    strays = geometric.astray > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
     log.debug("left: %s, limit %.3f, beyond noise %.3f, stray %.3f", found, limit, beyond, stray)
-    structured = strongest.size > limit and strongest.p_value < STRUCTURE_P
-    significant = structured or noisier or stray > STRAY_PART
-    along = strongest.along
-    size = strongest.size
-    if not structured and noisier:
-        size = beyond
-    if not structured and stray > STRAY_PART:
-        along = "place"
-    p_value = strongest.p_value
-    if not structured and significant:
-        p_value = min(s.p_value for s in found)
-        p_value = min(p_value, *_more_than_noise(fitted.distance, table.pair, noise / geometric.step_noise_px))
-    sentence = f"{size:.3f} px remain, strongest along {along}" if significant else ""
-    return Remaining(p_value, along, size, GEOMETRY, significant, sentence)
+    if strongest.size > limit and strongest.p_value < STRUCTURE_P:
+        sentence = f"{strongest.size:.3f} px remain, strongest along {strongest.along}"
+        return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, True, sentence)
+    if noisier:
+        sentence = f"{beyond:.3f} px remain beyond tracking noise, strongest along {strongest.along}"
+        return Remaining(p_noisier, strongest.along, beyond, GEOMETRY, True, sentence)
+    if strays:
+        sentence = f"{stray:.0%} of the points move on their own"
+        p_value = None if geometric.astray > STRAY_PART else p_stray
+        return Remaining(p_value, "place", strongest.size, GEOMETRY, True, sentence)
+    return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
 
 
 def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> tuple[float, float]:

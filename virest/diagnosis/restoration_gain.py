@@ -1,7 +1,9 @@
 """What a better model does for the restored pictures, measured without truth.
 
-Some pairs of neighbouring frames, lively ones spread over the capture, are restored with the profile as given and with
-the extended one.  Two neighbours are two independent witnesses of one scene:
+Some pairs of neighbouring frames, high-motion ones spread over the capture, are kept back from every fit of points,
+blur and curve, and restored with the profile as given and with the extended one.  (Brightness sees them: a gain that
+drifts belongs to its frame, and other frames do not tell it.)  Two neighbours are two independent witnesses of one
+scene:
 
 - *sharpness*: the gradient that both show.  One picture is laid on the other by a homography through tracked points,
   and the product of their gradients is averaged: noise and the ringing of a wrong kernel differ between the two and
@@ -45,6 +47,8 @@ Rectangle = tuple[int, int, int, int]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
 PAIRS = 4
+KEPT_BACK = 0.1
+"""At most this part of the frames is kept back from fits."""
 MIN_TRACKS = 16
 """Fewer points than this lay no picture on another."""
 HOMOGRAPHY_PX = 2.0
@@ -129,9 +133,13 @@ def measure_restoration_gain(
     gray: Reader,
     settings: RestorationSettings = PRESETS["balanced"],
     each: Each = one_by_one,
+    firsts: Sequence[int] | None = None,
 ) -> RestorationGain:
-    """Restore a few pairs of neighbours with both profiles and compare; pictures: RGB by index, gray: luma."""
-    firsts = chosen_pairs(capture, extended)
+    """Restore a few pairs of neighbours with both profiles and compare; pictures: RGB by index, gray: luma.
+
+    firsts: the first frame of each pair, kept back from the fits that made the extended profile; None: any.
+    """
+    firsts = chosen_pairs(capture, extended) if firsts is None else firsts
     numbers = sorted({first + step for first in firsts for step in (0, 1)})
     recorded = {index: picture for index, picture in pictures(numbers) if picture is not None}
     profiles = [nominal] if extended == nominal else [nominal, extended]
@@ -173,6 +181,26 @@ def chosen_pairs(capture: Capture, profile: CameraProfile) -> list[int]:
     lagging = profile.extensions.frame_lag_frames
     if lagging:
         chosen += choose_pairs(frames[: lagging + 1], capture.imu, 2, 2, offset_s)
+    return _pairs_of(chosen, capture)
+
+
+def pairs_to_keep_back(capture: Capture, profile: CameraProfile) -> list[int]:
+    """First frames of the pairs that no fit is to see, spread over the capture; of the start-up too, if there is one.
+
+    None where the capture is so short that a pair is more than KEPT_BACK of it.
+    """
+    frames = [
+        dataclasses.replace(frame, skip_reason=None, skip_codes=()) if frame.only_startup else frame
+        for frame in capture.frames
+    ]
+    count = min(PAIRS, int(KEPT_BACK * sum(frame.skip_reason is None for frame in frames) / 2))
+    if not count:
+        return []
+    return _pairs_of(choose_pairs(frames, capture.imu, 2 * count, 2, profile.time_offset_s or 0.0), capture)[:count]
+
+
+def _pairs_of(chosen: Sequence[int], capture: Capture) -> list[int]:
+    """First frames of the pairs of neighbours among some frames, without exact repeats; no two pairs share a frame."""
     firsts: list[int] = []
     for index in sorted(set(chosen)):
         free = not firsts or index > firsts[-1] + 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
@@ -18,13 +19,21 @@ from virest.motion.track_model import TrackTable
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 JUDGE_POINTS = 3500
+LAGGING_BLOCK, MOST_LAGGING_BLOCKS = 3, 8
+"""Pairs in a block of those that a start-up moves, at least, and blocks at most."""
+
+
+FOLDS = (0, 1)
+"""A fit of fold k sees the blocks of time whose number is k modulo 2; the others judge it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A candidate on blocks that it was not fitted to."""
+    """A candidate, or a way of choosing one, on blocks that took no part in its fit."""
 
     candidate: Candidate
+    distance: Array
+    """(n,) whitened held-out distances of the points."""
     block_loss: Array
     """(blocks,) mean held-out loss a point."""
     pair_loss: Array
@@ -35,63 +44,131 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Screened:
-    """A candidate with its model fitted to all blocks, with few points."""
+    """A candidate with its model fitted to each fold's blocks, with few points."""
 
-    loss: float
     candidate: Candidate
+    models: tuple[Model, Model]
+    """Fitted, by fold."""
+    losses: tuple[float, float]
+    """On the blocks that they were fitted to."""
     scale: float
     depth_spread_per_m: float
 
+    @property
+    def loss(self) -> float:
+        """Mean of both folds."""
+        return 0.5 * sum(self.losses)
+
 
 def screen(evidence: Evidence, candidates: Sequence[Candidate], each: Each) -> list[Screened]:
-    """Fit each candidate to all blocks."""
+    """Fit each candidate to the blocks of each fold."""
     tables = {
         lag: evidence.table(model, SCREEN_POINTS) for lag, model in {c.model.lag: c.model for c in candidates}.items()
     }
-    calls = [(evidence.imu, tables[c.model.lag], c.model, (*c.model.terms, *c.added)) for c in candidates]
+    use = [evidence.block % 2 == fold for fold in FOLDS]
+    calls = [
+        (evidence.imu, tables[c.model.lag], c.model, (*c.model.terms, *c.added), use[fold])
+        for c in candidates
+        for fold in FOLDS
+    ]
     found = each(_screen, calls)
-    return [Screened(s[0], replace(c, model=s[1]), s[2], s[3]) for c, s in zip(candidates, found, strict=True)]
+    return [_screened(c, *halves) for c, *halves in zip(candidates, found[::2], found[1::2], strict=True)]
 
 
-def _screen(
-    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term]
-) -> tuple[float, Model, float, float]:
-    """Loss, fitted model, scale and spread of depths of one candidate."""
-    fitted = fit_model(imu, model, terms, table)
+Half = tuple[float, Model, float, float]
+"""Loss, fitted model, scale and spread of depths of a candidate on the blocks of one fold."""
+
+
+def _screen(imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask) -> Half:
+    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]))
     found = replace(model, profile=fitted.profile, scene=fitted.scene)
     return relief_loss(fitted), found, fitted.scale, fitted.depth_spread_per_m
 
 
+def _screened(candidate: Candidate, first: Half, second: Half) -> Screened:
+    spread = 0.5 * (first[3] + second[3])
+    models, losses = (first[1], second[1]), (first[0], second[0])
+    return Screened(replace(candidate, model=first[1]), models, losses, min(first[2], second[2]), spread)
+
+
 def best_of_each(screened: list[Screened]) -> list[Screened]:
-    """For each cause the starting point that fits best; best causes first."""
-    best: dict[str, Screened] = {}
+    """For each cause the starting point that fits best, chosen for each fold by its own blocks; best causes first."""
+    by_name: dict[str, list[Screened]] = {}
     for entry in screened:
-        name = entry.candidate.name
-        if name not in best or entry.loss < best[name].loss:
-            best[name] = entry
-    return sorted(best.values(), key=lambda entry: entry.loss)
+        by_name.setdefault(entry.candidate.name, []).append(entry)
+    best = []
+    for entries in by_name.values():
+        first, second = (min(entries, key=lambda entry, k=fold: entry.losses[k]) for fold in FOLDS)  # type: ignore[misc]
+        better = min(first, second, key=lambda entry: entry.loss)
+        if first.candidate.word == second.candidate.word and first.candidate.model.lag == second.candidate.model.lag:
+            models, losses = (first.models[0], second.models[1]), (first.losses[0], second.losses[1])
+            better = replace(better, models=models, losses=losses)
+        best.append(better)
+    return sorted(best, key=lambda entry: entry.loss)
+
+
+def promising(base: Screened, better: Sequence[Screened], count: int) -> tuple[frozenset[str], frozenset[str]]:
+    """Names of the most promising causes of each fold, by the blocks that it is fitted to alone."""
+    first, second = (
+        frozenset(
+            entry.candidate.name
+            for entry in sorted(better, key=lambda entry, k=fold: entry.losses[k])[:count]  # type: ignore[misc]
+            if entry.losses[fold] < base.losses[fold]
+        )
+        for fold in FOLDS
+    )
+    return first, second
 
 
 def judge(
-    evidence: Evidence, candidates: Sequence[Candidate], scale: float, depth_spread_per_m: float, each: Each
+    evidence: Evidence, screened: Sequence[Screened], scale: float, depth_spread_per_m: float, each: Each
 ) -> list[Judged]:
     """Fit on every other block, judge on those between, and the other way round."""
-    tables = [evidence.table(candidate.model, JUDGE_POINTS) for candidate in candidates]
+    tables = [evidence.table(entry.candidate.model, JUDGE_POINTS) for entry in screened]
     calls = [
-        (evidence.imu, table, c.model, (*c.model.terms, *c.added), evidence.block % 2 == fold, depth_spread_per_m)
-        for c, table in zip(candidates, tables, strict=True)
-        for fold in (0, 1)
-    ]
+        (evidence.imu, table, model, (*model.terms, *entry.candidate.added), evidence.block % 2 == fold,
+         depth_spread_per_m)
+        for entry, table in zip(screened, tables, strict=True)
+        for fold, model in enumerate(entry.models)
+    ]  # fmt: skip
     halves = each(_held_out, calls)
     judged = []
-    for candidate, table, first, second in zip(candidates, tables, halves[::2], halves[1::2], strict=True):
+    for entry, table, first, second in zip(screened, tables, halves[::2], halves[1::2], strict=True):
         distance = np.where(evidence.block[table.pair] % 2 == 0, second, first)
-        block = evidence.block[table.pair]
-        mean = loss(distance, scale)
-        by_pair = np.bincount(table.pair, mean) / np.maximum(np.bincount(table.pair), 1)
-        by_block = np.bincount(block, mean) / np.maximum(np.bincount(block), 1)
-        judged.append(Judged(candidate, by_block, by_pair, capped_rms(distance)))
+        judged.append(_judged(evidence, entry.candidate, table, distance, scale))
     return judged
+
+
+def _judged(evidence: Evidence, candidate: Candidate, table: TrackTable, distance: Array, scale: float) -> Judged:
+    mean, block = loss(distance, scale), evidence.block[table.pair]
+    by_pair, by_block = (np.bincount(k, mean) / np.maximum(np.bincount(k), 1) for k in (table.pair, block))
+    return Judged(candidate, distance, by_block, by_pair, capped_rms(distance))
+
+
+def choose(
+    evidence: Evidence, judged: Sequence[Judged], allowed: tuple[frozenset[str], frozenset[str]], scale: float
+) -> Judged:
+    """What the best cause gains where nothing chose it: a choice for each block by other blocks alone.
+
+    A block of one fold is judged by fits that saw the other fold's blocks; which cause counts is chosen by the
+    remaining blocks of its own fold, which those fits did not see either.  Of causes that are not promising by the
+    fitted blocks none is chosen, and where none is, the first of ``judged``, which is the model without.
+    """
+    table = evidence.table(judged[0].candidate.model, JUDGE_POINTS)
+    block = evidence.block[table.pair]
+    losses = np.stack([entry.block_loss for entry in judged])
+    distance, chosen = judged[0].distance.copy(), np.zeros(losses.shape[1], np.intp)
+    for number in range(losses.shape[1]):
+        fitted_to = 1 - number % 2
+        free = [k for k, entry in enumerate(judged) if k and entry.candidate.name in allowed[fitted_to]]
+        others = np.arange(number % 2, losses.shape[1], 2)
+        others = others[others != number]
+        if free:
+            by = losses[free][:, others].mean(axis=1) if len(others) else np.arange(len(free), dtype=float)
+            chosen[number] = free[int(np.argmin(by))]
+        distance[block == number] = judged[chosen[number]].distance[block == number]
+    best = judged[int(np.bincount(chosen).argmax())]
+    return _judged(evidence, best.candidate, table, distance, scale)
 
 
 def _held_out(
@@ -103,12 +180,18 @@ def _held_out(
 
 
 def lagging_gain(evidence: Evidence, before: Judged, after: Judged) -> Array:
-    """Gain of the pairs that a start-up schedule moves; nothing of it was fitted, so each pair is a judge."""
+    """Gain (blocks,) of the pairs that a start-up schedule moves, by blocks of neighbours that share errors."""
     last = after.candidate.model.profile.extensions.frame_lag_frames
     moved = np.array([pair.first <= last for pair in evidence.observed.pairs])
     both = min(len(before.pair_loss), len(after.pair_loss), len(moved))
-    gain: Array = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
-    return gain
+    gain = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
+    parts = np.array_split(gain, max(min(len(gain) // LAGGING_BLOCK, MOST_LAGGING_BLOCKS), 3))
+    return np.array([part.mean() for part in parts if len(part)])
+
+
+def chance_of(gain: Array) -> float:
+    """Probability (one-sided t test) of so even a gain (blocks,) where there is none."""
+    return float(stats.t.sf(t_ratio(gain), max(len(gain) - 1, 1)))
 
 
 def t_ratio(values: Array) -> float:

@@ -64,7 +64,7 @@ class ObservedTracks:
         return replace(self, pairs=kept, noise_px=self.noise_px[use])
 
     def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
-        """The pairs whose two pictures lie inside the inertial data, with no pause or untrusted stretch between them."""
+        """The pairs whose two pictures lie inside the inertial data, with no pause or untrusted stretch between."""
         shutter = profile.shutter
         start = np.asarray(profile.imu_time_s(shutter.first_row_start_s(self.stamp_s, self.exposure_s)))
         last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s) + MARGIN_S

@@ -265,7 +265,7 @@ def _descend(
     problem = _Problem(imu, table, terms, start)
     system, damping = problem.weighed(state, look or problem.look(state, None)), 0.0
     if not system.hessian.size:
-        return state, system
+        return replace(state, scene=system.scene), system
     for _ in range(max_iterations):
         step = system.solve(damping)
         step *= min(1.0, 1.0 / max(float(np.max(np.abs(step) / system.limit, initial=0.0)), 1e-12))

@@ -45,7 +45,7 @@ def _pair_noise(pair: TrackPair) -> float:
 
 def _residual(pair: TrackPair) -> tuple[Array, int]:
     order = next((o for o in ORDERS if len(pair) >= POINTS_PER_TERM * (o + 1) * (o + 2) // 2), 0)
-    basis = _basis(pair.points_first_px, order)
+    basis = flow_basis(pair.points_first_px, order)
     step = pair.points_second_px - pair.points_first_px
     weight = np.ones(len(pair))
     residual = step
@@ -58,7 +58,8 @@ def _residual(pair: TrackPair) -> tuple[Array, int]:
     return residual, basis.shape[1]
 
 
-def _basis(points_px: Array, order: int) -> Array:
+def flow_basis(points_px: Array, order: int) -> Array:
+    """Monomials (n, k) of places up to an order, about their middle."""
     centred = points_px - points_px.mean(axis=0)
     x, y = (centred / max(float(np.abs(centred).max()), 1.0)).T
     return np.stack([x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)], axis=-1)

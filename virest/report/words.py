@@ -184,11 +184,19 @@ def diagnosis_verdict(verdict: str, causes: Sequence[Mapped], nominal: Mapped) -
     words = [f"Found: {named}." if named else ""]
     if nominal.get("geometry_rms_px") is not None:
         words.append(
-            f"Tracked points were off by {number(nominal['geometry_rms_px'], 3)} px, of which tracking itself makes "
-            f"{number(nominal.get('geometry_noise_px'), 3)} px ({number(nominal.get('tracks'), 9)} tracks in "
-            f"{number(nominal.get('frames'), 9)} frames)."
+            f"Tracked points were off by {residual_words(nominal['geometry_rms_px'], nominal.get('geometry_noise_px'))}"
+            f" ({number(nominal.get('tracks'), 9)} tracks in {number(nominal.get('frames'), 9)} frames)."
         )
     return Verdict(level, headline, " ".join(filter(None, words)))
+
+
+def residual_words(residual_px: Any, noise_px: Any) -> str:
+    """A residual beside tracking noise, which is measured on its own and may come out larger."""
+    shown, noise = f"{number(residual_px, 3)} px", f"{number(noise_px, 3)} px"
+    known = all(isinstance(value, int | float) for value in (residual_px, noise_px))
+    if known and residual_px < noise_px:
+        return f"{shown}, no more than tracking noise ({noise})"
+    return f"{shown} (tracking noise {noise})"
 
 
 def cause_view(cause: Mapped) -> dict[str, Any]:
@@ -229,10 +237,11 @@ def _part(after: Any, before: Any) -> float | None:
 def remaining_words(unexplained: Mapped, verdict: str) -> str:
     """What no cause explains, in a sentence."""
     along = str(unexplained.get("strongest_along") or "nothing in particular")
-    p_value = number(unexplained.get("p_value"), 2)
+    value = unexplained.get("p_value")
+    p_value = "p unknown" if value is None else f"p = {number(value, 2)}"
     if verdict == "unexplained":
-        return f"What remains is more than chance (p = {p_value}) and goes most with {along}."
-    return f"What remains is of no size (p = {p_value}, most along {along})."
+        return f"What remains is more than chance ({p_value}), strongest along {along}."
+    return f"No significant residual ({p_value}, strongest along {along})."
 
 
 def gain_words(gain: Mapped) -> list[tuple[str, str]]:

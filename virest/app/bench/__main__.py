@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from virest import __version__
+from virest.app.bench.broken import broken_section
+from virest.app.bench.calibration import calibration_section
 from virest.app.bench.commands import commands_section
 from virest.app.bench.compare import NOISE, compare_text, read_report
 from virest.app.bench.cost import cost_section
@@ -46,7 +48,9 @@ SECTIONS: dict[str, Section] = {
     "cost": cost_section,
     "curves": curves_section,
     "diagnosis": diagnosis_section,
+    "calibration": calibration_section,
     "soak": soak_section,
+    "broken": broken_section,
     "real": real_section,
 }
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image", "deepinv", "torch")
@@ -59,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         old, new = map(read_report, options.compare)
         emit(compare_text(old, new, options.noise))
         return
-    scale = Scale(quick=options.quick, full=options.full)
+    scale = Scale(quick=options.quick, full=options.full, seeds=options.seeds)
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
     work = Path(tempfile.mkdtemp(prefix="work-", dir=options.out))
@@ -79,6 +83,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="a few frames: a look, no measurement")
     size.add_argument("--full", action="store_true", help="memory up to 3000 frames")
+    parser.add_argument("--seeds", type=int, default=100, help="captures of --only calibration [100]")
     parser.add_argument("--out", type=Path, default=Path("bench-out"), help="folder of bench.json [bench-out]")
     parser.add_argument("--compare", nargs=2, type=Path, metavar=("OLD", "NEW"), help="measure nothing, compare these")
     parser.add_argument(

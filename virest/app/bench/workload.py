@@ -38,6 +38,8 @@ class Scale:
 
     quick: bool = False
     full: bool = False
+    seeds: int = 100
+    """Captures that calibrations are compared with truth on."""
 
     @property
     def name(self) -> str:

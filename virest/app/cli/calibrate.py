@@ -50,7 +50,7 @@ def calibrate(
     readout_time_s           0.020000       0.022700  8.1e-05  yes
     readout_direction   right_to_left  right_to_left           yes
     ...
-    residual 0.399 -> 0.123 px, of which tracking makes 0.123 px
+    residual 0.399 -> 0.123 px (tracking noise 0.123 px)
     wrote camera.yaml
 
     \b

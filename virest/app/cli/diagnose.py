@@ -28,7 +28,7 @@ def diagnose(
 
     \b
     $ virest diagnose shaken
-    shaken: 13774 tracks in 60 frames, off by 1.336 px, of which tracking makes 0.1759 px
+    shaken: 13774 tracks in 60 frames, residual 1.336 px (tracking noise 0.1759 px)
     cause              parameter  given    found          ±  before   after  gain  held out         rivals
     readout_time  readout_time_s  0.022  0.01493  5.607e-05   1.339  0.1836  100%  geometry_rms_px  -
     readout_time: the rows are read within 0.01493 s

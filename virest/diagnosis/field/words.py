@@ -83,7 +83,7 @@ UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.
 def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding:
     """A field as a finding of the diagnosis."""
     if isinstance(entry, Distrusted):
-        return _distrusted(entry)
+        return _distrusted(entry, noise_px)
     fields, form = entry.fields, entry.form
     shape = shape_of(fields[0]) if len(fields) == 1 else _common_shape(fields)
     size, std = _size(fields)
@@ -103,7 +103,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
         size,
         _unit(form.kind, form.covariates),
         std,
-        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, min(noise_px, entry.after_px)),
+        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, noise_px),
         entry.p_value,
         entry.rivals,
         entry.stability,
@@ -113,7 +113,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     )
 
 
-def _distrusted(entry: Distrusted) -> FieldFinding:
+def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
     """Stretches of the log: what they look like, how far points are off there, and whether they are bridged."""
     first = entry.stretches[0]
     total_s = sum(stretch.to_s - stretch.from_s for stretch in entry.stretches)
@@ -150,7 +150,7 @@ def _distrusted(entry: Distrusted) -> FieldFinding:
         size,
         "rad/s",
         None,
-        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, entry.noise_px),
+        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, noise_px),
         entry.p_value,
         (),
         None,

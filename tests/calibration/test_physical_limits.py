@@ -1,0 +1,49 @@
+"""What no camera can be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from virest.calibration.physical_limits import impossible, is_depth
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.camera.shutter import Shutter
+
+PERIOD_S, EXPOSURE_S = 1 / 30, 0.008
+PHONE = CameraProfile(
+    640, 480, intrinsics=Intrinsics(640, 480, 520, 520, 319, 239), shutter=Shutter(0.0207), time_offset_s=0.4
+)
+
+
+def test_a_phone_is_possible() -> None:
+    """Nothing of an ordinary camera is at its limits, also where the exposure is unknown."""
+    assert not impossible(PHONE, PERIOD_S, EXPOSURE_S)
+    assert not impossible(PHONE, PERIOD_S, 0.0)
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 2.9e-4, -2.9e-4, 0.0334, 0.06])
+def test_no_sensor_reads_so_fast_or_so_slowly(readout_s: float) -> None:
+    """A rolling shutter takes a millisecond at least and a frame period at most."""
+    shutter = replace(PHONE.shutter, readout_time_s=readout_s)
+    assert impossible(replace(PHONE, shutter=shutter), PERIOD_S, EXPOSURE_S) == {"readout_time"}
+
+
+@pytest.mark.parametrize("scale", [0.05, 4.5, 20.0])
+def test_an_exposure_fits_into_its_frame(scale: float) -> None:
+    """36 of 33 ms is none, and neither is one at the end of the fit."""
+    shutter = replace(PHONE.shutter, exposure_scale=scale)
+    assert impossible(replace(PHONE, shutter=shutter), PERIOD_S, EXPOSURE_S) == {"exposure_time"}
+
+
+@pytest.mark.parametrize("focal_px", [190.0, 7000.0])
+def test_lenses_have_angles_of_view(focal_px: float) -> None:
+    """Neither 190 nor 7000 px over 640 px is a lens before such a sensor."""
+    lens = Intrinsics(640, 480, focal_px, focal_px, 319, 239)
+    assert impossible(replace(PHONE, intrinsics=lens), PERIOD_S, EXPOSURE_S) == {"focal_length"}
+
+
+def test_scenes_lie_before_the_lens() -> None:
+    """A depth ends neither in the lens nor at the end of the fit's range."""
+    assert [is_depth(depth) for depth in (0.02, 0.5, 1e4)] == [False, True, False]

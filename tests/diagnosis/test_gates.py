@@ -1,0 +1,260 @@
+"""What has to be true before a cause is named: gates, blocks that took no part, errors that hang together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnosis.test_photometry import FRAMES, NOISE, NOMINAL, hidden, made_observations
+from motion.synthetic_tracks import Recording, Setup
+
+from virest.camera.profile import CameraProfile
+from virest.diagnosis import geometric_ladder, local_blur, local_blur_fit, picture_ladder
+from virest.diagnosis.candidates import Candidate
+from virest.diagnosis.catalogue import CATALOGUE, FALSE_ALARM, MAX_P
+from virest.diagnosis.findings import Rung
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
+from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
+from virest.diagnosis.geometric_ladder import Trial, _best_single, _significant
+from virest.diagnosis.photometry_effects import Vignetting
+from virest.diagnosis.photometry_fit import HeldOut, fit_photometry, judge, time_blocks
+from virest.diagnosis.trials import Judged, Screened, choose
+from virest.diagnosis.trials import judge as judge_points
+from virest.motion import profile_terms as terms_of
+from virest.motion.shared_out import one_by_one
+
+HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
+EFFECT = {effect.name: effect for effect in GEOMETRIC_EFFECTS}
+
+
+@lru_cache(maxsize=1)
+def hand() -> tuple[Recording, Evidence]:
+    """A recording and its evidence."""
+    camera = Recording(HAND)
+    return camera, make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), camera.observed)
+
+
+# ── held out ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_points_are_judged_by_fits_that_did_not_see_them() -> None:
+    """Half of the blocks shifted in time: each half is judged by the other half's offset."""
+    camera, evidence = hand()
+    late = (evidence.block % 2).astype(float) * 0.012
+    stamps = camera.observed.stamp_s.copy()
+    for pair, shift_s in zip(camera.observed.pairs, late, strict=True):
+        stamps[pair.second] = camera.observed.stamp_s[pair.second] + shift_s
+    torn = make_evidence(evidence.imu, replace(camera.observed, stamp_s=stamps))
+    model = Model(camera.profile, None, ())
+    candidate = Candidate("time_offset", model, (terms_of.TIME_OFFSET,), EFFECT["time_offset"])
+    (judged,) = judge_points(torn, [Screened(candidate, (model, model), (0.0, 0.0), 1.0, 0.0)], 1.0, 0.0, one_by_one)
+    table = torn.table(model, 3500)
+    for fold in (0, 1):
+        fitted = torn.fit(model, (terms_of.TIME_OFFSET,), table, torn.block % 2 == fold)
+        held = torn.block[table.pair] % 2 != fold
+        expected = torn.distances(fitted, table, 0.0)
+        np.testing.assert_allclose(judged.distance[held], expected[held], rtol=1e-6)
+
+
+def test_what_was_chosen_is_judged_where_nothing_chose_it() -> None:
+    """A cause that only its own block likes is chosen nowhere else, and not there either."""
+    _, evidence = hand()
+    table = evidence.table(Model(hand()[0].profile, None, ()), 3500)
+    block, blocks = evidence.block[table.pair], int(evidence.block.max()) + 1
+
+    def made(name: str, losses: Any) -> Judged:
+        candidate = Candidate(name, Model(hand()[0].profile, None, ()), (), None)
+        each = np.asarray(losses, float)
+        return Judged(candidate, np.sqrt(np.expm1(each))[block] * 2.4, each, np.zeros(len(evidence.block)), 1.0)
+
+    base = made("", np.full(blocks, 1.0))
+    steady = made("focal_length", np.full(blocks, 0.95))
+    lucky = np.full(blocks, 1.04)
+    lucky[2] = 0.2
+    by_chance = made("clock_skew", lucky)
+    both = frozenset({"focal_length", "clock_skew"})
+    found = choose(evidence, [base, steady, by_chance], (both, both), 1.0)
+    assert found.block_loss[2] == pytest.approx(0.95)
+    # other blocks of its parity see that block, and may choose by it
+    assert found.block_loss[1] == pytest.approx(0.95)
+    nothing = choose(evidence, [base, steady, by_chance], (frozenset(), frozenset()), 1.0)
+    np.testing.assert_allclose(nothing.block_loss, 1.0)
+
+
+def test_brightness_is_judged_on_the_other_blocks(rng: np.random.Generator) -> None:
+    """Vignetting in every other block of time explains nothing where it was not fitted."""
+    dark = made_observations(hidden(vignetting_corner_loss=0.45), np.random.default_rng(1))
+    even = made_observations(hidden(), np.random.default_rng(1))
+    odd = time_blocks(dark) % 2 == 1
+    torn = replace(dark, grey=np.where(odd, dark.grey, even.grey))
+    held = judge(torn, NOMINAL, [Vignetting()])
+    assert held.after > 0.97 * held.before
+
+
+def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The masks of fit and judge share no residual, and leave none out."""
+    time_s = np.linspace(0.0, 4.0, 80)
+    fits: list[Any] = []
+    judged: list[Any] = []
+    monkeypatch.setattr(local_blur_fit, "fit", lambda *a: fits.append(a[4]))
+    monkeypatch.setattr(local_blur_fit, "judge", lambda *a: judged.append(a[3]) or 0.0)
+    local_blur_fit.held_out(SimpleNamespace(time_s=time_s), CameraProfile(64, 48), None, ())  # type: ignore[arg-type]
+    assert len(fits) == len(judged) == 2
+    for used, held in zip(fits, judged, strict=True):
+        assert not np.any(used & held)
+        assert np.all(used | held)
+
+
+# ── gates of the points ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def trial_of(monkeypatch: pytest.MonkeyPatch, losses: dict[str, Any], p_value: float = 0.0) -> Any:
+    """What the ladder makes of causes with these held-out losses by block; the model without has 1 everywhere."""
+    camera, evidence = hand()
+    model = Model(camera.profile, None, ())
+
+    def judged(name: str, each: Any) -> Judged:
+        candidate = Candidate(name, model, (), EFFECT.get(name))
+        return Judged(candidate, np.zeros(1), np.asarray(each, float), np.zeros(1), float(np.mean(each)))
+
+    entries = [judged(name, each) for name, each in losses.items()]
+    before = judged("", np.ones(len(next(iter(losses.values())))))
+    monkeypatch.setattr(geometric_ladder, "choose", lambda _evidence, judged, *_: judged[1])
+    monkeypatch.setattr(geometric_ladder, "_significant", lambda *_: (model if p_value < MAX_P else None, p_value))
+    allowed = frozenset(losses)
+    return _best_single(model, Trial(evidence, before, entries, (allowed, allowed), 1.0))
+
+
+WOBBLE = np.array([0.01, -0.01, 0.02, -0.02, 0.01, -0.01, 0.0, 0.0])
+
+
+def test_a_gain_must_be_worth_naming(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two thousandths of the loss, however even, are not; two hundredths are."""
+    assert trial_of(monkeypatch, {"focal_length": 0.998 + 1e-3 * WOBBLE})[0] is None
+    assert trial_of(monkeypatch, {"focal_length": 0.98 + 1e-2 * WOBBLE})[0] is not None
+
+
+def test_a_gain_must_hold_between_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One block's gain is none; a large gain need be less even than a small one."""
+    single = np.ones(8)
+    single[3] = 0.5
+    assert trial_of(monkeypatch, {"focal_length": single})[0] is None
+    uneven = np.array([1.0, 0.99, 0.94, 0.98, 1.0, 0.93, 0.97, 1.01])
+    gain = 1 - uneven
+    t = gain.mean() / (gain.std(ddof=1) / np.sqrt(8))
+    assert 1.9 < t < 3.0
+    assert trial_of(monkeypatch, {"focal_length": uneven})[0] is None
+    assert trial_of(monkeypatch, {"focal_length": 1 - 4 * gain})[0] is not None
+
+
+def test_causes_that_the_blocks_do_not_tell_apart_are_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cause nearly as good in every block is none; one that is as good in the mean and better in some is."""
+    best = 0.80 + WOBBLE
+    step, other = trial_of(monkeypatch, {"focal_length": best, "gyro_scale": best + 0.02 + 0.3 * WOBBLE})
+    assert step is not None
+    assert (step.accepted[0].rivals, other) == ((), None)
+    step, other = trial_of(monkeypatch, {"focal_length": best, "gyro_scale": best + 0.01 + 3 * WOBBLE[::-1]})
+    assert step is not None
+    assert [rival.name for rival in step.accepted[0].rivals] == ["gyro_scale"]
+    assert other is not None
+    assert other.accepted[0].name == "gyro_scale"
+
+
+def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in a thousand is too likely for one of twenty-two causes; for a word its gain by blocks decides."""
+    assert MAX_P * len(CATALOGUE) == pytest.approx(FALSE_ALARM)
+    camera, evidence = hand()
+    model = Model(camera.profile, None, ())
+    candidate = Candidate("time_offset", model, (terms_of.TIME_OFFSET,), EFFECT["time_offset"])
+    for p_value, named in ((0.5 * MAX_P, True), (1e-3, False)):
+        monkeypatch.setattr(geometric_ladder, "_p_value", lambda *_, p=p_value: p)
+        entered, told = _significant(evidence, candidate, camera.profile, np.zeros(3))
+        assert (entered is not None, told) == (named, p_value)
+    word = Candidate("readout_direction", model, (), EFFECT["readout_direction"], "top_to_bottom")
+    even, uneven = np.array([0.1, 0.11, 0.1, 0.09, 0.1, 0.1]), np.array([0.1, -0.05, 0.3, 0.0, 0.1, 0.02])
+    assert _significant(evidence, word, camera.profile, even)[0] is not None
+    assert _significant(evidence, word, camera.profile, uneven)[0] is None
+
+
+# ── gates of brightness ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("held", "p_value", "named"),
+    [
+        (HeldOut(2.0, 1.0, 0.9, "time"), 1e-9, True),
+        (HeldOut(2.0, 1.9, 0.9, "time"), 1e-9, False),
+        (HeldOut(2.0, 1.0, 0.9, "time"), 1e-3, False),
+        (HeldOut(2.0, 1.99, 1.98, "time"), 1e-9, False),
+        (HeldOut(1.0, 0.9, 1.1, "time"), 1e-9, True),
+    ],
+)
+def test_brightness_gains_too(
+    held: HeldOut, p_value: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cause of brightness takes 15 % of the excess away and 2 % of the whole, and is significant."""
+    observed = made_observations(hidden(), rng)
+    plain, better = (
+        SimpleNamespace(cost=10.0, memory=0.0, profile=NOMINAL),
+        SimpleNamespace(cost=1.0, memory=0.0, rms=1.0, of=lambda _name: (np.zeros(1), np.zeros((1, 1)))),
+    )
+    monkeypatch.setattr(picture_ladder, "fit_photometry", lambda *_: better)
+    monkeypatch.setattr(picture_ladder, "judge", lambda *_: held)
+    monkeypatch.setattr(picture_ladder, "significance", lambda *_: (9.0, p_value))
+    rung, effect, _ = picture_ladder._rung(observed, NOMINAL, plain, [Vignetting()], [], one_by_one)  # type: ignore[arg-type]
+    assert isinstance(rung, Rung)
+    assert (effect is not None) is named
+
+
+# ── errors that hang together ────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_points_of_one_moment_share_its_errors(rng: np.random.Generator) -> None:
+    """A shift common to each pair's points makes an offset less certain than as large a shift of each point."""
+    camera, evidence = hand()
+    model = Model(camera.profile, None, (terms_of.TIME_OFFSET,))
+    table = evidence.table(model, 3500)
+    common = 0.15 * rng.normal(size=(table.n_pairs, 2))[table.pair]
+    own = rng.permutation(common)
+    stds = [
+        evidence.fit(model, model.terms, replace(table, second_px=table.second_px + off)).std("time_offset")[0]
+        for off in (common, own)
+    ]
+    assert stds[0] > 1.6 * stds[1]
+
+
+def test_patches_of_one_moment_share_its_errors(rng: np.random.Generator) -> None:
+    """Light that leans towards the corners in some stretches of time makes vignetting less certain."""
+    observed = made_observations(hidden(), rng)
+    lean = rng.normal(size=int(time_blocks(observed).max()) + 1)[time_blocks(observed)]
+    wandering = replace(observed, grey=observed.grey + 2.0 * NOISE * lean * (observed.radius**2 - 0.2))
+    mixed = rng.permutation(FRAMES)[observed.frame]
+    as_often = np.array([lean[np.argmax(observed.frame == k)] for k in range(FRAMES)])[mixed]
+    scattered = replace(observed, grey=observed.grey + 2.0 * NOISE * as_often * (observed.radius**2 - 0.2))
+    stds = [fit_photometry(one, NOMINAL, [Vignetting()]).std[0] for one in (wandering, scattered)]
+    assert stds[0] > 1.25 * stds[1]
+
+
+def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Residuals that are alike in a stretch of time tell less than as many that are not."""
+    time_s = np.linspace(0.0, 4.0, 400)
+    seen = SimpleNamespace(time_s=time_s, damping_std=0.1)
+    problem = local_blur_fit._Problem(
+        seen,
+        CameraProfile(64, 48),
+        None,
+        [local_blur_fit.ExposureTime()],
+        np.ones(400, bool),  # type: ignore[arg-type]
+    )
+    jacobian = np.stack([np.ones(400), np.zeros(400), np.zeros(400)], axis=-1)
+    common = rng.normal(size=8)[local_blur.time_blocks(time_s)]
+    variances = []
+    for residual in (common, rng.permutation(common)):
+        # no damping changes them
+        monkeypatch.setattr(local_blur_fit._Problem, "residual", lambda *_, r=residual: r)
+        variances.append(problem.covariance(np.zeros(3), residual, jacobian, np.ones(400))[0, 0])
+    assert variances[0] > 8 * variances[1]

@@ -1,0 +1,151 @@
+"""Captures that a diagnosis can say little of end in a verdict with its reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from motion.synthetic_tracks import Recording, Setup
+
+from virest.app.bench.broken import _fill, _header
+from virest.app.bench.diagnosis import diagnose_folder
+from virest.app.simulate import simulate_command
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Frame
+from virest.diagnosis import photometry_fit
+from virest.diagnosis.alike import stamped
+from virest.diagnosis.findings import CONSISTENT, GEOMETRY, Finding, HeldOutGain, ParameterChange
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
+from virest.diagnosis.geometric_evidence import Model, make_evidence
+from virest.diagnosis.geometric_ladder import _p_if_plausible, climb
+from virest.diagnosis.local_blur import MEMORY, _recent
+from virest.diagnosis.local_blur_model import transfers
+from virest.diagnosis.local_blur_spectra import bin_count, join_ratios
+from virest.diagnosis.photometry_effects import GainDrift
+from virest.diagnosis.photometry_fit import fit_photometry, significance
+from virest.diagnosis.picture_ladder import changes_of, frames_of, values_of
+from virest.diagnosis.points import with_null_values
+from virest.motion import profile_terms as terms_of
+from virest.motion.integration import integrate_gyro
+
+HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
+
+
+@pytest.fixture(scope="module")
+def at_rest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera on a stand."""
+    folder = tmp_path_factory.mktemp("rest") / "rest"
+    simulate_command(folder, width=240, height=320, frames=20, seed=5, rate_rad_s=0.0)
+    return folder
+
+
+def test_a_camera_at_rest_tells_nothing_with_exposures_or_without(at_rest: Path) -> None:
+    """Nothing is fitted to points that do not move, and unknown exposures are named as the reason."""
+    log = at_rest / "movie_metadata.csv"
+    exposure = next(k for k, name in enumerate(_header(log)) if "xposure" in name)
+    partial(_fill, log.name, exposure, "null")(at_rest)
+    found = diagnose_folder(at_rest)
+    assert (found.verdict, found.causes) == (CONSISTENT, ())
+    assert any("at rest" in note for note in found.notes)
+    assert any("known exposures" in note and "blur not judged" in note for note in found.notes)
+
+
+def test_frames_before_the_inertial_data_stay_in_their_place(tmp_path: Path) -> None:
+    """A gyroscope that begins 0.15 s late leaves the first frames out, and no other frame takes their numbers."""
+    folder = tmp_path / "late"
+    simulate_command(folder, width=240, height=320, frames=26, seed=3, rate_rad_s=1.0, exposure_ms=8)
+    begin_ns = int((folder / "frame_timestamps.txt").read_text(encoding="utf-8").splitlines()[1].split(",")[0])
+    log = folder / "gyro_accel.csv"
+    head, *rows = log.read_text(encoding="utf-8").splitlines()
+    late = [row for row in rows if int(row.split(",")[0]) > begin_ns + 150_000_000]
+    log.write_text("\n".join([head, *late]) + "\n", encoding="utf-8")
+    found = diagnose_folder(folder)
+    assert found.verdict == CONSISTENT
+    assert found.nominal.blur_rms_px is not None
+
+
+def test_the_next_frame_stands_for_one_at_no_known_time() -> None:
+    """What H.264 remembers of a frame without exposure or without inertial data is not made up."""
+    frames = [Frame(k, 10**9 * k, 0.03 * k, 0.01) for k in range(6)]
+    frames[3] = replace(frames[3], skip_reason="no IMU", skip_codes=("no-imu",))
+    frames[2] = replace(frames[2], exposure_s=None)
+    assert [frame.index for frame in _recent(frames, 5)] == [5, 4, 4][:MEMORY]
+    assert [frame.index for frame in _recent(frames, 1)] == [1, 0, 0][:MEMORY]
+
+
+def test_no_tiles_have_no_transfers() -> None:
+    """An empty table of spectra keeps its shape."""
+    camera = Recording(HAND)
+    trajectory = integrate_gyro(camera.imu, camera.profile)
+    assert transfers(join_ratios([]), camera.profile, trajectory).shape == (0, 2, MEMORY, bin_count())
+
+
+def test_gains_of_frames_that_no_patch_shows_are_unknown(rng: np.random.Generator, monkeypatch) -> None:
+    """Frames that the fit does not see take their neighbours' gain, and its deviation is unknown."""
+    from diagnosis.test_photometry import FRAMES, NOMINAL, hidden, made_observations
+
+    gain = np.exp(0.1 * np.sin(0.4 * np.arange(FRAMES)))
+    observed = made_observations(hidden(gain=tuple(gain / np.median(gain))), rng)
+    monkeypatch.setattr(photometry_fit, "_PER_FRAME", 30)
+    rare = np.isin(observed.frame, (10, 11, 12)) & ((observed.place // 2) % 4 == 0)
+    observed = observed.subset(~rare)
+    effect = GainDrift(tuple(range(FRAMES)), FRAMES)
+    fit = fit_photometry(observed, NOMINAL, [effect])
+    assert significance(fit, "gain_drift", observed)[1] < 1e-6
+    std = np.sqrt(np.diag(fit.of("gain_drift")[1]))
+    change = changes_of(values_of(effect, NOMINAL), values_of(effect, fit.profile), std, frames_of(fit))["gain"]
+    assert len(change.estimate) == FRAMES
+    assert np.flatnonzero(np.isnan(change.std)).tolist() == [10, 11, 12]
+    np.testing.assert_allclose(np.log(change.estimate[9:14]), np.log(gain[9:14] / np.median(gain)), atol=0.04)
+
+
+def test_pictures_of_another_motion_tell_no_unknown_values() -> None:
+    """Where pictures do not follow the gyroscope, readout, lens and clock stay as they were."""
+    camera, other = Recording(replace(HAND, frames=80)), Recording(replace(HAND, seed=8, frames=80))
+    unknown = replace(camera.profile, intrinsics=None, time_offset_s=None, readout_known=False)
+    stranger = SimpleNamespace(imu=other.imu, repeats=())
+    _, terms, notes, _, follows = with_null_values(camera.observed, stranger, unknown)  # type: ignore[arg-type]
+    assert not follows
+    assert terms == []
+    assert any("a guess" in note for note in notes)
+    own = SimpleNamespace(imu=camera.imu, repeats=())
+    assert {term.name for term in with_null_values(camera.observed, own, unknown)[1]} == {  # type: ignore[arg-type]
+        "focal_length", "readout_time", "time_offset",
+    }  # fmt: skip
+
+
+def test_a_value_at_the_end_of_what_can_be_is_no_cause() -> None:
+    """A readout of 0.29 ms is significant by its deviation, and no sensor's."""
+    camera = Recording(HAND)
+    evidence = make_evidence(camera.imu, camera.observed)
+    effect = next(effect for effect in GEOMETRIC_EFFECTS if effect.name == "readout_time")
+    shutter = camera.profile.shutter
+    for readout_s, expected in ((2.9e-4, True), (0.015, False)):
+        found = replace(camera.profile, shutter=replace(shutter, readout_time_s=readout_s))
+        model = Model(found, None, (terms_of.TIME_OFFSET, effect.term))  # type: ignore[arg-type]
+        fitted = evidence.fit(model, model.terms, evidence.table(model, 400))
+        assert (_p_if_plausible(evidence, fitted, effect, found, camera.profile) == 1.0) is expected
+
+
+def test_an_unknown_readout_of_the_other_sense_is_turned_about() -> None:
+    """The fit of an unknown readout passes through zero; what it leaves has a positive one."""
+    camera = Recording(HAND)
+    evidence = make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), camera.observed)
+    shutter = replace(camera.profile.shutter, readout_time_s=0.0, readout_direction="bottom_to_top")
+    start = replace(camera.profile, shutter=shutter, readout_known=False)
+    found = climb(evidence, start, (terms_of.TIME_OFFSET, terms_of.READOUT), (), max_rungs=0).model.profile
+    assert found.shutter.readout_direction == "top_to_bottom"
+    assert found.shutter.readout_time_s == pytest.approx(camera.profile.shutter.readout_time_s, abs=1e-3)
+
+
+def test_an_offset_without_exposures_may_be_an_exposure() -> None:
+    """Where exposures are unknown an offset has them as its rival."""
+    change = {"time_offset_s": ParameterChange(0.0, 0.004, 1e-5)}
+    finding = Finding("time_offset", change, HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1), (), 1e-9, "")
+    verdict = SimpleNamespace(nominal=Model(CameraProfile(640, 480), None, ()))
+    (named,) = stamped(verdict, [finding], np.zeros(5))  # type: ignore[arg-type]
+    assert [rival.name for rival in named.rivals] == ["exposure_time"]

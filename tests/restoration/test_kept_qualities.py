@@ -1,0 +1,59 @@
+"""Qualities of restored pictures and limits of plans that nothing else would miss."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.degradation.light import FrameLight
+from virest.motion.alignment import OffsetEstimate
+from virest.restoration import planning
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.frame import _relit
+from virest.restoration.settings import PRESETS
+from virest.restoration.shutter import warp
+
+
+def test_straightening_keeps_fine_detail() -> None:
+    """Half a pixel to the side, a wave of five pixels keeps most of its contrast; a straight line loses a fifth."""
+    x = np.arange(120, dtype=np.float32)
+    wave = np.tile(128 + 80 * np.sin(2 * np.pi * x / 5), (16, 1)).astype(np.uint8)
+    source = np.stack(np.meshgrid(x + 0.5, np.arange(16, dtype=np.float32)), axis=-1).astype(np.float32)
+    middle = warp(wave, source)[:, 10:-10].astype(float)
+    assert np.std(middle) > 0.9 * np.std(wave[:, 10:-10].astype(float))
+
+
+def test_a_straightened_picture_keeps_the_vignetting_of_where_its_pixels_go() -> None:
+    """Light recorded in a corner and moved inwards gets the inner place's vignetting; flicker is taken away."""
+    curve = ResponseCurve("srgb")
+    height, width = 12, 20
+    recorded = np.full((height, width), 0.5, np.float32)
+    kept = np.linspace(0.6, 1.0, width, dtype=np.float32)[None].repeat(height, axis=0)
+    grey = int(np.rint(255 * curve.encode(0.5 * 0.3)))
+    picture = np.full((height, width, 3), grey, np.uint8)
+    shown = curve.linear_table()[_relit(picture, curve, FrameLight(recorded, recorded, kept))][..., 1]
+    expected = curve.linear_table()[grey] / 0.5 * kept
+    np.testing.assert_allclose(shown, expected, rtol=0.03)
+
+
+@pytest.mark.parametrize(("std_s", "copied"), [(0.001, False), (0.004, True), (2.0, True)])
+def test_frames_are_copied_where_the_offset_is_not_known_well_enough(
+    std_s: float, copied: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a radian a second and 500 px, 4 ms are 2 px: as much as the blur that is to be undone."""
+    estimate = OffsetEstimate(
+        0.02, std_s, (0.0,) * 3, (0.01,) * 3, 0.1, 0.1, 0.99, 0.02, 0.0, 0.0, 0.001, None, None, "rotation", 60, 4000,
+        True, "",
+    )  # fmt: skip
+    monkeypatch.setattr(planning, "estimate_time_offset", lambda *_: estimate)
+    lens = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
+    profile = replace(CameraProfile(640, 480, intrinsics=lens), time_offset_s=None)
+    capture = SimpleNamespace(imu=None, frames=())
+    plan = planning._filled(RestorationPlan(profile, PRESETS["balanced"]), capture, [])  # type: ignore[arg-type]
+    assert (plan.copy_reason is not None) is copied

@@ -1,0 +1,130 @@
+"""Captures with one thing broken each, diagnosed and calibrated: a verdict or a one-line error, never a traceback."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import traceback
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from virest.app.bench.tables import table
+from virest.app.bench.workload import Scale, simulated
+from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
+from virest.app.diagnose import DiagnosisOptions, run_diagnosis
+from virest.errors import VirestError
+
+LOGS = ("gyro_accel.csv", "movie_metadata.csv", "frame_timestamps.txt")
+FILLINGS = {"null": "null", "zero": "0", "huge": "1e9", "first": None}
+"""What a column is filled with; None: its first value."""
+CUT_PARTS = {"its first tenth": (0.1, 1.0), "its second half": (0.0, 0.5), "its middle": None}
+Way = Callable[[Path], None]
+
+
+def broken_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
+    """Break simulated captures (and the real ones that are there) in every way, and count how each command ends.
+
+    With --full the measured captures too.
+    """
+    sources = [
+        simulated(work, "broken-source", width=240, height=320, frames=24, seed=3, rate_rad_s=1.0, exposure_ms=8),
+        simulated(work, "broken-rest", width=240, height=320, frames=24, seed=4, rate_rad_s=0.0),
+    ]
+    sources += _measured() if scale.full else []
+    rows = [
+        {"capture": source.name, "broken": name, **ended(work, source, way)}
+        for source in sources
+        for name, way in ways(source)
+    ]
+    faults = [row for row in rows if "fault" in (row["diagnose"], row["calibrate"])]
+    header = ["capture", "broken", "diagnose", "calibrate"]
+    text = table(header, [[row[key] for key in header] for row in rows])
+    return {"rows": rows, "faults": len(faults)}, f"One thing broken each\n{text}\n{len(faults)} faults in {len(rows)}"
+
+
+def _measured() -> list[Path]:
+    """Measured captures that are there (the folder named by VIREST_REALDATA)."""
+    root = Path(os.environ.get("VIREST_REALDATA") or "/nonexistent")
+    return sorted(folder.parent for folder in root.glob("*/movie.mp4"))
+
+
+def ended(work: Path, source: Path, way: Way) -> dict[str, str]:
+    """How diagnose and calibrate end on a copy of a capture that was broken: a verdict, ``refused`` or ``fault``."""
+    folder = work / f"broken-{source.name}"
+    shutil.copytree(source, folder, ignore=shutil.ignore_patterns("truth*"))
+    try:
+        way(folder)
+        output = CalibrationOutput(work / "broken.yaml", overwrite=True)
+        found = {
+            "diagnose": _end(lambda: run_diagnosis(str(folder), DiagnosisOptions(work / "out", None, True)).verdict),
+            "calibrate": _end(lambda: str(run_calibration(plan_calibration(folder), output)[0]["verdict"])),
+        }
+    finally:
+        shutil.rmtree(folder)
+    return found
+
+
+def _end(call: Callable[[], str]) -> str:
+    try:
+        return call()
+    except VirestError:
+        return "refused"
+    except Exception:  # a fault is what this looks for
+        traceback.print_exc()
+        return "fault"
+
+
+def ways(source: Path) -> Iterator[tuple[str, Way]]:
+    """Name of what is broken, and how to break it, for the files that a capture has."""
+    for log in (source / name for name in LOGS):
+        if not log.exists():
+            continue
+        yield f"no {log.name}", partial(_remove, log.name)
+        yield f"{log.name}: empty", partial(_keep_rows, log.name, 0.0, 0.0)
+        for name, part in CUT_PARTS.items():
+            yield f"{log.name} without {name}", partial(_without_rows, log.name, part)
+        for number, column in enumerate(_header(log)):
+            for filling, text in FILLINGS.items():
+                yield f"{log.name}: {column} {filling}", partial(_fill, log.name, number, text)
+    yield "no camera.yaml", partial(_remove, "camera.yaml")
+
+
+def _header(log: Path) -> list[str]:
+    head = log.read_text(encoding="utf-8").splitlines()[0]
+    return [cell.strip() for cell in head.split(",")]
+
+
+def _remove(name: str, folder: Path) -> None:
+    (folder / name).unlink(missing_ok=True)
+
+
+def _without_rows(name: str, part: tuple[float, float] | None, folder: Path) -> None:
+    if part is not None:
+        _keep_rows(name, *part, folder)
+        return
+    head, rows = _rows(folder / name)
+    _write(folder / name, head, rows[: 2 * len(rows) // 5] + rows[3 * len(rows) // 5 :])
+
+
+def _keep_rows(name: str, begin: float, end: float, folder: Path) -> None:
+    head, rows = _rows(folder / name)
+    _write(folder / name, head, rows[round(begin * len(rows)) : round(end * len(rows))])
+
+
+def _fill(name: str, number: int, text: str | None, folder: Path) -> None:
+    head, rows = _rows(folder / name)
+    cells = [row.split(",") for row in rows]
+    filling = cells[0][number] if text is None else text
+    filled = [",".join([*row[:number], filling, *row[number + 1 :]]) for row in cells]
+    _write(folder / name, head, filled)
+
+
+def _rows(log: Path) -> tuple[str, list[str]]:
+    head, *rows = log.read_text(encoding="utf-8").splitlines()
+    return head, rows
+
+
+def _write(log: Path, head: str, rows: list[str]) -> None:
+    log.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")

@@ -1,0 +1,50 @@
+"""What a camera can be: limits of fitted values that follow from how sensors and lenses work.
+
+A fit that ends at such a limit, or beyond it, describes no camera; it compensates for something else.
+"""
+
+from __future__ import annotations
+
+from virest.camera.profile import CameraProfile
+
+LEAST_READOUT_S = 1e-3
+"""The fastest rolling shutters (stacked sensors, 960 frames/s) read a frame in about 1 ms; a global shutter has 0."""
+FOCAL_OF_LONG_SIDE = (0.3, 10.0)
+"""From an ultra-wide lens of 11 mm to a telephoto of 360 mm, in terms of a 36 mm wide sensor."""
+DEPTH_M = (0.02, 1e4)
+"""From the closest focus of a macro lens to where parallax within an exposure is below any measurement."""
+LEAST_EXPOSURE_S = 1e-6
+"""No phone's or action camera's electronic shutter is faster than a few microseconds."""
+SCALE_OF_EXPOSURE = (0.05, 20.0)
+"""The true exposure over the logged one."""
+OFFSET_S = 2.0
+"""A larger offset is another recording, or another clock."""
+
+
+def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> frozenset[str]:
+    """Names of the effects whose values in a profile lie at or beyond their physical limits.
+
+    period_s: between frames; exposure_s: typical, as logged; 0: unknown.  A readout or an exposure takes at most the
+    period.  A readout below LEAST_READOUT_S, but for one of exactly 0, belongs to no sensor; a fitted one ends there.
+    """
+    found = set()
+    shutter, lens = profile.shutter, profile.intrinsics
+    if not LEAST_READOUT_S <= abs(shutter.readout_time_s) < period_s:
+        found.add("readout_time")
+    low, high = SCALE_OF_EXPOSURE
+    true_exposure_s = exposure_s * shutter.exposure_scale
+    in_time = exposure_s <= 0 or LEAST_EXPOSURE_S < true_exposure_s < period_s
+    if not low < shutter.exposure_scale < high or not in_time:
+        found.add("exposure_time")
+    if lens is not None:
+        low, high = (part * max(profile.width, profile.height) for part in FOCAL_OF_LONG_SIDE)
+        if not (low < lens.fx_px < high and low < lens.fy_px < high):
+            found.add("focal_length")
+    if abs(profile.time_offset_s or 0.0) >= OFFSET_S:
+        found.add("time_offset")
+    return frozenset(found)
+
+
+def is_depth(depth_m: float) -> bool:
+    """Whether a fitted depth lies inside its limits."""
+    return DEPTH_M[0] < depth_m < DEPTH_M[1]
