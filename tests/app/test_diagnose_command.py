@@ -74,7 +74,7 @@ def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Let the ladder come to a given verdict."""
 
     def give(verdict: str = "explained", *causes: Finding, error: Exception | None = None) -> None:
-        def climb(source: diagnose.Source, progress: Say, _each: Each) -> Diagnosis:
+        def climb(source: diagnose.Source, progress: Say, _each: Each, *_kept: object) -> Diagnosis:
             progress("points", 0.5)
             assert [number for number, _ in source.pictures([7, 3, 4])] == [3, 4, 7]
             assert next(source.gray([5]))[1].shape == (120, 160)  # type: ignore[union-attr]
