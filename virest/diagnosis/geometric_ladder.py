@@ -131,6 +131,8 @@ class GeometricVerdict:
     notes: list[str] = field(default_factory=list)
     fields: list[Any] = field(default_factory=list)
     """Unknown effects that were found beyond the causes: :class:`virest.diagnosis.field.records.FittedField`."""
+    evidence: Evidence | None = None
+    """The pairs that the model was fitted to."""
 
 
 def climb(

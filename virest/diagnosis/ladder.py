@@ -158,6 +158,7 @@ class _Story:
                 self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
             )
             self.geometric = self.points.climbed(progress)
+        self.geometric = self.points.described(self.geometric, self.light.profile)
         self.findings = stamped(self.geometric, findings_of(self.geometric), self.points.observed.exposure_s)
 
     def judge_blur(self, gray: Reader, progress: Callable[[float], None]) -> None:
@@ -177,7 +178,8 @@ class _Story:
             )
         if is_exposure and scale is not None:
             exposure = as_exposure(self.findings, scale, float(np.median(exposure_s)))
-            self.geometric = replace(self.points, start=exposed(self.points.start, scale)).climbed(progress)
+            points = replace(self.points, start=exposed(self.points.start, scale))
+            self.geometric = points.described(points.climbed(progress), self.light.profile)
             self.findings = [exposure, *stamped(self.geometric, findings_of(self.geometric), exposure_s)]
         if any(finding.name == "exposure_time" for finding in self.findings):
             self.blur, is_exposure = one_exposure(self.blur), True

@@ -88,6 +88,16 @@ class TrackedPoints:
         again.notes.append(f"{astray:.0%} of the points lie in parts of the picture that go their own way: left out")
         return again
 
+    def described(self, found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
+        """A ladder's end with the fields that its points ask for, under the light that was found.
+
+        Pulsing light moves the mean time of each row's light, which looks like rows that are read unevenly.
+        """
+        if not self.rungs_allowed or found.evidence is None:
+            return found
+        model = replace(found.model, profile=pulsing(found.model.profile, lit))
+        return with_fields(replace(found, model=model), found.evidence, self.capture)
+
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
         doubtful = doubtful_pairs(observed, self.capture, self.start)
         rest = observed.chosen(~doubtful.hit) if doubtful.sets_aside else observed
@@ -95,9 +105,9 @@ class TrackedPoints:
         found = climb(
             evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each
         )
+        found.evidence = evidence
         if not self.rungs_allowed:
             return found
-        found = with_fields(found, evidence, self.capture)
         if doubtful.sets_aside:
             with_bridges(found, observed, doubtful, self.capture)
         elif doubtful.hit.any():

@@ -153,7 +153,7 @@ def _take_over(
     bridges = {field.knots: field.std for field in deviations}
     held = [replace(field, std=bridges.get(field.knots, field.std)) for field in fitted.profile.fields]
     found.model = replace(whole, profile=fitted.profile.with_fields(held), scene=fitted.scene)
-    found.fit, found.table = fitted, table
+    found.fit, found.table, found.evidence = fitted, table, evidence
     found.final_rms_px = capped_rms(fitted.distance) * evidence.typical_px
     found.noise_px = evidence.noise_px(fitted)
 

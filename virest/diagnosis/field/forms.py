@@ -32,7 +32,7 @@ STD = {"delay": 0.01, "displacement": 30.0, "scale": 0.2, "rate": 1.0}
 """Prior of a free number: ten times what a phone would show.  It only holds numbers that nothing tells."""
 QUOTIENT = {"delay": 1e-4, "displacement": 0.1, "scale": 1e-4, "rate": 2e-3}
 """Step of the difference quotients, in the unit of the values."""
-TIME, PLACE = "time", "displacement over x, y"
+TIME, OVER = "time", " over "
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class FieldForm:
     @property
     def name(self) -> str:
         """What it is called: kind and covariates."""
-        return f"{self.kind} over {', '.join(self.covariates)}"
+        return f"{self.kind}{OVER}{', '.join(self.covariates)}"
 
     @property
     def covariates(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import point_residuals
-from virest.diagnosis.field.forms import FieldForm, possible_forms
+from virest.diagnosis.field.forms import OVER, FieldForm, possible_forms
 from virest.diagnosis.field.records import FittedField
 from virest.diagnosis.field.screening import MIN_T, Selection, score_forms, select, t_ratio
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
@@ -55,7 +55,9 @@ class HeldOut:
 
 def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -> GeometricVerdict:
     """The ladder's end with the fields that its residuals ask for; the same where they ask for none."""
-    model, fitted, accepted = found.model, found.fit, list(found.accepted)
+    # bridges of the log stay as they are: hundreds of numbers that no field shares
+    terms = tuple(term for term in found.model.terms if OVER not in term.name)
+    model, fitted, accepted = replace(found.model, terms=terms), found.fit, list(found.accepted)
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
         chosen = _asked_for(evidence, capture, model, fitted)
@@ -93,7 +95,7 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         accepted=accepted,
         final_rms_px=capped_rms(fitted.distance) * evidence.typical_px,
         noise_px=evidence.noise_px(fitted),
-        fields=[replace(entry, fit=fitted) for entry in fields],
+        fields=[*found.fields, *(replace(entry, fit=fitted) for entry in fields)],
     )
 
 
