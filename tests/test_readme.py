@@ -1,22 +1,30 @@
-"""The README and the program say the same: commands, options, profile and settings keys."""
+"""README, documentation and program say the same: commands, options, keys, links and examples."""
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
+import pytest
 import typer
+import yaml
+from documentation import DOCS, PAGES, README, ROOT, anchors, fences, links, name_of, prose, read, typed_lines
 from pydantic import BaseModel
 
 from virest.app.bench import __main__ as bench
 from virest.app.cli import app
+from virest.app.gallery import CASES
 from virest.app.settings import settings_model
 from virest.camera import profile
+from virest.diagnosis.catalogue import CATALOGUE
 
-README = Path(__file__).resolve().parent.parent / "README.md"
-TEXT = README.read_text(encoding="utf-8")
-COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive", "--nthreads"}
-"""Options of pip, git and dask that a README may name."""
+TEXT = "\n".join(map(read, PAGES))
+PROGRAM: Any = typer.main.get_command(app)
+COMMANDS: dict[str, Any] = PROGRAM.commands
+OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive", "--nthreads", "--array"}
+"""Options of pip, git, dask and Slurm that a page may name."""
+MOST_BYTES = 8192
+SHELL = ("", "sh", "console")
 
 
 def options_of(command: Any) -> set[str]:
@@ -36,67 +44,114 @@ def keys_of(model: type[BaseModel]) -> set[str]:
     return keys
 
 
-def code_blocks() -> list[str]:
-    """The text inside the README's fences."""
-    return re.findall(r"^```[a-z]*\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
+def calls(page: Path) -> list[str]:
+    """Calls of virest in a page's fences, each without pipes, redirections and comments."""
+    lines = [line for fence in fences(page) if fence.language in SHELL for line in typed_lines(fence)]
+    found = [re.search(r"(?:^|[\s|/])(virest [a-z].*)", line) for line in lines]
+    return [re.split(r"\s[|&;#>]|\s:::|\s\|\|", match.group(1))[0] for match in found if match]
 
 
-def typed(block: str) -> list[str]:
-    """Lines of a fence; of a session only those behind a prompt."""
-    lines = block.replace("\\\n", " ").splitlines()
-    prompted = [line for line in lines if line.startswith("$ ")]
-    return prompted or lines
+def inline_calls(page: Path) -> list[str]:
+    """Inline code that names a command of virest."""
+    return [code for code in re.findall(r"`([^`\n]+)`", prose(page)) if re.match(r"virest [a-z]", code)]
 
 
-def shell_lines() -> list[str]:
-    """Code of the README that calls virest: lines of fences, and inline code."""
-    lines = [line for block in code_blocks() for line in typed(block)]
-    prose = re.sub(r"^```.*?^```", "", TEXT, flags=re.MULTILINE | re.DOTALL)
-    return [
-        line for line in [*lines, *re.findall(r"`([^`\n]+)`", prose)] if re.search(r"(^|[\s|/])virest\s+[a-z-]", line)
-    ]
+def test_the_readme_is_short() -> None:
+    """A reader has the README read in a few minutes; all else is in docs/."""
+    assert len(README.read_bytes()) <= MOST_BYTES
 
 
-def test_every_command_in_the_readme_exists() -> None:
-    """A command and its options, as the README writes them, can be typed."""
-    for line in shell_lines():
-        for name, rest in re.findall(r"(?:^|[\s|/])virest\s+([a-z][a-z-]*)([^|&;#]*)", line):
-            assert name in COMMANDS, f"README: virest {name}"
-            unknown = set(re.findall(r"(?<!\S)(--[a-z][a-z-]*)", rest)) - options_of(COMMANDS[name])
-            assert not unknown, f"README: virest {name} has no {', '.join(unknown)}"
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_example_can_be_typed(page: Path) -> None:
+    """The program's own parser takes every call of virest that a page shows."""
+    for call in calls(page):
+        filled = re.sub(r'("?)\$(?:\(\([^)]*\)\)|[A-Z_]+)', r"\g<1>1", call)
+        words = shlex.split(filled)[1:]
+        with PROGRAM.make_context("virest", list(words)) as context:
+            name, command, rest = context.command.resolve_command(context, [*context._protected_args, *context.args])
+            while hasattr(command, "commands"):
+                name, command, rest = command.resolve_command(context, rest)
+            with command.make_context(name, list(rest), parent=context):
+                pass
 
 
-def test_every_option_in_the_readme_exists() -> None:
-    """An option that the README names anywhere belongs to some command, or to the bench."""
-    known = set.union(*(options_of(command) for command in COMMANDS.values())) | OTHER_TOOLS | {"--help", "--version"}
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_command_named_in_the_text_exists(page: Path) -> None:
+    """Inline code names commands and options that there are."""
+    for call in inline_calls(page):
+        words = call.split()
+        assert words[1] in COMMANDS, f"{name_of(page)}: {call}"
+        unknown = set(re.findall(r"(?<!\S)(--[a-z][a-z-]*)", call)) - options_of(COMMANDS[words[1]]) - OTHER_TOOLS
+        assert not unknown, f"{name_of(page)}: {call}: {unknown}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_option_named_in_the_text_exists(page: Path) -> None:
+    """An option that a page names belongs to some command, to the program, or to the bench."""
+    known = options_of(PROGRAM) | OTHER_TOOLS | {"--help", "--version", "--install-completion", "--show-completion"}
     known |= set(re.findall(r'add_argument\(\s*"(--[a-z-]+)"', Path(bench.__file__).read_text(encoding="utf-8")))
-    assert not set(re.findall(r"`(--[a-z][a-z-]*)", TEXT)) - known
+    assert not set(re.findall(r"`(--[a-z][a-z-]*)", prose(page))) - known
 
 
-def test_every_command_is_in_the_readme() -> None:
-    """No command is left untold."""
-    for name in COMMANDS:
-        assert re.search(rf"virest {name}\b", TEXT), name
-
-
-def test_every_option_of_process_is_in_the_readme() -> None:
-    """The main command's options are all explained."""
-    missing = {option for option in options_of(COMMANDS["process"]) if not re.search(rf"{option}(?![a-z-])", TEXT)}
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_has_its_page_with_every_option(name: str) -> None:
+    """A command has a page of its own, the README links it, and the page names each of its options."""
+    page = DOCS / "commands" / f"{name}.md"
+    assert f"docs/commands/{name}.md" in read(README)
+    shared = {"--json", "--quiet", "--verbose", "--version", "--help"}
+    missing = {o for o in options_of(COMMANDS[name]) - shared if not re.search(rf"{o}(?![a-z-])", read(page))}
     assert not missing
 
 
-def test_every_profile_and_settings_key_is_in_the_readme() -> None:
-    """A key that a YAML file may hold is named in the README."""
+def test_every_profile_and_settings_key_is_documented() -> None:
+    """A key that a YAML file may hold is named on the page of profiles."""
+    page = read(DOCS / "profile.md")
     keys = keys_of(profile._Profile) | keys_of(settings_model())
-    assert not {key for key in keys if not re.search(rf"\b{re.escape(key)}\b", TEXT)}
+    assert not {key for key in keys if not re.search(rf"\b{re.escape(key)}\b", page)}
 
 
-def test_every_key_of_the_readmes_profile_exists() -> None:
-    """A YAML block of the README that shows a profile or settings names only known keys."""
+def test_every_effect_is_documented_and_in_the_gallery() -> None:
+    """Each effect has its line in the profile's table and its section in the gallery, with a picture that is there."""
+    for name in CATALOGUE:
+        assert f"| `{name}` |" in read(DOCS / "profile.md")
+    for name in CASES:
+        assert re.search(rf"^## {name}$", read(DOCS / "gallery.md"), re.MULTILINE), name
+
+
+def test_every_key_of_a_shown_profile_exists() -> None:
+    """A YAML block that shows a profile or settings names only known keys."""
     known = keys_of(profile._Profile) | keys_of(settings_model())
-    for block in code_blocks():
-        if not re.search(r"^virest_(profile|settings):", block, re.MULTILINE):
+    for fence in (fence for page in PAGES for fence in fences(page)):
+        if not re.search(r"^virest_(profile|settings):", fence.text, re.MULTILINE):
             continue
-        bare = re.sub(r"#.*", "", block)
+        bare = re.sub(r"#.*", "", fence.text)
         inside = re.sub(r"^estimates:.*(\n\s+.*)*", "estimates:", bare, flags=re.MULTILINE)
         assert not set(re.findall(r"(?:^\s*|[{,]\s*)([A-Za-z_]\w*):", inside, re.MULTILINE)) - known
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_no_link_is_dead(page: Path) -> None:
+    """A link or picture of a page leads to a file of the repository, and to a heading in it."""
+    for target in links(page):
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.is_file(), f"{name_of(page)}: {target}"
+        assert not anchor or anchor in anchors(file), f"{name_of(page)}: {target}"
+
+
+def test_the_site_lists_every_page() -> None:
+    """mkdocs.yml names each page once, and no page that is missing."""
+
+    def leaves(node: Any) -> list[str]:
+        if isinstance(node, str):
+            return [node]
+        return [leaf for child in (node.values() if isinstance(node, dict) else node) for leaf in leaves(child)]
+
+    listed = leaves(yaml.safe_load((ROOT / "mkdocs.yml").read_text("utf-8"))["nav"])
+    assert sorted(listed) == sorted(page.relative_to(DOCS).as_posix() for page in PAGES if page != README)
+
+
+def test_every_picture_of_the_site_is_shown() -> None:
+    """No picture lies in docs/ that no page shows."""
+    shown = {(page.parent / target).resolve() for page in PAGES for target in links(page)}
+    assert not {file for file in DOCS.rglob("*.png") if file.resolve() not in shown}

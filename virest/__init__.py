@@ -1,7 +1,60 @@
-"""virest: visual-inertial restoration of shaken, rolling-shutter phone captures.
+"""virest: deblur and straighten phone captures by the phone's own gyroscope.
 
-The folders follow the river from light to picture: camera -> capture -> motion -> degradation -> restoration.
-Import from the room that you need (``from virest.camera.profile import read_profile``); this file stays light.
+>>> import virest
+>>> capture = virest.open("sample_data/leaves")
+>>> restored = capture.restore(5)
+
+The functions below are the stable interface; they load what they need when they are first used.
 """
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.2.0"
+__all__ = [
+    "CameraProfile",
+    "Capture",
+    "ImuSamples",
+    "RestoredFrame",
+    "Trajectory",
+    "VirestError",
+    "__version__",
+    "calibrate",
+    "deblur",
+    "diagnose",
+    "open",
+    "restore",
+    "simulate",
+]
+
+if TYPE_CHECKING:
+    from virest.app.api import Capture, calibrate, deblur, diagnose, open, restore, simulate
+    from virest.camera.profile import CameraProfile
+    from virest.capture.imu import ImuSamples
+    from virest.errors import VirestError
+    from virest.motion.trajectory import Trajectory
+    from virest.restoration.frame import RestoredFrame
+
+_HOMES = {
+    "CameraProfile": "virest.camera.profile",
+    "ImuSamples": "virest.capture.imu",
+    "RestoredFrame": "virest.restoration.frame",
+    "Trajectory": "virest.motion.trajectory",
+    "VirestError": "virest.errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name of the interface when it is first used."""
+    if name not in __all__:
+        raise AttributeError(f"module 'virest' has no attribute '{name}'")
+    from importlib import import_module
+
+    value = getattr(import_module(_HOMES.get(name, "virest.app.api")), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -11,7 +11,14 @@ import pytest
 
 from virest.app.bench import __main__ as bench
 from virest.app.bench import commands, compare, growth, memory, peers, speed, summary
-from virest.app.bench.workload import Run, Scale, Timing, looped_capture, recorded_frames, timed
+from virest.app.bench.workload import (
+    Run,
+    Scale,
+    Timing,
+    looped_capture,
+    recorded_frames,
+    timed,
+)
 from virest.capture.folder import read_capture
 from virest.capture.video import probe_movie
 from virest.evaluation.baselines import PAPERS, SCIKIT

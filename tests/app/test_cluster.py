@@ -122,7 +122,7 @@ def test_work_that_is_called_off_is_not_written_down_as_failed() -> None:
     future: Future[dict[str, int]] = Future()
     future.cancel()
     future.set_running_or_notify_cancel()
-    with pytest.raises(RestorationError, match="called off"):
+    with pytest.raises(RestorationError, match="cancelled"):
         jobs._collect(future, None, Workers(1))  # type: ignore[arg-type]
     assert isinstance(CancelledError(), Exception)
     assert is_lost(RestorationError("gone", cluster_lost=True))

@@ -110,7 +110,7 @@ def files_in(folder: Path) -> list[str]:
 
 
 def test_the_account_has_the_agreed_keys_and_no_others(tiny: Path, tmp_path: Path, ladder, monkeypatch) -> None:
-    """diagnosis.json: keys, gain, null for what is no number, "inf" for infinity; figures that exist."""
+    """diagnosis.json: keys, gain, null for what is not a number, "inf" for infinity; figures that exist."""
     monkeypatch.setattr(diagnose, "draw_figures", DRAW_FIGURES)
     ladder("explained", offset_cause(), odd_cause())
     assert run(tiny, "--out", tmp_path / "out") == 0

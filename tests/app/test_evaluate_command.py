@@ -148,7 +148,7 @@ def test_captures_without_truth_or_board_are_refused(shaken: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (("deblur", "--restored", "a"), 2, "go together"),
+        (("deblur", "--restored", "a"), 2, "belong together"),
         (("deblur", "x", "--restored", "a", "--reference", "b"), 2, "not both"),
         (("deblur", "--restored", "nowhere", "--reference", "nowhere"), 4, "nowhere"),
         (("shutter", "--board", "round"), 2, "chessboard"),

@@ -206,7 +206,7 @@ def test_the_account_of_a_failure_is_no_obstacle(tmp_path: Path, mode: str) -> N
 
 
 def test_the_account_of_a_failure_spares_whatever_stands_there(tmp_path: Path) -> None:
-    """A run, finished or not, and what is none of ours; a folder that cannot be made is an OutputError."""
+    """A run, finished or not, and what is not one of ours; a folder that cannot be made is an OutputError."""
     run = RunFolder(tmp_path / "trip")
     finish(run)
     before = {name: (run.path / name).read_bytes() for name in names(run.path) if (run.path / name).is_file()}

@@ -305,7 +305,7 @@ def test_a_picture_that_is_gone_or_broken_leaves_its_place_empty(report, made):
     code, out, err = report(made, "--json", "--frames", 2)
     assert code == 0
     assert json.loads(out)["captures"][0]["recorded_shown"]
-    assert "is no picture" in err
+    assert "is not a picture" in err
     assert len(pictures_of(made / "report.html")) == 2
 
 

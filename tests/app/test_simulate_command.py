@@ -48,6 +48,8 @@ def test_a_still_bracket_can_be_asked_for(virest: Virest, tmp_path: Path) -> Non
         (("--auto-exposure", "20"), 3, "12"),
         (("--auto-exposure", "3:1"), 3, "at least 2"),
         (("--direction", "up"), 2, "top_to_bottom"),
+        (("--isp", "camera"), 3, "phone"),
+        (("--sharpen", "1,2,3"), 2, "--sharpen"),
     ],
 )
 def test_a_wrong_wish_is_one_line(virest: Virest, tmp_path: Path, arguments: tuple[object, ...], code: int, says: str):
@@ -77,3 +79,24 @@ def test_the_sample_captures_are_small_and_whole() -> None:
     for name in sample.SAMPLES:
         kept = {f"{i:06d}.png" for i in sample.KEPT_TRUTH}
         assert {path.name for path in (folder / name / "truth/frames").iterdir()} == kept
+
+
+def test_a_phone_can_be_asked_for_and_changed(virest: Virest, tmp_path: Path) -> None:
+    """``--isp phone`` with strengths of its own beside it; the summary names all that is on."""
+    arguments = ("--isp", "phone", "--sharpen", "1.5,2", "--denoise", 0, "--offset-ms", -3)
+    made = virest("simulate", "trip", *SMALL, *arguments, "--json", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    isp = json.loads(made.stdout)["isp"]
+    assert (isp["sharpen"], isp["sharpen_radius_px"], isp["offset_s"]) == (1.5, 2.0, -0.003)
+    assert isp["tone"] > 0
+    assert "denoise" not in isp
+    assert json.loads((tmp_path / "trip/truth/effects.json").read_text())["isp"] == isp
+
+
+def test_the_help_groups_the_phones_options(virest: Virest, tmp_path: Path) -> None:
+    """They stand under a title of their own, behind the others."""
+    text = virest("simulate", "--help", cwd=tmp_path).stdout
+    usual, phones = text.partition("\nOptions:")[2].split("Phone's processing")
+    assert "--seed" in usual
+    assert "--sharpen" not in usual
+    assert all(option in phones for option in ("--isp", "--sharpen", "--gyro-noise", "--bits-per-px"))

@@ -173,7 +173,7 @@ def write_long_movie(path: Path) -> None:
 
 
 def test_a_store_that_gives_no_bytes_fails_no_frame(bucket: str, tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The movie may be sound: the error says so, and is none of a frame."""
+    """The movie may be sound: the error says so, and no frame failed for it."""
     index = probe_movie(tiny / "movie.mp4")
     upload(tiny, f"{bucket}/tiny")
 

@@ -445,7 +445,7 @@ def test_files_that_are_too_large_missing_or_folders_are_refused(tmp_path: Path)
         read_profile(tmp_path / "large.yaml")
     with pytest.raises(SettingsError, match=r"none\.yaml: no such file"):
         read_profile(tmp_path / "none.yaml")
-    with pytest.raises(SettingsError, match="is no plain file"):
+    with pytest.raises(SettingsError, match="is not a regular file"):
         load_yaml_mapping(tmp_path)
 
 
@@ -463,3 +463,26 @@ def test_reading_does_not_change_the_mapping() -> None:
     content: dict[str, Any] = yaml.safe_load(CONTRACT_EXAMPLE)
     parse_profile(content)
     assert content == yaml.safe_load(CONTRACT_EXAMPLE)
+
+
+def test_centre_and_distortion_stay_while_the_focal_length_is_unknown():
+    """A null fx forgets neither cx, cy nor the distortion: the focal length found later joins them."""
+    lens = {"fx_px": None, "fy_px": None, "cx_px": 301.0, "cy_px": 250.5, "distortion": {"model": "radtan", "k1": -0.1}}
+    profile = parse_profile({"virest_profile": 1, "image": {"width": 640, "height": 480}, "intrinsics": lens})
+    assert profile.intrinsics is None
+    written = profile_mapping(profile)["intrinsics"]
+    assert (written["fx_px"], written["cx_px"], written["cy_px"]) == (None, 301.0, 250.5)
+    found = profile.with_focal(512.0, 3.0, "points").intrinsics
+    assert found is not None
+    assert (found.fx_px, found.fy_px, found.cx_px, found.cy_px) == (512.0, 512.0, 301.0, 250.5)
+    assert found.coefficients[0] == -0.1
+
+
+def test_a_file_with_opencvs_first_line_is_read(tmp_path: Path):
+    """OpenCV writes ``%YAML:1.0``, which is no directive of YAML; lines keep their numbers in messages."""
+    path = tmp_path / "camera.yaml"
+    path.write_text("%YAML:1.0\n---\nvirest_profile: 1\nimage: {width: 640, height: 480}\n")
+    assert read_profile(path).width == 640
+    path.write_text("%YAML:1.0\n---\nvirest_profile: [1\n")
+    with pytest.raises(SettingsError, match="line 4"):
+        read_profile(path)

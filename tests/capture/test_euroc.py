@@ -85,7 +85,8 @@ def test_exposures_of_tum_vi_join_by_time(sequence):
     (sequence / "dso/cam0/times.txt").write_text("\n".join(["# id time exposure", *times]) + "\n")
     capture = read_capture(sequence)
     assert capture.frames[3].exposure_s == pytest.approx(3.5e-3)
-    assert [frame.index for frame in capture.frames if frame.exposure_s is None] == [4]
+    assert capture.frames[4].exposure_s == pytest.approx(4.5e-3)
+    assert "exposure-interpolated" in {note.code for note in capture.notes}
 
 
 def test_without_sensor_yaml_a_camera_chain_serves(sequence):

@@ -54,12 +54,13 @@ def test_portrait_focal_lengths_are_swapped(writer):
 
 
 def test_metadata_join_by_time_not_by_index(writer):
-    """Spare metadata rows are left over and missing ones leave their frame without exposure, in either order."""
+    """Spare metadata rows are left over, and frames without one take their neighbours' exposure, in either order."""
     writer.metadata_ns = [START_NS - 2 * PERIOD_NS, START_NS - PERIOD_NS, *writer.metadata_ns]
     del writer.metadata_ns[2 + 5]
     capture = read_capture(writer.write())
-    assert [frame.index for frame in capture.frames if frame.exposure_s is None] == [5]
-    assert {"metadata-missing", "metadata-spare"} <= codes(capture)
+    assert [frame.index for frame in capture.frames if frame.iso is None] == [5]
+    assert capture.frames[5].exposure_s == pytest.approx(0.005)
+    assert {"metadata-missing", "metadata-spare", "exposure-interpolated"} <= codes(capture)
     assert skipped(capture) == []
 
 

@@ -42,7 +42,7 @@ FOUND_YAML = {
     "unknown key below a line": (b"_p: 0", "unknown key '_p'"),
     "unknown key of nothing": (b'"": 1', "unknown key ''"),
     "unknown key like a kind of pydantic's": (PROFILE + b"shutter: {literal: 1}", "unknown key 'shutter.literal'"),
-    "number with line ends": (PROFILE + b'response: {kind: gamma, gamma: "0\n\n\n\n."}', "gamma: is no number"),
+    "number with line ends": (PROFILE + b'response: {kind: gamma, gamma: "0\n\n\n\n."}', "gamma: is not a number"),
     "number that Python writes only in part": (PROFILE + b"x: 0x" + b"f" * 5000, "digits"),
     "key that Python writes only in part": (b"0x" + b"f" * 5000 + b": 1", "digits"),
     "number of base 60 beyond a float": (b"x: 1" + b":1" * 400 + b".5", "digits"),

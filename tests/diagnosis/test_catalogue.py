@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.catalogue import CATALOGUE
-from virest.diagnosis.findings import BLUR, GEOMETRY, PHOTOMETRY
+from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.local_blur_fit import Defocus, ExposureTime
 from virest.diagnosis.photometry_effects import BlackLevel, Flicker, ResponseGamma, Vignetting
@@ -15,17 +15,17 @@ SPECIAL = {"scene_depth", "frame_lag"}
 
 
 def test_the_simulator_hides_what_the_catalogue_names_and_nothing_else() -> None:
-    """22 effects on both sides."""
+    """23 effects on both sides."""
     assert set(effect_names()) == set(CATALOGUE)
-    assert len(CATALOGUE) == 22
+    assert len(CATALOGUE) == 23
 
 
 def test_every_named_cause_has_somebody_who_looks_for_it() -> None:
-    """Points, brightness and blur share the catalogue between them; exposures that vary move points too."""
+    """Points, brightness, blur and edges share the catalogue between them; exposures that vary move points too."""
     points = {effect.name for effect in GEOMETRIC_EFFECTS} - {"exposure_time"} | SPECIAL
     light = {effect().name for effect in (ResponseGamma, BlackLevel, Vignetting, Flicker)} | {"gain_drift"}
     blur = {effect().name for effect in (ExposureTime, Defocus)}
-    for quantity, seekers in ((GEOMETRY, points), (PHOTOMETRY, light), (BLUR, blur)):
+    for quantity, seekers in ((GEOMETRY, points), (PHOTOMETRY, light), (BLUR, blur), (EDGES, {"sharpening"})):
         assert {name for name, cause in CATALOGUE.items() if cause.shows_in == quantity} == seekers
 
 

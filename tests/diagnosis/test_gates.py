@@ -13,7 +13,7 @@ from diagnosis.test_photometry import FRAMES, NOISE, NOMINAL, hidden, made_obser
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.camera.profile import CameraProfile
-from virest.diagnosis import geometric_ladder, local_blur, local_blur_fit, picture_ladder
+from virest.diagnosis import geometric_ladder, local_blur, local_blur_fit, photometry_fit, picture_ladder
 from virest.diagnosis.candidates import Candidate
 from virest.diagnosis.catalogue import CATALOGUE, FALSE_ALARM, MAX_P
 from virest.diagnosis.findings import Rung
@@ -85,14 +85,32 @@ def test_what_was_chosen_is_judged_where_nothing_chose_it() -> None:
     np.testing.assert_allclose(nothing.block_loss, 1.0)
 
 
-def test_brightness_is_judged_on_the_other_blocks(rng: np.random.Generator) -> None:
-    """Vignetting in every other block of time explains nothing where it was not fitted."""
-    dark = made_observations(hidden(vignetting_corner_loss=0.45), np.random.default_rng(1))
-    even = made_observations(hidden(), np.random.default_rng(1))
-    odd = time_blocks(dark) % 2 == 1
-    torn = replace(dark, grey=np.where(odd, dark.grey, even.grey))
-    held = judge(torn, NOMINAL, [Vignetting()])
-    assert held.after > 0.97 * held.before
+def test_brightness_is_judged_on_the_other_blocks(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No fit sees an observation that it is judged by, and every observation judges one."""
+    observed = replace(made_observations(hidden(), rng), x_px=np.arange(150.0 * FRAMES))
+    seen: list[Any] = []
+    held: list[Any] = []
+
+    def fitted(observations: Any, _profile: Any, _effects: Any, use: Any = None) -> Any:
+        seen.append(observations.x_px if use is None else observations.x_px[use])
+        return SimpleNamespace(memory=0.0, profile=NOMINAL)
+
+    monkeypatch.setattr(photometry_fit, "fit_photometry", fitted)
+    monkeypatch.setattr(photometry_fit, "normalised_rms", lambda o, _: held.append(o.x_px) or (1.0, 0.5))
+    judge(observed, NOMINAL, [Vignetting()])
+    assert len(seen) == len(held) == 4
+    for used, judged in zip(seen, held, strict=True):
+        assert not np.intersect1d(used, judged).size
+    assert len(np.unique(np.concatenate(held))) == len(observed)
+
+
+def test_the_noise_of_brightness_is_that_measured_beforehand(rng: np.random.Generator) -> None:
+    """What a fit leaves is no measure of the noise, whether it is less or more."""
+    observed = made_observations(hidden(vignetting_corner_loss=0.3), rng)
+    noisier = replace(observed, noise=1.5 * observed.noise)
+    held = judge(noisier, NOMINAL, [Vignetting()])
+    assert held.after < 0.8 * held.noise
+    assert held.noise == pytest.approx(1.5 * NOISE, rel=0.01)
 
 
 def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,6 +56,13 @@ def test_captures_beyond_the_movies_end_follow_its_rhythm() -> None:
     assert found[2].exposure_s == 0.004
 
 
+def test_a_lag_that_outlasts_the_movie_stays_on_all_its_slots() -> None:
+    """Repeats at 2 and 8 use up two of three and a half periods; the last slots are still one and a half late."""
+    found = at_true_times(frames(10), lagging(0.14, 8), (2, 8))
+    shows = np.array([frame.time_s / 0.04 for frame in found])
+    np.testing.assert_allclose(shows, np.arange(10) + 3.5 - np.array([0, 0, 1, 1, 1, 1, 1, 1, 2, 2]), atol=1e-9)
+
+
 def test_without_a_lag_nothing_changes() -> None:
     """And frames that something else speaks against stay left out."""
     assert at_true_times(frames(6), phone()) == frames(6)

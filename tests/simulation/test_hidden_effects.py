@@ -35,8 +35,9 @@ CHANGES = {
     "flicker": "extensions.flicker",
     "gain_drift": "extensions.gain",
     "defocus": "extensions.defocus",
+    "sharpening": "",
 }
-"""The contract's table of effects."""
+"""The contract's table of effects; no profile keeps what the phone does to finished pictures."""
 SEEN_OUTSIDE = ("camera.yaml", "edge_epochs.txt", "frame_timestamps.txt", "movie_metadata.csv")
 
 
@@ -124,7 +125,8 @@ def test_a_hidden_effect_cannot_be_read_outside_truth(name, plain_capture, simul
         assert (folder / file).read_bytes() == (plain_capture / file).read_bytes(), file
     told = json.loads((folder / "truth" / "effects.json").read_text())
     assert [effect["name"] for effect in told["effects"]] == [name]
-    assert read_profile(folder / "truth" / "camera.yaml") != read_profile(folder / "camera.yaml")
+    true, nominal = (read_profile(folder / place / "camera.yaml") for place in ("truth", "."))
+    assert (true != nominal) == bool(CHANGES[name])
 
 
 @pytest.mark.parametrize("name", ["gyro_bias", "gyro_scale", "imu_rotation"])
@@ -192,3 +194,13 @@ def test_two_effects_do_not_disturb_each_other(simulate):
     true = read_profile(folder / "truth" / "camera.yaml")
     assert (true.time_offset_s, true.extensions.vignetting_corner_loss) == (0.01, 0.4)
     assert SMALL["frames"] == len(list((folder / "truth" / "frames").iterdir()))
+
+
+def test_sharpening_is_hidden_in_the_phones_processing(simulate):
+    """Its values stand among the effects and in the strengths; the radius may be left out, and is drawn."""
+    folder = simulate("sharp", frames=2, effects=["sharpening=1.3"])
+    truth = json.loads((folder / "truth/effects.json").read_text(encoding="utf-8"))
+    values = truth["effects"][0]["parameters"]
+    assert values["amount"] == 1.3
+    assert 1.0 <= values["radius_px"] <= 1.8
+    assert truth["isp"] == {"sharpen": 1.3, "sharpen_radius_px": values["radius_px"]}

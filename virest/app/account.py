@@ -11,6 +11,7 @@ from typing import Any
 
 from virest import __version__
 from virest.app import console
+from virest.app.finish import Finished
 from virest.app.outputs import file_facts, parse_lines, resolved
 from virest.app.planning import Job, ProcessOptions
 from virest.camera.profile import profile_mapping
@@ -20,6 +21,8 @@ from virest.restoration.capture import RestorationPlan
 
 PARTLY_FAILED = 9
 STATUSES = ("restored", "copied", "skipped", "failed")
+STEPS = ("deblurred", "straightened")
+"""What is counted beside the four statuses, of restored frames."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 MOST_FILES, MOST_BYTES = 32, 1 << 30
 """Of a capture that cannot be read: what is looked at for run.json."""
@@ -32,11 +35,18 @@ def run_totals(logs: list[Path]) -> dict[str, Any]:
     for content in read_each(logs):
         for line in parse_lines(content):
             counts[line["status"]] += 1
+            counts.update(line.get("done", ()))
             seconds.update({stage: line["seconds"].get(stage, 0.0) for stage in STAGES})
-    return {"counts": {status: counts[status] for status in STATUSES}, "seconds": dict(seconds)}
+    return {"counts": {name: counts[name] for name in (*STATUSES, *STEPS)}, "seconds": dict(seconds)}
 
 
-def run_account(job: Job, plan: RestorationPlan, totals: dict[str, Any], wall_s: float) -> dict[str, Any]:
+def run_account(
+    job: Job,
+    plan: RestorationPlan,
+    totals: dict[str, Any],
+    wall_s: float,
+    finished: Finished = Finished(),  # noqa: B008  (frozen)
+) -> dict[str, Any]:
     """The content of run.json."""
     notes = [note.text for note in job.capture.notes if note.severity != "info"]
     counts = totals["counts"]
@@ -51,7 +61,9 @@ def run_account(job: Job, plan: RestorationPlan, totals: dict[str, Any], wall_s:
         "folder": str(job.capture.folder.absolute()),
         "movie": str(job.capture.movie.absolute()),
         "command": job.request["command"],
-        "profile": profile_mapping(plan.profile),
+        "profile": profile_mapping(finished.profile(plan.profile)),
+        "crop_px": None if finished.crop_px is None else list(finished.crop_px),
+        "film": None if finished.film is None else str(finished.film),
         "profile_source": job.profile_source,
         "profile_sha256": job.request["profile_sha256"],
         "settings": dataclasses.asdict(plan.settings),
@@ -87,7 +99,7 @@ def failure_account(
         "settings": dataclasses.asdict(options.settings),
         "frames": job.request["frames"] if job else None,
         "inputs": _inputs(job) if job else _facts_of_folder(locate(path)),
-        "counts": dict.fromkeys(STATUSES, 0),
+        "counts": dict.fromkeys((*STATUSES, *STEPS), 0),
         "totals": _sums(0, {}, wall_s),
         "verdict": f"not processed: {known.message}",
         "warnings": [text for text in (known.message, known.hint) if text],

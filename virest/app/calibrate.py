@@ -81,7 +81,7 @@ class CalibrationOutput:
             if not path.absolute().parent.is_dir():
                 raise OutputError(f"{path}: its folder does not exist", hint="create it first")
         if self.kalibr and self.kalibr.exists() and not self.kalibr.is_dir():
-            raise OutputError(f"{self.kalibr}: is no folder", hint="name a folder for Kalibr's files")
+            raise OutputError(f"{self.kalibr}: is not a folder", hint="name a folder for Kalibr's files")
         for path in self.files:
             if path.is_dir():
                 raise OutputError(f"{path}: is a folder", hint="name a file")
@@ -109,7 +109,7 @@ def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str
     if not frames:
         raise CalibrationError(
             f"{capture.name}: no frame can be used: {capture.frames[0].skip_reason}",
-            hint="look at it by virest inspect, or record longer",
+            hint="run virest inspect on it, or record longer",
         )
     return CalibrationPlan(capture, profile, source, _imu_file(source), tuple(extra), tuple(frames))
 
@@ -146,23 +146,30 @@ def run_calibration(
     OutputError; nothing is written then.
     """
     output.require()
-    step = progress or (lambda _: None)
-    movie = plan.capture.movie
-    pairs = track_frames(GrayReader(movie, probe_movie(movie)), plan.frames, each, step)
-    found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1))
-    _require_offset(found)
-    noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)
-    facts = as_json(plan, found, noise)
+    facts, found, noise = find_calibration(plan, progress, each)
     text = describe(facts)
     _write(output, facts, found, noise, plan.capture)
     facts["written"] = [str(path) for path in output.files]
     return facts, "\n".join([text, *(f"wrote {path}" for path in output.files)])
 
 
+def find_calibration(
+    plan: CalibrationPlan, progress: Callable[[int], Any] | None = None, each: Each = one_by_one
+) -> tuple[Json, GeometryCalibration, ImuNoise | None]:
+    """Track and fit; the mapping for ``--json``, and what it was made from.  Raises CalibrationError."""
+    step = progress or (lambda _: None)
+    movie = plan.capture.movie
+    pairs = track_frames(GrayReader(movie, probe_movie(movie)), plan.frames, each, step)
+    found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1))
+    _require_offset(found)
+    noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)
+    return as_json(plan, found, noise), found, noise
+
+
 def _require_offset(found: GeometryCalibration) -> None:
     """Nothing else can be believed of a capture whose clock is unknown."""
     offset = next((value for value in found.values if value.name == "time_offset_s"), None)
-    if offset is not None and not offset.determined:
+    if offset is not None and not offset.determined and not offset.rough:
         std = f" (± {1e3 * float(np.max(offset.std)):.1f} ms)" if offset.std is not None else ""
         raise CalibrationError(
             f"the motion does not determine the time offset{std}",
@@ -205,7 +212,7 @@ def _profile_text(facts: Json, profile: CameraProfile) -> str:
 def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise | None) -> Json:
     """Everything that was found, as one mapping."""
     values = [_value_facts(value) for value in found.values]
-    undetermined = [value["name"] for value in values if not value["determined"]]
+    undetermined = [value["name"] for value in values if not value["determined"] and not value["rough"]]
     return {
         "capture": plan.capture.name,
         "folder": str(plan.capture.folder),
@@ -245,6 +252,7 @@ def _value_facts(value: CalibratedValue) -> Json:
         "std": value.std,
         "determined": value.determined,
         "note": value.note,
+        "rough": value.rough,
     }
 
 
@@ -262,9 +270,15 @@ def _own_notes(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNois
     notes = []
     if found.residual_px > UNEXPLAINED * found.noise_px:
         notes.append(
-            f"the residual is {found.residual_px / found.noise_px:.1f} times what tracking makes: something remains "
-            "unexplained, and the standard deviations count it as noise"
+            f"the residual is {found.residual_px / found.noise_px:.1f} times the tracking noise: something remains "
+            "unexplained, and the standard deviations include it as noise"
         )
+    notes += [
+        f"the time offset is written although it is known to ± {1e3 * float(np.max(value.std)):.1f} ms only: film a "
+        "few seconds more, and turn the phone about all three axes"
+        for value in found.values
+        if value.rough and value.std is not None
+    ]
     if plan.imu_file and noise:
         notes += _imu_disagreements(plan.imu_file, noise)
     return notes
@@ -275,7 +289,7 @@ def _imu_disagreements(file: ImuNoise, measured: ImuNoise) -> list[str]:
     notes = []
     if abs(measured.update_rate_hz / file.update_rate_hz - 1) > RATE_TOLERANCE:
         notes.append(
-            f"{IMU_NAME} says {file.update_rate_hz:g} Hz, this capture has {measured.update_rate_hz:.4g} Hz: another "
+            f"{IMU_NAME} states {file.update_rate_hz:g} Hz, this capture has {measured.update_rate_hz:.4g} Hz: another "
             "phone or mode?"
         )
     pairs = (
@@ -300,25 +314,25 @@ def describe(facts: Json) -> str:
         table(["value", "start", "calibrated", "±", "determined", "note"], rows),
         f"residual {facts['before_px']:.3f} -> {residual_words(facts['residual_px'], facts['noise_px'])}",
         f"{facts['tracks']} tracks in {facts['pairs']} pairs of frames, {share:.1f} % of them moving on their own; "
-        f"the gyroscope explains {facts['explained']:.1%} of the turns",
+        f"the gyroscope explains {facts['explained']:.1%} of the rotation",
         f"camera's translation: {_TRANSLATIONS.get(facts['translation'], facts['translation'])}",
     ]
     if facts["frames"] < facts["frames_recorded"]:
-        lines.append(f"looked at {facts['frames']} of {facts['frames_recorded']} frames, runs spread over the capture")
+        lines.append(f"used {facts['frames']} of {facts['frames_recorded']} frames: runs from all parts of the capture")
     lines += [
-        f"errors of {pair['first']} and {pair['second']} go together: correlation {pair['correlation']:+.2f}"
+        f"errors of {pair['first']} and {pair['second']} are correlated: {pair['correlation']:+.2f}"
         for pair in facts["correlations"]
     ]
     if facts["not_determined"]:
-        lines.append(f"left as it was: {', '.join(facts['not_determined'])}")
+        lines.append(f"kept at the starting value: {', '.join(facts['not_determined'])}")
     return "\n".join(lines + [f"note: {_one_line(note)}" for note in facts["notes"]])
 
 
 _TRANSLATIONS = {
     "none": "none seen",
-    "inertial": "by the accelerometer, before a plane",
-    "direction": "one direction for each pair of frames, any depths",
-    "free": "a smooth path of its own, before a plane; the accelerometer does not tell it",
+    "inertial": "from the accelerometer, in front of a plane",
+    "direction": "one direction per pair of frames, any depth",
+    "free": "a smooth path, in front of a plane; the accelerometer does not determine it",
 }
 
 
@@ -334,7 +348,7 @@ def _rows(value: Json) -> list[list[str]]:
 
 
 def _row(value: Json, name: str, start: Any, found: Any, std: Any) -> list[str]:
-    shown = _cell(found, std) if value["determined"] else "–"
+    shown = _cell(found, std) if value["determined"] or value.get("rough") else "–"
     spread = "" if std is None else f"{std:.2g}"
     return [name, _cell(start, std), shown, spread, "yes" if value["determined"] else "no", _one_line(value["note"])]
 

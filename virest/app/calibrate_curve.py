@@ -33,6 +33,7 @@ def calibrate_curve(
     kind: str = "auto",
     out: Path | None = None,
     plot: Path | None = None,
+    overwrite: bool = False,
 ) -> tuple[dict[str, Any], str]:
     """Fit the curve and write its files; returns the mapping for ``--json`` and the table for people.
 
@@ -40,7 +41,7 @@ def calibrate_curve(
     CalibrationError, OutputError; nothing is written then.
     """
     for path in (out, plot):
-        _require_place(path)
+        _require_place(path, overwrite=overwrite)
     stills, notes = read_source(source, exposures)
     fit = fit_response([BracketPicture(s.file, s.levels, s.exposure) for s in stills], kind)
     facts = as_json(fit, stills, notes)
@@ -52,13 +53,15 @@ def calibrate_curve(
     return facts, describe(facts, out, plot)
 
 
-def _require_place(path: Path | None) -> None:
+def _require_place(path: Path | None, *, overwrite: bool) -> None:
     if path is None:
         return
     if path.is_dir():
         raise OutputError(f"{path}: is a folder", hint="name a file")
     if not path.absolute().parent.is_dir():
         raise OutputError(f"{path}: its folder does not exist", hint="create it first")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already", hint="name another file, or pass --overwrite")
 
 
 def plot_format_known(path: Path) -> bool:

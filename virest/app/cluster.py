@@ -101,7 +101,7 @@ class ClusterExecutor(Executor):
         if time.monotonic() - self._alone_since_s > FIRST_WORKER_S:
             raise RestorationError(
                 f"the scheduler {self.address} has had no workers for {FIRST_WORKER_S:.0f} s",
-                hint="start workers, then go on with --resume",
+                hint="start workers, then continue with --resume",
                 cluster_lost=True,
             )
 
@@ -109,7 +109,7 @@ class ClusterExecutor(Executor):
         """The error of a scheduler that does not answer any more."""
         return RestorationError(
             f"the scheduler {self.address} is gone; the segments that are done stay",
-            hint="start it again, then go on with --resume",
+            hint="start it again, then continue with --resume",
             cluster_lost=True,
         )
 

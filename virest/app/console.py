@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from virest.errors import OutputError, VirestError
 
 OUR_FAULT = "this is a fault of virest, not of your input; please report it with the lines above"
+MOVIE_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".insv", ".360")
 
 
 class Bar(Protocol):
@@ -125,7 +126,7 @@ def progress_bar(total: int, label: str, *, quiet: bool) -> Iterator[Bar | None]
 
 
 def expand_dash(captures: Iterable[str]) -> list[str]:
-    """Replace ``-`` by the folder names on standard input, one a line."""
+    """Replace ``-`` by the folder names on standard input, one a line, and a movie by the folder that holds it."""
     names: list[str] = []
     for capture in captures:
         if capture != "-":
@@ -133,13 +134,20 @@ def expand_dash(captures: Iterable[str]) -> list[str]:
         elif sys.stdin is not None:
             lines = sys.stdin.buffer.read().split(b"\n")
             names += [os.fsdecode(line.removesuffix(b"\r")) for line in lines if line.strip()]
-    return names
+    return [folder_of(name) for name in names]
 
 
-def table(header: list[str], rows: list[list[str]]) -> str:
-    """Columns under their heads, the first and the last two to the left, numbers to the right."""
+def folder_of(capture: str) -> str:
+    """The capture's folder, where the movie inside it was given."""
+    if capture.lower().endswith(MOVIE_ENDINGS) and os.path.isfile(capture):
+        return os.path.dirname(capture) or "."
+    return capture
+
+
+def table(header: list[str], rows: list[list[str]], words: int = 2) -> str:
+    """Columns under their heads, the first and the last few (``words``) to the left, numbers to the right."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    left = {0, len(header) - 1, len(header) - 2}
+    left = {0, *range(len(header) - words, len(header))}
 
     def line(row: list[str]) -> str:
         cells = [c.ljust(w) if i in left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from virest.app.console import table
 from virest.app.outputs import capture_name, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
-from virest.camera.profile import CameraProfile, format_profile
+from virest.camera.profile import CameraProfile, format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames
@@ -105,14 +105,7 @@ def run_diagnosis(
     folder = Path(options.out) / capture_name(path)
     require_free(folder, options.overwrite)
     source = open_source(Path(path), options.config)
-    firsts = pairs_to_keep_back(source.capture, source.profile)
-    kept_back = [first + step for first in firsts for step in (0, 1)]
-    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, kept_back)
-    say("restoring", LADDER_PART)
-    gain = measure_restoration_gain(
-        source.capture, found.nominal_profile, found.extended_profile, source.pictures, source.gray, each=each,
-        firsts=firsts,
-    )  # fmt: skip
+    found, gain = _found_and_judged(source, say, each)
     say("figures", GAIN_PART)
     files, drawn = draw_figures(source.capture, found, each)
     facts = as_json(found, gain, drawn)
@@ -122,6 +115,24 @@ def run_diagnosis(
     say("done", 1.0)
     text = describe(source.capture.name, found, gain, folder)
     return DiagnosisOutcome(facts, text, found.verdict)
+
+
+def find_diagnosis(path: Path, config: Path | None = None) -> Json:
+    """The mapping of diagnosis.json without a file written: the extended profile and the residuals stand in it."""
+    found, gain = _found_and_judged(open_source(path, config), lambda _stage, _part: None, one_by_one)
+    facts = as_json(found, gain, [[] for _ in found.causes])
+    return {**facts, "extended_profile": profile_mapping(found.extended_profile), "residuals": found.residuals}
+
+
+def _found_and_judged(source: Source, say: Progress, each: Each) -> tuple[Diagnosis, RestorationGain]:
+    """What is wrong, and what mending it does to pictures that no fit has seen."""
+    firsts = pairs_to_keep_back(source.capture, source.profile)
+    kept_back = [first + step for first in firsts for step in (0, 1)]
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, kept_back)
+    say("restoring", LADDER_PART)
+    profiles = found.nominal_profile, found.extended_profile
+    gain = measure_restoration_gain(source.capture, *profiles, source.pictures, source.gray, each=each, firsts=firsts)
+    return found, gain
 
 
 def climb(source: Source, progress: Progress, each: Each = one_by_one, kept_back: Collection[int] = ()) -> Diagnosis:
@@ -337,7 +348,7 @@ def _shots(capture: Capture, found: Diagnosis) -> dict[str, tuple[Capture, Camer
 def _pictures_figure(
     capture: Capture, simulated: Mapping[str, Picture | None], shots: Mapping[str, tuple[Capture, CameraProfile, int]]
 ) -> bytes | None:
-    """A lively frame against its simulation from its neighbour's restored picture, with either profile."""
+    """A high-motion frame against its simulation from its neighbour's restored picture, with either profile."""
     number = next((number for _, _, number in shots.values()), None)
     if number is None:
         return None
@@ -457,7 +468,7 @@ def _gain_line(gain: RestorationGain) -> str:
     if not gain.frames:
         return "restored: the capture is too short to keep frames back from the fits"
     if math.isnan(gain.sharpness_after):
-        return "restored: no two neighbours could be laid on each other"
+        return "restored: no two neighbouring frames could be registered"
     return (
         f"restored: sharpness {_number(gain.sharpness_recorded)} recorded, {_number(gain.sharpness_before)} as given, "
         f"{_number(gain.sharpness_after)} extended; neighbours disagree by "

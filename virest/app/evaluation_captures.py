@@ -95,7 +95,7 @@ def read_picture(path: Path) -> Picture:
     """Read an RGB picture of 8 bits."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
-        raise CaptureError(f"{path}: is no picture that can be read", hint="give PNG or JPEG files")
+        raise CaptureError(f"{path}: is not a picture that can be read", hint="give PNG or JPEG files")
     return picture[..., ::-1].astype(np.uint8)
 
 

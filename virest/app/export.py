@@ -2,6 +2,7 @@
 
     euroc   mav0/cam0/{data/<ns>.png, data.csv, sensor.yaml}, mav0/imu0/{data.csv, sensor.yaml}, dso/cam0/times.txt
     tum     rgb/<s>.png, rgb.txt, accelerometer.txt, imu.txt
+    nerfstudio, colmap, gyroflow    see export_scenes
     both    camchain-imucam.yaml, imu.yaml, orb_slam3.yaml, times.txt, camera.yaml, export.json
 
 One clock: samples are brought to the camera's by the profile's offset and skew, and pictures keep their logged stamps
@@ -25,7 +26,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest import __version__
-from virest.app.export_plan import INSTANT_NOTE, RECORD, ExportFrame, ExportOptions, ExportPlan, Json, plan_export
+from virest.app.export_plan import (
+    INSTANT_NOTE,
+    RECORD,
+    SCENES,
+    ExportFrame,
+    ExportOptions,
+    ExportPlan,
+    Json,
+    plan_export,
+)
+from virest.app.export_scenes import colmap_files, frame_poses, gyroflow_profile, transforms_json
 from virest.app.outputs import output_error, plain, write_picture
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu
 from virest.camera.orb_slam import format_orb_slam
@@ -46,6 +57,9 @@ __all__ = ["ExportOptions", "plan_export", "run_export"]
 
 log = logging.getLogger(__name__)
 
+PICTURES = {"euroc": "mav0/cam0/data", "tum": "rgb"}
+"""Where the pictures of a format go; ``images`` for the others."""
+
 
 # ── write ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -57,13 +71,48 @@ def run_export(plan: ExportPlan, progress: Callable[[int], Any] | None = None) -
     """
     step = progress or (lambda _: None)
     with _whole_folder(plan.target) as part:
+        if plan.options.format == "gyroflow":
+            return _write_lens_profile(plan, part)
         written = _write_pictures(plan, part, step)
         if not written:
             raise CaptureError(f"{plan.capture.name}: no picture can be decoded", hint="copy the movie again")
-        _write_tables(plan, written, part)
+        if plan.options.format in SCENES:
+            _write_scene(plan, written, part)
+        else:
+            _write_tables(plan, written, part)
         facts = _facts(plan, written)
         _write(part / RECORD, json.dumps(plain(facts), allow_nan=False, indent=2) + "\n")
     return facts, describe(facts)
+
+
+def _write_lens_profile(plan: ExportPlan, part: Path) -> tuple[Json, str]:
+    """Write Gyroflow's lens profile alone: its gyroscope data stay where they are."""
+    if plan.profile.intrinsics is None:
+        raise CaptureError(f"{plan.capture.name}: the focal length is unknown", hint="virest calibrate --with focal")
+    rate_hz = _rate_hz([frame.time_ns for frame in plan.frames])
+    text, error_px = gyroflow_profile(plan.camera, rate_hz)
+    _write(part / "lens.json", text)
+    facts = _facts(plan, list(plan.frames)) | {"frames": 0, "lens_error_px": error_px}
+    _write(part / RECORD, json.dumps(plain(facts), allow_nan=False, indent=2) + "\n")
+    readout = f"{1e3 * plan.camera.shutter.readout_time_s:.2f} ms" if plan.camera.readout_known else "unknown"
+    lines = [
+        f"{plan.capture.name}: lens profile for Gyroflow, readout {readout}",
+        f"its fisheye model is within {error_px:.2f} px of this lens",
+        f"wrote {plan.target / 'lens.json'}",
+    ]
+    return facts, "\n".join(lines)
+
+
+def _write_scene(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> None:
+    """Write what nerfstudio or COLMAP reads beside the pictures."""
+    poses = frame_poses(plan, frames, [_picture_name(plan, frame) for frame in frames])
+    if plan.options.format == "nerfstudio":
+        files = {"transforms.json": transforms_json(plan, poses)}
+    else:
+        files = colmap_files(plan, poses)
+    for name, text in files.items():
+        _write(part / name, text)
+    _write(part / "camera.yaml", _commented(_said(plan)) + format_profile(plan.profile))
 
 
 @contextmanager
@@ -87,7 +136,7 @@ def _whole_folder(target: Path) -> Iterator[Path]:
 
 def _write_pictures(plan: ExportPlan, part: Path, step: Callable[[int], Any]) -> list[ExportFrame]:
     """Write the pictures; returns the frames that have one, those that cannot be decoded are counted."""
-    folder = part / ("mav0/cam0/data" if plan.options.format == "euroc" else "rgb")
+    folder = part / PICTURES.get(plan.options.format, "images")
     folder.mkdir(parents=True)
     written = []
     for frame, picture in _pictures(plan):
@@ -106,6 +155,8 @@ def _write_pictures(plan: ExportPlan, part: Path, step: Callable[[int], Any]) ->
 
 
 def _picture_name(plan: ExportPlan, frame: ExportFrame) -> str:
+    if plan.options.format in SCENES:
+        return f"{frame.index:06d}.png"
     return f"{frame.time_ns}.png" if plan.options.format == "euroc" else f"{seconds(frame.time_ns)}.png"
 
 
@@ -235,9 +286,9 @@ def describe(facts: Json) -> str:
     """Lines for people."""
     span_s = (facts["span_ns"][1] - facts["span_ns"][0]) / 1e9
     lines = [
-        f"{facts['capture']}: {facts['frames']} {facts['pictures']} pictures over {span_s:.2f} s and "
+        f"{facts['capture']}: {facts['frames']} {facts['pictures']} frames over {span_s:.2f} s and "
         f"{facts['imu_rows']} inertial rows as {facts['format']}"
     ]
     lines += [f"left out: {number} frames ({reason})" for reason, number in facts["left_out"].items()]
-    lines.append(f"a picture stands for the instant {1e3 * facts['instant_after_stamp_s']:.2f} ms after its stamp")
+    lines.append(f"a frame shows the instant {1e3 * facts['instant_after_stamp_s']:.2f} ms after its stamp")
     return "\n".join([*lines, f"wrote {facts['folder']}"])

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,18 @@ from numpy.typing import NDArray
 from virest.app.outputs import RunFolder, capture_name, read_lines
 from virest.camera.kalibr import ImuNoise, measure_imu_noise
 from virest.camera.profile import CameraProfile, Extensions, parse_profile
+from virest.capture.files import label, scan_text
 from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile
 from virest.errors import CaptureError, OutputError
 from virest.restoration.capture import at_true_times
 
+if TYPE_CHECKING:
+    from virest.app.export_scenes import GivenPoses
+
 log = logging.getLogger(__name__)
 
-FORMATS = ("euroc", "tum")
+FORMATS = ("euroc", "tum", "nerfstudio", "colmap", "gyroflow")
+SCENES = ("nerfstudio", "colmap")
 STAMPS = ("logged", "instant")
 RECORD = "export.json"
 INSTANT_NOTE = "a picture stands for an instant"
@@ -44,6 +50,8 @@ class ExportOptions:
     """Of the movie's frame indices."""
     stamps: str = "logged"
     overwrite: bool = False
+    poses: Path | None = None
+    """A trajectory of the camera (TUM), for nerfstudio and COLMAP."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +84,13 @@ class ExportPlan:
     noise: ImuNoise | None
     source: str
     notes: tuple[str, ...]
+    camera: CameraProfile
+    """Of the capture, as :attr:`profile` is of what is written."""
+    velocities: Mapping[int, list[float]]
+    """m/s in camera axes, by frame, where a run knows them."""
+    restored_start: bool = False
+    """Whether restored pictures show the start of the first row's exposure."""
+    poses: GivenPoses | None = None
 
 
 def plan_export(path: str, options: ExportOptions) -> ExportPlan:
@@ -85,6 +100,7 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
     capture = read_capture(folder)
     profile, source = resolve_profile(capture, options.config)
     pictures: dict[int, Path] | None = None
+    velocities: dict[int, list[float]] = {}
     left_out: dict[str, int] = {}
     reference = "middle"
     if options.restored is not None:
@@ -93,6 +109,7 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
         profile, source = parse_profile(account["profile"], "run.json"), f"{options.restored.name}/run.json"
         reference = account.get("settings", {}).get("reference", "exposure-start")
         pictures = _restored_pictures(run, capture, left_out)
+        velocities = _velocities(run)
     chosen = _choose(capture, profile, options, pictures, left_out)
     if not chosen:
         why = ", ".join(f"{number} {reason}" for reason, number in left_out.items()) or "--frames selects none"
@@ -108,7 +125,21 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
     noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
     times = _imu_time_ns(capture, profile)
     return ExportPlan(
-        target, capture, options, frames, left_out, written, instant_s, times, noise, source, tuple(notes)
+        target,
+        capture,
+        options,
+        frames,
+        left_out,
+        written,
+        instant_s,
+        times,
+        noise,
+        source,
+        tuple(notes),
+        profile,
+        velocities,
+        options.restored is not None and reference == "exposure-start",
+        None if options.poses is None else _read_poses(options.poses),
     )
 
 
@@ -121,7 +152,7 @@ def _require_free(target: Path, capture: Path, options: ExportOptions) -> None:
     if not target.exists() and not target.is_symlink():
         return
     if not (target / RECORD).is_file():
-        raise OutputError(f"{target}: exists and is no export of virest", hint="choose another folder with --out")
+        raise OutputError(f"{target}: exists and is not an export of virest", hint="choose another folder with --out")
     if not options.overwrite:
         raise OutputError(f"{target}: holds an export", hint="--overwrite replaces it, --out chooses another folder")
 
@@ -151,7 +182,7 @@ def _restored_pictures(run: RunFolder, capture: Capture, left_out: dict[str, int
         index, status = int(line.get("frame", -1)), line.get("status")
         known = 0 <= index < len(capture.frames)
         if not known or line.get("timestamp_ns") != capture.frames[index].timestamp_ns:
-            text = f"{run.parameters}: frame {index} is none of {capture.name}: its stamp differs"
+            text = f"{run.parameters}: frame {index} is not one of {capture.name}: its stamp differs"
             raise CaptureError(text, hint="pass the run of this capture")
         picture = run.picture(index)
         if status in PLAIN_PICTURES and picture.is_file():
@@ -160,6 +191,19 @@ def _restored_pictures(run: RunFolder, capture: Capture, left_out: dict[str, int
             reason = str(status) if status not in PLAIN_PICTURES else "picture is missing"
             left_out[reason] = left_out.get(reason, 0) + 1
     return pictures
+
+
+def _velocities(run: RunFolder) -> dict[int, list[float]]:
+    """The camera's velocity of each frame that a run knows it of."""
+    motions = {line["frame"]: line.get("motion") or {} for line in read_lines(run.parameters)}
+    return {number: motion["velocity_m_s"] for number, motion in motions.items() if motion.get("velocity_m_s")}
+
+
+def _read_poses(path: Path) -> GivenPoses:
+    from virest.app.export_scenes import GivenPoses
+
+    scan_text(path, CaptureError, "a trajectory: time x y z qx qy qz qw")
+    return GivenPoses(path.read_text(encoding="utf-8"), label(path))
 
 
 def _choose(

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from virest.capture.detect import partial_readers
+from virest.capture.files import is_present
 from virest.capture.folder import EPOCHS, Capture, Frame, Note, read_capture, resolve_profile
 from virest.capture.join import median_period_s
 from virest.capture.video import MovieIndex
 from virest.errors import CaptureError, VirestError
 
 DROPPED = " dropped: "
+NOT_APPLIED_S = 1e-6
 
 
 def inspect_capture(path: Path) -> tuple[dict[str, Any], str, int]:
@@ -52,7 +54,8 @@ def as_json(capture: Capture) -> dict[str, Any]:
         },
         "counts": {key: value for key, value in capture.counts.items() if DROPPED not in key},
         "dropped": _dropped(capture.counts),
-        "clock": {"source": capture.clock_source, "shift_s": capture.clock_shift_ns / 1e9},
+        "frames": _frame_counts(capture.frames),
+        "clock": _clock(capture.clock_source, capture.clock_shift_ns, capture.clock_difference_ns),
         "span_s": {
             "frames": [float(frame_s[0]), float(frame_s[-1])],
             "imu": [float(capture.imu.time_s[0]), float(capture.imu.time_s[-1])],
@@ -65,6 +68,7 @@ def as_json(capture: Capture) -> dict[str, Any]:
         "imu_gaps_s": [list(gap) for gap in capture.imu_gaps_s],
         "repeats": list(capture.repeats),
         "startup_lag_s": capture.startup_lag_s,
+        "stalls": [list(stall) for stall in capture.stalls],
         "skipped": _skipped(capture.frames),
         "exposure_s": _range([frame.exposure_s for frame in capture.frames]),
         "iso": _range([frame.iso for frame in capture.frames]),
@@ -80,6 +84,19 @@ def as_json(capture: Capture) -> dict[str, Any]:
 
 
 # ── facts ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _frame_counts(frames: tuple[Frame, ...]) -> dict[str, Any]:
+    """How many frames there are, how many can be used, and how many cannot for each cause."""
+    codes = [code for frame in frames for code in frame.skip_codes]
+    skipped = {code: codes.count(code) for code in sorted(set(codes))}
+    return {"recorded": len(frames), "usable": sum(f.skip_reason is None for f in frames), "skipped": skipped}
+
+
+def _clock(source: str, shift_ns: int, difference_ns: int | None) -> dict[str, Any]:
+    """What was added to the camera's stamps, and what edge_epochs.txt has, whether or not that had to be applied."""
+    difference_s = None if difference_ns is None else difference_ns / 1e9
+    return {"source": source, "shift_s": shift_ns / 1e9, "edge_epochs_difference_s": difference_s}
 
 
 def _note(note: Note) -> dict[str, str]:
@@ -149,8 +166,14 @@ def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
     }
     notes = [Note("error", _code(fault), str(fault))]
     if _is_folder(folder):
-        for path, reader in partial_readers(folder).items():
-            _look_at(path, reader, facts, notes)
+        readers = partial_readers(folder)
+        missing = [path.name for path in readers if path.name != EPOCHS and not is_present(path)]
+        for path, reader in readers.items():
+            if path.name not in missing:
+                _look_at(path, reader, facts, notes)
+        others = [name for name in missing if name not in str(fault)]
+        if others:
+            notes.append(Note("error", "files-missing", f"missing too: {', '.join(others)}"))
     facts["notes"] = [_note(note) for note in notes]
     return facts
 
@@ -183,7 +206,8 @@ def _look_at(path: Path, reader: Callable[[Path], Any], facts: dict[str, Any], n
                 "keyframes": len(found.keyframes),
             }
         case "edge_epochs.txt":
-            facts["clock"] = {"source": found.source, "shift_s": (found.mean_difference_ns or 0) / 1e9}
+            applied_ns = (found.mean_difference_ns or 0) if found.source == "UNKNOWN" else 0
+            facts["clock"] = _clock(found.source, applied_ns, found.mean_difference_ns)
         case _:
             facts["counts"][f"{path.name} rows"] = found.rows
             if found.dropped:
@@ -215,7 +239,11 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     for name, reasons in facts["dropped"].items():
         rows.append(("dropped", f"{name}: " + ", ".join(f"{n} {reason}" for reason, n in reasons.items())))
     if clock := facts.get("clock"):
-        rows.append(("clock", f"source {clock['source']}, camera stamps shifted by {clock['shift_s']:.6f} s"))
+        text = f"source {clock['source']}, camera stamps shifted by {clock['shift_s']:.6f} s"
+        difference_s = clock["edge_epochs_difference_s"]
+        if difference_s is not None and abs(difference_s - clock["shift_s"]) > NOT_APPLIED_S:
+            text += f" (edge_epochs.txt: the clocks lie {difference_s:.6f} s apart, which this source does not need)"
+        rows.append(("clock", text))
     for name, span in (facts.get("span_s") or facts.get("logged_span_s") or {}).items():
         rows.append(("span", f"{name} {span[0]:.3f} to {span[1]:.3f} s"))
     if not facts["usable"]:

@@ -22,7 +22,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from multiprocessing.connection import wait as wait_for_handles
 from pathlib import Path
@@ -54,8 +54,21 @@ MOST_AHEAD = 8
 """Calls begun before their results are wanted: enough to keep many workers in work, few enough to keep memory flat."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
+EDGE_PX = 0.5
+"""A pixel reaches this far around its centre: as `valid_px` counts."""
+
 Picture = NDArray[np.uint8]
 Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class PictureWishes:
+    """Which pictures a run writes beside the restored frames, and which it leaves out."""
+
+    masks: bool = False
+    """Where a restored frame holds recorded data."""
+    skip_copied: bool = False
+    """No picture of frames that are only copied."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +85,7 @@ class Segment:
     run: RunFolder
     around: tuple[Frame, ...] = ()
     """Neighbours in the movie that are decoded for these frames' sake and not restored here."""
+    pictures: PictureWishes = PictureWishes()
 
     @property
     def log_path(self) -> Path:
@@ -113,13 +127,20 @@ def cut_imu(imu: ImuSamples, frames: Sequence[Frame], plan: RestorationPlan) -> 
 
 
 def make_segment(
-    frames: tuple[Frame, ...], capture: Capture, name: str, index: MovieIndex, plan: RestorationPlan, run: RunFolder
+    frames: tuple[Frame, ...],
+    capture: Capture,
+    name: str,
+    index: MovieIndex,
+    plan: RestorationPlan,
+    run: RunFolder,
+    pictures: PictureWishes = PictureWishes(),
 ) -> Segment:
     """One segment as a worker takes it."""
     place, movie = RunFolder(run.path.absolute()), capture.movie.absolute()  # a worker may stand in another folder
     around = _around(frames, capture, plan)
     every = sorted((*frames, *around), key=lambda frame: frame.index)
-    return Segment(name, movie, index, frames, cut_imu(capture.imu, every, plan), plan.of(every), place, around)
+    imu = cut_imu(capture.imu, every, plan)
+    return Segment(name, movie, index, frames, imu, plan.of(every), place, around, pictures)
 
 
 def _around(frames: tuple[Frame, ...], capture: Capture, plan: RestorationPlan) -> tuple[Frame, ...]:
@@ -244,6 +265,8 @@ def _reason(error: Exception) -> str:
 
 def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> dict[str, Any]:
     """Write the frame's picture, if there is one, and give its line."""
+    if segment.pictures.skip_copied and restored.status == "copied":
+        restored = replace(restored, picture=None)
     path = segment.run.picture(restored.frame.index)
     began = time.perf_counter()
     if restored.picture is None:
@@ -252,10 +275,22 @@ def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> 
         except OSError as error:
             raise OutputError(f"{path}: {error.strerror}", hint="check the output folder") from error
     else:
+        if segment.pictures.masks:
+            write_picture(segment.run.mask(restored.frame.index), recorded_mask(restored.picture, restored.source_px))
         write_picture(path, restored.picture)
     write_s = time.perf_counter() - began if restored.picture is not None else 0.0
     seconds = {"decode": decode_s, "estimate": 0.0, "deblur": 0.0, "shutter": 0.0, "write": write_s, **restored.seconds}
     return frame_line(segment, restored, seconds)
+
+
+def recorded_mask(picture: Picture, source_px: NDArray[np.float32] | None) -> Picture:
+    """(height, width): 255 where a pixel was read inside the recorded picture, 0 where its edge is repeated."""
+    height, width = picture.shape[:2]
+    if source_px is None:
+        return np.full((height, width), 255, np.uint8)
+    return np.asarray(
+        cv2.inRange(source_px, (-EDGE_PX, -EDGE_PX), (width - 1 + EDGE_PX, height - 1 + EDGE_PX)), np.uint8
+    )
 
 
 def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, float]) -> dict[str, Any]:
@@ -280,7 +315,17 @@ def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, flo
         "response": curve,
         "deblur": {"method": "none"},
     }
-    return {**line, **restored.parameters, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
+    line |= restored.parameters
+    line["done"] = steps_done(line)
+    return {**line, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
+
+
+def steps_done(line: dict[str, Any]) -> list[str]:
+    """What was done to a frame: ``deblurred``, ``straightened``."""
+    if line["status"] != "restored":
+        return []
+    steps = (("deblurred", line["deblur"]), ("straightened", line["shutter"]))
+    return [name for name, step in steps if step and step["method"] != "none"]
 
 
 # ── workers ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -308,6 +353,8 @@ def process_pool(jobs: int, *, verbose: bool = False) -> ProcessPoolExecutor:
 
 def submit_uninterrupted(pool: ProcessPoolExecutor, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
     """Hand a call to a pool; processes that this starts never see the Ctrl-C meant for the parent."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows, where workers ignore Ctrl-C once they run
+        return pool.submit(function, *arguments)
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
     try:
         return pool.submit(function, *arguments)
@@ -406,7 +453,7 @@ class Workers:
         """The error of work that was called off from outside."""
         if isinstance(self._executor, ClusterExecutor):
             return self._executor.lost()
-        return RestorationError("the work was called off", hint="go on with --resume")
+        return RestorationError("the job was cancelled", hint="continue with --resume")
 
     def renew(self) -> None:
         """After a worker's death: a pool is broken and begins anew, a cluster has others."""

@@ -13,7 +13,6 @@ Behind an address (``s3://…``) every file is put there by one request, the fol
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import math
@@ -22,7 +21,7 @@ import re
 import secrets
 import shutil
 import unicodedata
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,17 +34,26 @@ from virest.app.png import png_bytes
 from virest.capture.location import RemotePath, is_remote, locate, read_each, remove_files
 from virest.errors import OutputError, RestorationError
 
+fcntl: Any
+msvcrt: Any
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+    import msvcrt
+
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
 PART = re.compile(r".*\.[0-9a-f]{8}\.part")
 BESIDE = ("diagnosis.json", "extended.yaml", "figures", "report.html")
 """What `diagnose` writes into the same folder: no obstacle for a run, and none of its files."""
-REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs")
+REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs", "outputs")
 UNPRINTABLE = ("Cc", "Zl", "Zp")
 """Control characters and separators of lines, by their Unicode category."""
 SIGNIFICANT_DIGITS = 10
 
 Mode = Literal["new", "resume", "overwrite"]
 Found = Literal["nothing", "unfinished", "finished"]
+Change = Callable[[dict[str, Any]], dict[str, Any]]
 
 _HINTS = {
     errno.ENOSPC: "free some space there, then go on (a run with --resume)",
@@ -174,6 +182,16 @@ class RunFolder:
         return self.path / "frames"
 
     @property
+    def masks(self) -> Path:
+        """Folder of the masks, where they are asked for."""
+        return self.path / "masks"
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folders of this run's own files, those that are there."""
+        return tuple(place for place in (self.path, self.frames, self.masks) if place.is_dir())
+
+    @property
     def segments(self) -> Path:
         """Folder of the finished segments' logs."""
         return self.path / ".segments"
@@ -201,6 +219,10 @@ class RunFolder:
     def picture(self, frame: int) -> Path:
         """Where a frame's picture goes."""
         return self.frames / f"{frame:06d}.png"
+
+    def mask(self, frame: int) -> Path:
+        """Where a frame's mask goes."""
+        return self.masks / f"{frame:06d}.png"
 
     def segment_log(self, first: int, last: int) -> Path:
         """Where a segment's lines go."""
@@ -230,7 +252,7 @@ def check_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Found:
 
 
 def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
-    """Whether a run stands here, and its request. Raises OutputError for a folder or file that is none of ours."""
+    """Whether a run stands here, and its request. Raises OutputError for a folder or file that is not one of ours."""
     if run.path.exists() and not run.path.is_dir():
         raise OutputError(f"{run.path}: is a file", hint="choose another folder with --out")
     if run.frames.is_symlink() or run.segments.is_symlink():
@@ -338,15 +360,23 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
                 run.path.rmdir()
 
 
+def _take(handle: int) -> None:
+    """Lock an open file for this process alone.  Raises OSError where another one holds it."""
+    if fcntl is not None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    else:  # Windows
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+
+
 @contextmanager
 def _locked(run: RunFolder) -> Iterator[None]:
     while True:
         try:
-            handle = os.open(run.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            handle = os.open(run.lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
         except OSError as error:
             raise output_error(run.path, error) from error
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _take(handle)
         except OSError:
             os.close(handle)
             raise OutputError(
@@ -360,9 +390,12 @@ def _locked(run: RunFolder) -> Iterator[None]:
     try:
         yield
     finally:
+        if fcntl is None:
+            os.close(handle)  # Windows removes no open file
         with suppress(OSError):
             run.lock.unlink()
-        os.close(handle)
+        if fcntl is not None:
+            os.close(handle)
 
 
 def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
@@ -383,7 +416,7 @@ def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
 
 def _remove_own(run: RunFolder) -> None:
     """Remove what a run made, except its state, and nothing else."""
-    for folder in (run.path, run.frames):
+    for folder in run.folders:
         own = [file for file in folder.iterdir() if OWN_FILES.fullmatch(file.name) and file != run.state]
         remove_files([file for file in own if is_remote(file) or not file.is_dir()])
 
@@ -418,7 +451,7 @@ def remove_parts(run: RunFolder) -> None:
     """Remove the half-written files of writers that were killed; a store has none."""
     if is_remote(run.path):
         return
-    for folder in (run.path, run.frames, run.segments):
+    for folder in (*run.folders, run.segments):
         for file in folder.iterdir() if folder.is_dir() else ():
             if PART.fullmatch(file.name):
                 file.unlink(missing_ok=True)
@@ -432,7 +465,7 @@ def _leave(run: RunFolder) -> None:
             return
         if run.frames.is_dir():
             _remove_own(run)
-        for folder in (run.segments, run.frames):
+        for folder in (run.segments, run.masks, run.frames):
             with suppress(FileNotFoundError):
                 folder.rmdir()
         run.state.unlink(missing_ok=True)
@@ -441,7 +474,8 @@ def _leave(run: RunFolder) -> None:
 def remove_stray_pictures(run: RunFolder, keep: Iterable[int]) -> None:
     """Remove pictures of segments that were not finished."""
     kept = {run.picture(frame).name for frame in keep}
-    names = (file for file in run.frames.iterdir() if OWN_FILES.fullmatch(file.name))
+    folders = (place for place in (run.frames, run.masks) if place.is_dir())
+    names = (file for place in folders for file in place.iterdir() if OWN_FILES.fullmatch(file.name))
     remove_files([file for file in names if file.name not in kept])
 
 
@@ -476,10 +510,17 @@ def _is_finished(frames: tuple[int, ...], data: bytes, pictures: set[str]) -> bo
         return False
 
 
-def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any]) -> None:
-    """Join the segments' lines in frame order, write run.json last, and take away the scaffolding."""
+def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any], change: Change | None = None) -> None:
+    """Join the segments' lines in frame order, write run.json last, and take away the scaffolding.
+
+    change: what happened to a line's pictures after the segments were done.
+    """
     try:
-        _join(run.parameters, logs)
+        if change is None:
+            _join(run.parameters, logs)
+        else:
+            lines = (change(line) for log in read_each(logs) for line in parse_lines(log))
+            write_whole(run.parameters, "".join(json_line(line) + "\n" for line in lines).encode())
         _write_account(run, account)
         run.state.unlink(missing_ok=True)
     except OSError as error:

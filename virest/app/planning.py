@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest import __version__
-from virest.app.jobs import prepare_worker
+from virest.app.finish import FinishWishes
+from virest.app.jobs import PictureWishes, prepare_worker
 from virest.app.outputs import Mode, RunFolder, check_run, file_facts, plain
 from virest.camera.profile import CameraProfile, profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
@@ -25,6 +26,7 @@ from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, VirestError
+from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import RestorationSettings
@@ -48,6 +50,8 @@ class ProcessOptions:
     scheduler: str | None = None
     mode: Mode = "new"
     command: str = ""
+    pictures: PictureWishes = PictureWishes()  # noqa: RUF009  (frozen)
+    finish: FinishWishes = FinishWishes()  # noqa: RUF009  (frozen)
     json_lines: bool = False
     """Give each frame's line on standard output, in frame order, as they are done."""
     quiet: bool = False
@@ -107,7 +111,9 @@ def plan_capture(path: str, name: str, options: ProcessOptions) -> Planned:
         planned = Planned(job)
         if check_run(job.run, job.request, options.mode) != "finished" or options.mode != "resume":
             index = probe_movie(job.capture.movie)
-            planned = Planned(job, index, _plan(job, index, options.settings))
+            plan = _plan(job, index, options.settings)
+            job = dataclasses.replace(job, selected=_selected(job.capture, plan.profile, options))
+            planned = Planned(job, index, plan)
     except VirestError as error:
         planned = dataclasses.replace(planned, error=error)
     return dataclasses.replace(planned, seconds=time.perf_counter() - began)
@@ -182,7 +188,7 @@ def _require_capture(path: str) -> None:
     try:
         if place.is_dir():
             return
-        what = "is no folder" if place.exists() else "no such folder"
+        what = "is not a folder" if place.exists() else "no such folder"
     except (OSError, ValueError) as fault:  # a name too long, an address that does not answer
         what = getattr(fault, "strerror", None) or str(fault)
     raise CaptureError(f"{shown(path)}: {what}", hint="pass the folder that holds movie.mp4 and the sensor logs")
@@ -196,11 +202,17 @@ def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> 
     profile, source = resolve_profile(capture, options.config)
     log.info("%s: camera profile from %s", name, source)
     chosen = sorted(range(len(capture.frames))[options.frames])
-    frames = at_true_times(capture.frames, profile, capture.repeats)
-    selected = tuple(_admit(frames[i], keep_start_up=options.settings.keep_start_up) for i in chosen)
+    selected = _selected(capture, profile, options)
     inputs = tuple(_input_files(capture, options.config))
     request = _request(profile, options, chosen, inputs)
     return Job(name, path, run, capture, profile, str(source), selected, request, inputs)
+
+
+def _selected(capture: Capture, profile: CameraProfile, options: ProcessOptions) -> tuple[Frame, ...]:
+    """The frames that were asked for, at the times that a profile gives them."""
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    chosen = sorted(range(len(frames))[options.frames])
+    return tuple(_admit(frames[i], keep_start_up=options.settings.keep_start_up) for i in chosen)
 
 
 def _admit(frame: Frame, *, keep_start_up: bool) -> Frame:
@@ -223,6 +235,9 @@ def _request(
         "profile_sha256": hashlib.sha256(mapping.encode()).hexdigest(),
         "inputs": [file_facts(file) for file in inputs],
     }
+    wishes = {**dataclasses.asdict(options.pictures), **dataclasses.asdict(options.finish)}
+    if options.pictures != PictureWishes() or options.finish != FinishWishes():
+        request["outputs"] = wishes
     return plain(request)
 
 
@@ -246,9 +261,10 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
 
     plan = plan_restoration(job.capture, job.profile, settings, read_decodable)
     for name, estimate in plan.profile.estimates.items():
-        if name not in job.profile.estimates:
-            spread = "" if estimate.std is None else f" ± {estimate.std}"
-            log.info("%s: %s = %s%s (%s)", job.name, name, estimate.value, spread, estimate.source)
+        told = name == "time_offset_s" and any(warning.startswith("time offset") for warning in plan.warnings)
+        if name not in job.profile.estimates and not told:
+            said = with_deviation(name, estimate.value, estimate.std)
+            log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
     for note in plan.notes:
         log.info("%s: %s", job.name, note)
     for warning in plan.warnings:

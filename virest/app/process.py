@@ -6,18 +6,19 @@ import dataclasses
 import json
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from virest.app import console
-from virest.app.account import PARTLY_FAILED, STATUSES, failure_account, run_account, run_totals
+from virest.app.account import PARTLY_FAILED, failure_account, run_account, run_totals
 from virest.app.cluster import is_lost
+from virest.app.finish import Finished, finish_pictures, require_finishable
 from virest.app.jobs import Ahead, Segment, Workers, cut_frames, make_segment, run_segments
+from virest.app.names import shard_of
+from virest.app.outcome import CaptureOutcome, summary
 from virest.app.outputs import (
     RunFolder,
-    capture_name,
     check_run,
     finish_run,
     finished_segments,
@@ -46,24 +47,6 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class CaptureOutcome:
-    """What became of one capture."""
-
-    name: str
-    folder: Path
-    counts: dict[str, int]
-    """Frames by status."""
-    verdict: str
-    seconds: float
-    """Wall-clock time."""
-
-    @property
-    def exit_code(self) -> int:
-        """9 where a frame failed."""
-        return PARTLY_FAILED if self.counts.get("failed") else 0
-
-
-@dataclass(frozen=True, slots=True)
 class _Turn:
     """One of the captures of a call."""
 
@@ -88,12 +71,13 @@ class _Turn:
         return plan_capture(self.path, self.name, options)
 
 
-def process_captures(paths: list[str], options: ProcessOptions) -> int:
+def process_captures(paths: list[str], options: ProcessOptions, shard: tuple[int, int] = (1, 1)) -> int:
     """Process captures one after the other. Returns the exit code: a capture's own, or 9 where some of many failed.
 
-    With several workers the captures are read and planned by them, some ahead of their turn.
+    With several workers the captures are read and planned by them, some ahead of their turn.  shard: only the i-th of N
+    parts of the captures, (i, N); their names are those in the whole batch.
     """
-    names = _require_distinct_names(paths)
+    paths, names = shard_of(paths, shard)
     _require_out(options.out)
     if options.config is not None:
         _require_config(options.config)
@@ -119,22 +103,10 @@ def process_captures(paths: list[str], options: ProcessOptions) -> int:
                 codes.append(console.report_error(error, shown(name)))
     finally:
         workers.kill()
-    if outcomes and not options.json_lines:
-        console.emit(_summary(outcomes))
+    if outcomes and not options.json_lines and not options.quiet:
+        console.emit(summary(outcomes))
     failures = [code for code in codes if code]
     return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
-
-
-def _require_distinct_names(paths: list[str]) -> list[str]:
-    names = [capture_name(path) for path in paths]
-    for name, times in Counter(names).items():
-        if times > 1:
-            both = ", ".join(path for path, n in zip(paths, names, strict=True) if n == name)
-            raise OutputError(
-                f"{times} captures are named {name!r} ({both}) and would share one output folder",
-                hint="process them with different --out, or rename one",
-            )
-    return names
 
 
 def _require_config(config: Path) -> None:
@@ -143,7 +115,7 @@ def _require_config(config: Path) -> None:
     except OSError as error:
         raise SettingsError(f"{config}: {error.strerror}", hint="--config takes a camera profile") from None
     if not found:
-        what = "is no plain file" if config.exists() else "no such file"
+        what = "is not a regular file" if config.exists() else "no such file"
         raise SettingsError(f"{config}: {what}", hint="--config takes a camera profile")
 
 
@@ -163,7 +135,8 @@ def _process(turn: _Turn, options: ProcessOptions, workers: Workers) -> CaptureO
     planned = Planned()
     try:
         require_startable(turn.path, turn.name, options)
-        planned = turn.plan(options)
+        with console.progress_bar(1, f"{shown(turn.name)}: reading and planning", quiet=options.quiet):
+            planned = turn.plan(options)
         seconds = planned.seconds if turn.ahead else time.perf_counter() - began
         say(planned.messages)
         if planned.error is not None:
@@ -190,8 +163,11 @@ def _process_planned(
     if planned.index is None or planned.plan is None or (found == "finished" and options.mode == "resume"):
         with opened_run(run, job.request, "resume"):
             return _repeat_finished(job, options)
+    require_finishable(options.finish, turn.name, run.path, overwrite=options.mode != "new")
     with opened_run(run, job.request, options.mode):
         try:
+            if options.pictures.masks:
+                run.masks.mkdir(exist_ok=True)
             workers.start(job.capture.movie, run.path)
             return _run(job, planned.index, planned.plan, options, workers, began, turn.begin_next)
         except BaseException:
@@ -230,24 +206,40 @@ def _run(
     """Run the segments that are not done yet, then finish the run's folder; tells when all are given out."""
     parts = cut_frames(job.selected, job.capture.keyframes or index.keyframes)
     numbers = [tuple(frame.index for frame in part) for part in parts]
+    restoring = time.perf_counter()
     done = finished_segments(job.run, numbers)
     _clean(job.run, [frame for n in done for frame in n])
     if done:
         log.info("%s: %d of %d segments were done before", job.name, len(done), len(parts))
     todo = (
-        make_segment(part, job.capture, job.name, index, plan, job.run)
+        make_segment(part, job.capture, job.name, index, plan, job.run, options.pictures)
         for part, n in zip(parts, numbers, strict=True)
         if n not in done
     )
-    give = _in_order(job.run, numbers, done) if options.json_lines else None
+    at_once = options.json_lines and not options.finish.any
+    give = _in_order(job.run, numbers, done) if at_once else None
     _work(_then(todo, given_out), workers, give, len(job.selected), sum(map(len, done)), job.name, options.quiet)
     logs = [job.run.segment_log(n[0], n[-1]) for n in numbers]
     totals = run_totals(logs)
-    wall_s = time.perf_counter() - began
-    account = run_account(job, plan, totals, wall_s)
-    finish_run(job.run, logs, account)
+    wall_s, restoring_s = time.perf_counter() - began, time.perf_counter() - restoring
+    finished = Finished()
+    if options.finish.any:
+        finished = finish_pictures(job.run, logs, job.capture.movie, index, options.finish, job.name)
+    account = run_account(job, plan, totals, wall_s, finished)
+    finish_run(job.run, logs, account, finished.changed if options.finish.any else None)
+    if options.json_lines and not at_once:
+        _emit_lines(job.run)
     _warn_about(job.name, account["counts"], len(job.selected))
-    return CaptureOutcome(job.name, job.run.path, account["counts"], account["verdict"], wall_s)
+    return CaptureOutcome(
+        job.name,
+        job.path,
+        job.run.path,
+        account["counts"],
+        account["verdict"],
+        restoring_s,
+        _advice(plan),
+        finished.film,
+    )
 
 
 def _then(todo: Iterator[Segment], given_out: Callable[[], None]) -> Iterator[Segment]:
@@ -305,7 +297,7 @@ def _in_order(
 def _leave_account(turn: _Turn, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float) -> None:
     """Write down why a capture could not be processed, where no run stands in its folder.
 
-    A single path that leads nowhere is a slip of the pen: it leaves nothing.
+    A single mistyped path writes no run.json.
     """
     try:
         if turn.among == 1 and not locate(turn.path).is_dir():
@@ -337,16 +329,29 @@ def _repeat_finished(job: Job, options: ProcessOptions) -> CaptureOutcome:
     log.info("%s: was finished before; nothing to do", job.name)
     account = json.loads(job.run.run_json.read_bytes())
     if options.json_lines:
-        for line in job.run.parameters.read_text("utf-8").splitlines():
-            console.emit(line)
-    return CaptureOutcome(job.name, job.run.path, account["counts"], account["verdict"], 0.0)
+        _emit_lines(job.run)
+    return CaptureOutcome(job.name, job.path, job.run.path, account["counts"], account["verdict"], 0.0)
 
 
-def _summary(outcomes: list[CaptureOutcome]) -> str:
-    header = ["capture", *STATUSES, "frames/s", "verdict", "output"]
-    rows = []
-    for outcome in outcomes:
-        counts = [str(outcome.counts.get(status, 0)) for status in STATUSES]
-        rate = sum(outcome.counts.values()) / outcome.seconds if outcome.seconds else 0.0
-        rows.append([outcome.name, *counts, f"{rate:.1f}" if rate else "-", outcome.verdict, str(outcome.folder)])
-    return console.table(header, rows)
+def _advice(plan: RestorationPlan) -> str:
+    """The command that would make more of a capture whose profile is unknown, or contradicted by the frames."""
+    if plan.contradicted is not None:
+        return "the frames contradict the profile: virest diagnose CAPTURE, then process with --config extended.yaml"
+    unknown = [
+        name
+        for name, known in (
+            ("focal length", plan.profile.intrinsics is not None),
+            ("readout time", plan.profile.readout_known),
+            ("time offset", plan.profile.time_offset_s is not None),
+        )
+        if not known
+    ]
+    if unknown:
+        names = " and ".join(unknown)
+        return f"{names} unknown: virest calibrate CAPTURE --with focal, then process with --config camera.yaml"
+    return ""
+
+
+def _emit_lines(run: RunFolder) -> None:
+    for line in run.parameters.read_text("utf-8").splitlines():
+        console.emit(line)

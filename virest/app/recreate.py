@@ -22,7 +22,7 @@ from virest.motion.trajectory import vector_from_rotation
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import PRESETS, RestorationSettings
-from virest.simulation.effects import EffectContext, hide_effects
+from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.recreation import ScenePicture, known_frames, recreate_session
 from virest.simulation.session import Session, SessionSettings
@@ -70,7 +70,7 @@ def simulate_like(
     scene = find_scene(capture, plan, kept)
     context = EffectContext(len(kept), _fps(kept), np.random.default_rng([seed, 5]))
     true, applied = hide_effects(nominal, list(effects), context)
-    settings = SessionSettings(noise_levels=noise_levels, seed=seed)
+    settings = SessionSettings(noise_levels=noise_levels, seed=seed, isp=hidden_isp(applied))
     session = recreate_session(capture, kept, nominal, true, scene, settings)
     options = RecordingOptions(bits_per_px=_bits_per_px(capture), middle_truth=reference == "frame-middle")
     folder = write_recording(session, out, applied=applied, options=options, overwrite=overwrite, progress=progress)

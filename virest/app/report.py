@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from virest import __version__
+from virest.app.account import STATUSES
 from virest.app.outputs import RunFolder, file_facts, write_whole
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.video import MovieIndex, probe_movie, read_frames
@@ -117,6 +118,7 @@ class _Account(_Lenient):
     command: str = ""
     profile: dict[str, Any] = Field(default_factory=dict)
     profile_source: str = ""
+    crop_px: tuple[int, int, int, int] | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     inputs: list[_Input] = Field(default_factory=list)
     counts: dict[str, _Count]
@@ -245,7 +247,7 @@ def _require_dir(run_dir: Path) -> None:
     except OSError as error:
         raise CaptureError(f"{run_dir}: {error.strerror}", hint="pass OUT/<capture> of a run, or OUT itself") from None
     if not found:
-        what = "is no folder" if run_dir.exists() else "no such folder"
+        what = "is not a folder" if run_dir.exists() else "no such folder"
         raise CaptureError(f"{run_dir}: {what}", hint="pass OUT/<capture> of a run, or OUT itself")
 
 
@@ -299,7 +301,7 @@ def _read_bytes(path: Path, limit: int) -> bytes:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
             raise CaptureError(
-                f"{path}: is no plain file of at most {limit >> 20} MB", hint="was it written by virest?"
+                f"{path}: is not a regular file of at most {limit >> 20} MB", hint="was it written by virest?"
             )
         return path.read_bytes()
     except OSError as error:
@@ -366,14 +368,15 @@ def _numbered(path: Path) -> Iterator[tuple[int, bytes]]:
 
 def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
     account = _read_model(folder / RUN, _Account, "account of a run")
-    by_line, notes = _read_lines(folder, sum(account.counts.values()))
+    by_line, notes = _read_lines(folder, sum(account.counts.get(status, 0) for status in STATUSES))
     frames = list(by_line.values())
     chosen = choose_frames(frames, options.frames or max(1, min(FRAMES_SHOWN, MOST_FRAMES // among)))
     numbers = {facts.frame for facts in chosen}
     tiles = _read_tiles(folder, {n for n, facts in by_line.items() if facts.frame in numbers})
     movie, complaint = (None, "") if account.failure else find_movie(account, folder, options.capture)
     notes += [complaint] if complaint else []
-    shown = [_show(folder, facts, tiles[facts.frame], movie, PICTURE_BYTES // among // len(chosen)) for facts in chosen]
+    bytes_each = PICTURE_BYTES // among // len(chosen) if chosen else 0
+    shown = [_show(folder, facts, tiles[facts.frame], movie, bytes_each, account.crop_px) for facts in chosen]
     return RunRecord(account.model_dump(), frames, shown, tuple(notes))
 
 
@@ -400,15 +403,25 @@ def _frame_facts(line: _Line) -> FrameFacts:
     )
 
 
-def _show(folder: Path, facts: FrameFacts, tiles: Sequence[_Tile], movie: _Movie | None, max_bytes: int) -> ShownFrame:
-    """A frame with its pictures before and after; one that was copied has no after."""
+def _show(
+    folder: Path,
+    facts: FrameFacts,
+    tiles: Sequence[_Tile],
+    movie: _Movie | None,
+    max_bytes: int,
+    crop_px: tuple[int, int, int, int] | None = None,
+) -> ShownFrame:
+    """A frame with its pictures before and after, cut alike; one that was copied has no after."""
+    x0, y0, x1, y1 = crop_px or (0, 0, None, None)
     before = None if movie is None else _recorded(movie, facts.frame)
+    before = None if before is None else before[y0:y1, x0:x1]
     after = None
     if facts.state == "restored" or (facts.state == "copied" and before is None):
         after = read_picture(RunFolder(folder).picture(facts.frame))
     picture = after if after is not None else before
     size = (1, 1) if picture is None else (picture.shape[1], picture.shape[0])
-    columns = [(*tile.centre_px, tile.angle_rad, tile.length_px) for tile in tiles]
+    centres = [(tile.centre_px[0] - x0, tile.centre_px[1] - y0) for tile in tiles]
+    columns = [(*centre, tile.angle_rad, tile.length_px) for centre, tile in zip(centres, tiles, strict=True)]
     return show_frame(facts, before, after, columns, size, max_bytes)
 
 
@@ -431,7 +444,7 @@ def read_picture(path: Path) -> Picture | None:
         log.warning("%s", str(error).strip().splitlines()[-1])
         return None
     if picture is None:
-        log.warning("%s: is no picture", path)
+        log.warning("%s: is not a picture", path)
     return None if picture is None else np.asarray(picture, np.uint8)
 
 
@@ -554,7 +567,8 @@ def _describe(facts: Json) -> str:
     for capture in facts["captures"]:
         parts = []
         if capture["counts"] is not None:
-            counted = ", ".join(f"{count} {state}" for state, count in capture["counts"].items() if count)
+            known = {state: capture["counts"].get(state, 0) for state in STATUSES}
+            counted = ", ".join(f"{count} {state}" for state, count in known.items() if count)
             parts.append(f"{capture['verdict']} ({counted or 'no frames'})")
         if capture["diagnosis"] is not None:
             named = ", ".join(capture["causes"])

@@ -12,8 +12,9 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure
-from virest.simulation.effects import EffectContext, hide_effects
+from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
 from virest.simulation.hidden import NOTHING, Hidden
+from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import Session, SessionSettings, nominal_camera, plan_session
 
@@ -52,6 +53,7 @@ def simulate_command(
     overwrite: bool = False,
     profile: CameraProfile | None = None,
     hidden: Hidden = NOTHING,
+    isp: PhoneIsp = OFF,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Simulate a recording and write it to ``out``; returns a summary for ``--json``.
@@ -66,6 +68,7 @@ def simulate_command(
     hidden: effects that have no name, for tests.
     reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  profile: use this camera as the nominal
     one; width, height, focal_px, distortion, readout_ms, direction and response are then taken from it.
+    isp: the phone's own processing; truth/ shows its global curves, the capture's profile nothing of it.
     """
     if reference not in ("exposure-start", "frame-middle"):
         raise SettingsError(f"reference '{reference}' is not known", hint="use exposure-start or frame-middle")
@@ -80,6 +83,9 @@ def simulate_command(
         distortion=distortion,
         depth_m=np.inf if depth_m is None else depth_m,
     )
+    context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
+    true, applied = hide_effects(nominal, list(effects), context)
+    isp = hidden_isp(applied, isp)
     settings = SessionSettings(
         scene=scene,
         frames=frames,
@@ -94,11 +100,11 @@ def simulate_command(
         gyro_noise_rad_s=gyro_noise_rad_s,
         accel_noise_m_s2=accel_noise_m_s2,
         seed=seed,
+        isp=isp,
     )
-    context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
-    true, applied = hide_effects(nominal, list(effects), context)
-    session = plan_session(nominal, true, settings, hidden=hidden)
-    options = RecordingOptions(layout, clock, bitrate_bits_per_px, crf, middle_truth=reference == "frame-middle")
+    session = plan_session(nominal, isp.true_profile(true), settings, hidden=hidden)
+    bits_per_px = isp.bits_per_px or bitrate_bits_per_px
+    options = RecordingOptions(layout, clock, bits_per_px, crf, middle_truth=reference == "frame-middle")
     folder = write_recording(
         session, Path(out), applied=applied, options=options, overwrite=overwrite, progress=progress
     )  # fmt: skip
@@ -115,6 +121,7 @@ def simulate_command(
         "seed": seed,
         "blur_px": _blur_px(session),
         **_exposed(session),
+        **({"isp": isp.in_force()} if isp.in_force() else {}),
         "effects": [{"name": effect.name, "parameters": effect.parameters} for effect in applied],
     }
 
@@ -144,7 +151,7 @@ def parse_response(text: str) -> ResponseCurve:
     try:
         values = [float(n) for n in numbers.split(",")] if numbers else []
     except ValueError:
-        raise SettingsError(f"response '{text}' is no curve", hint="write gamma:2.2, for instance") from None
+        raise SettingsError(f"response '{text}' is not a curve", hint="write gamma:2.2, for instance") from None
     if kind in ("srgb", "linear") and not values:
         return ResponseCurve(kind)
     if kind == "gamma" and len(values) <= 1:
@@ -152,7 +159,7 @@ def parse_response(text: str) -> ResponseCurve:
     if kind == "five_segment" and len(values) in (0, 5):
         xb, yb, xc, yc, top = values or (0.12, 0.08, 0.62, 0.80, 1.0)
         return ResponseCurve("five_segment", b=(xb, yb), c=(xc, yc), y_max=top)
-    raise SettingsError(f"response '{text}' is no curve", hint="use srgb, linear, gamma:2.2 or five_segment")
+    raise SettingsError(f"response '{text}' is not a curve", hint="use srgb, linear, gamma:2.2 or five_segment")
 
 
 def _blur_px(session: Session) -> float:

@@ -123,7 +123,7 @@ def read_true_path(file: Path) -> CameraPath:
     except ValueError as error:
         raise CaptureError(f"{file}: {error}", hint="time_s,px_m,py_m,pz_m,qw,qx,qy,qz are expected") from error
     if table.shape[1] != 8 or len(table) < 2 or (np.diff(table[:, 0]) <= 0).any():
-        raise CaptureError(f"{file}: is no trajectory", hint="time_s,px_m,py_m,pz_m,qw,qx,qy,qz, times rising")
+        raise CaptureError(f"{file}: is not a trajectory", hint="time_s,px_m,py_m,pz_m,qw,qx,qy,qz, times rising")
     return CameraPath(table[:, 0], table[:, 1:4], table[:, 4:])
 
 

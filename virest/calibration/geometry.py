@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.calibration.held_fixed import OPTIONAL, HeldValue, held_notes, held_values
-from virest.calibration.start_up import StartUpLag, fit_start_up_lag
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -27,6 +26,7 @@ from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely, alig
 from virest.motion.comparable_noise import residual_px, tracking_noise_px
 from virest.motion.displacement import drift_std_m
 from virest.motion.observed_tracks import ObservedTracks, observe_tracks
+from virest.motion.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
 from virest.motion.track_model import TrackTable, ground
@@ -80,6 +80,10 @@ MAX_STD = {
 """Values known no better than this are not determined and stay where they were."""
 
 
+ROUGH_OFFSET_S = 0.01
+"""An offset known to this is written, and said to be rough; what is worse tells less than a phone's usual clocks do."""
+
+
 @dataclass(frozen=True, slots=True)
 class CalibratedValue:
     """One value of the profile, before and after."""
@@ -92,6 +96,8 @@ class CalibratedValue:
     std: float | list[float] | None
     determined: bool
     note: str = ""
+    rough: bool = False
+    """Not determined as well as is wanted, and written all the same, with its deviation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,6 +360,7 @@ def _conclude(
     if not rough.direction_known and not determined["readout_time"]:
         profile = _with_given_readout(profile, given)
     values = tuple(_value(term.name, given, profile, fit.profile, variances, determined) for term in fit.terms)
+    values = tuple(_rough(value, fit) if value.name == "time_offset_s" else value for value in values)
     direction_known = rough.direction_known and determined["readout_time"]
     values = (*values[:2], _direction_value(given, profile, direction_known), *values[2:])
     profile = _with_estimates(profile, values)
@@ -370,6 +377,14 @@ def _is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
     """Known well enough, and not by a single moment alone."""
     known = bool(np.all(np.sqrt(variance) <= MAX_STD[name]))
     return known and bool(np.all(fit.stretches[fit.slices[name]] >= MIN_STRETCHES))
+
+
+def _rough(offset: CalibratedValue, fit: TrackFit) -> CalibratedValue:
+    """An offset that is known roughly, by more than a single moment, says so."""
+    std_s = float(np.max(np.asarray(offset.std, float)))
+    if offset.determined or std_s > ROUGH_OFFSET_S or fit.stretches[fit.slices["time_offset"]][0] < MIN_STRETCHES:
+        return offset
+    return replace(offset, rough=True, note=f"rough: {1e3 * MAX_STD['time_offset']:g} ms are wanted")
 
 
 def right_way_round(profile: CameraProfile) -> CameraProfile:
@@ -515,7 +530,7 @@ def _direction_value(given: CameraProfile, profile: CameraProfile, known: bool) 
 def _with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -> CameraProfile:
     source = "tracked points against the inertial data"
     for value in values:
-        if value.determined and value.value is not None:
+        if (value.determined or value.rough) and value.value is not None:
             profile = profile.with_estimate(value.name, value.value, value.std, source)
     known = profile.readout_known or any(v.name == "readout_time_s" and v.determined for v in values)
     return replace(profile, readout_known=known)

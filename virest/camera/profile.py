@@ -32,6 +32,8 @@ BRIDGE_SLACK_S = 1e-3
 """A bridge may end this far from its stretch, as either is rounded."""
 LARGEST = 1e12
 """No value of a profile is larger: between clocks of different epochs lie 2e9 s.  Far beyond, products overflow."""
+OPENCV_HEAD = re.compile(r"\A\ufeff?%YAML:1\.0[^\n]*")
+"""First line of OpenCV's files, which is no YAML directive."""
 MAX_DIGITS = 250
 """No number of so many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
 NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
@@ -103,6 +105,8 @@ class CameraProfile:
     """Stretches (from, to) of the inertial log, from stamp_0, that do not follow the camera."""
     imu_untrusted_stamp_0_ns: int | None = None
     """First stamp of the only capture that these stretches belong to; None: any."""
+    lens_shape: Intrinsics | None = None
+    """Principal point and distortion where these are known and the focal length is not: its focal length is nominal."""
 
     @property
     def fields(self) -> tuple[ModelField, ...]:
@@ -153,9 +157,15 @@ class CameraProfile:
         return replace(self, estimates={**self.estimates, name: Estimate(value, std, source)}, **changes)
 
     def with_focal(self, focal_px: float, std_px: float, source: str) -> CameraProfile:
-        """The profile with an estimated focal length, square pixels and the principal point in the middle."""
-        lens = Intrinsics(self.width, self.height, focal_px, focal_px, (self.width - 1) / 2, (self.height - 1) / 2)
-        return self.with_estimate("fx_px", focal_px, std_px, source, intrinsics=lens)
+        """The profile with an estimated focal length and square pixels."""
+        return self.with_estimate("fx_px", focal_px, std_px, source, intrinsics=self.lens_of(focal_px))
+
+    def lens_of(self, fx_px: float, fy_px: float | None = None) -> Intrinsics:
+        """A lens of this focal length; principal point and distortion as known, or the middle and none."""
+        fy_px = fx_px if fy_px is None else fy_px
+        if self.lens_shape is not None:
+            return replace(self.lens_shape, fx_px=fx_px, fy_px=fy_px)
+        return Intrinsics(self.width, self.height, fx_px, fy_px, (self.width - 1) / 2, (self.height - 1) / 2)
 
 
 # ── the YAML edge ────────────────────────────────────────────────────────────────────────────────────────────────
@@ -169,7 +179,7 @@ def _number(value: Any) -> Any:
         try:
             value = float(value)
         except ValueError:
-            raise ValueError("is no number") from None
+            raise ValueError("is not a number") from None
     if isinstance(value, int | float) and LARGEST < abs(value) < math.inf:
         raise ValueError("is too large")
     return value
@@ -366,12 +376,12 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
     """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
     try:
         if not path.is_file():
-            what = "is no plain file" if path.exists() else "no such file"
+            what = "is not a regular file" if path.exists() else "no such file"
             raise SettingsError(f"{path}: {what}", hint="pass a YAML file")
         size = path.stat().st_size
         if size > MAX_PROFILE_BYTES:
             raise SettingsError(f"{path.name}: {size} bytes, more than {MAX_PROFILE_BYTES}", hint="is it a profile?")
-        text = path.read_text(encoding="utf-8")
+        text = OPENCV_HEAD.sub("", path.read_text(encoding="utf-8"), count=1)
         _require_plain(text, path.name)
         _require_keys_once(yaml.compose(text, Loader=yaml.SafeLoader), path.name)
         content = yaml.safe_load(text)
@@ -379,18 +389,16 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "cannot be read"
-        raise SettingsError(
-            f"{path.name}:{where} is not plain YAML: {problem}", hint="see the profile in README"
-        ) from None
+        raise SettingsError(f"{path.name}:{where} is not plain YAML: {problem}", hint="see docs/profile.md") from None
     except (UnicodeDecodeError, RecursionError):
         raise SettingsError(f"{path.name}: is not YAML text", hint="is it a profile?") from None
     except (ValueError, LookupError, AttributeError, OverflowError):  # of the library, for dates and tagged values
         text = f"{path.name}: a value is not of the kind that it is written as, such as a date that is none"
-        raise SettingsError(text, hint="write plain numbers and words, see the profile in README") from None
+        raise SettingsError(text, hint="write plain numbers and words, see docs/profile.md") from None
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}", hint="check the path and its permissions") from None
     if not isinstance(content, dict):
-        raise SettingsError(f"{path.name}: no keys at the top level", hint="see the profile in README")
+        raise SettingsError(f"{path.name}: no keys at the top level", hint="see docs/profile.md")
     return content
 
 
@@ -456,7 +464,7 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
     found = first.get("input")
     value = "" if isinstance(found, dict) else ", got null" if found is None else f", got {str(found)[:60]!r}"
     message = _printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
-    return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see the profile in README")
+    return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see docs/profile.md")
 
 
 def _key_path(fault: Any) -> list[str]:
@@ -501,7 +509,8 @@ def _from_model(model: _Profile) -> CameraProfile:
         width=width,
         height=height,
         device=model.device,
-        intrinsics=_intrinsics(model, width, height),
+        intrinsics=(known := _intrinsics(model, width, height)),
+        lens_shape=_lens_shape(model) if known is None else None,
         shutter=Shutter(
             model.shutter.readout_time_s or 0.0,
             model.shutter.readout_direction,
@@ -560,22 +569,32 @@ def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _intrinsics(model: _Profile, width: int, height: int) -> Intrinsics | None:
-    lens, sensor = model.intrinsics, model.sensor
+    sensor, lens = model.sensor, model.intrinsics
     fx, fy = lens.fx_px, lens.fy_px
     if fx is None and fy is None and sensor.focal_length_mm and (sensor.width_mm or sensor.height_mm):
         # eq 17: pixels per millimetre from whichever side is known, square pixels otherwise
         per_mm_x = width / sensor.width_mm if sensor.width_mm else height / sensor.height_mm  # type: ignore[operator]
         per_mm_y = height / sensor.height_mm if sensor.height_mm else per_mm_x
         fx, fy = sensor.focal_length_mm * per_mm_x, sensor.focal_length_mm * per_mm_y
-    if fx is None and fy is None:
-        return None
+    return None if fx is None and fy is None else _lens(model, fx or fy, fy or fx)  # type: ignore[arg-type]
+
+
+def _lens_shape(model: _Profile) -> Intrinsics | None:
+    """Principal point and distortion as stated, of a nominal focal length; None where nothing is."""
+    lens, size = model.intrinsics, float(max(model.image.width, model.image.height))
+    shape = _lens(model, size, size)
+    return shape if lens.cx_px is not None or lens.cy_px is not None or any(shape.coefficients) else None
+
+
+def _lens(model: _Profile, fx_px: float, fy_px: float) -> Intrinsics:
+    lens, width, height = model.intrinsics, model.image.width, model.image.height
     distortion = lens.distortion
     kind = "none" if distortion in (None, "none") else distortion.model  # type: ignore[union-attr]
     return Intrinsics(
         width,
         height,
-        fx or fy,  # type: ignore[arg-type]
-        fy or fx,  # type: ignore[arg-type]
+        fx_px,
+        fy_px,
         (width - 1) / 2 if lens.cx_px is None else lens.cx_px,
         (height - 1) / 2 if lens.cy_px is None else lens.cy_px,
         kind,
@@ -587,9 +606,9 @@ def _response(block: _Response | None, extensions: _Extensions) -> ResponseCurve
     if block is None:
         return None
     if block.kind == "five_segment" and (block.b is None or block.c is None):
-        raise SettingsError("response: five_segment needs b and c", hint="see the profile in README")
+        raise SettingsError("response: five_segment needs b and c", hint="see docs/profile.md")
     if block.kind == "table" and (block.x is None or block.y is None):
-        raise SettingsError("response: table needs x and y", hint="see the profile in README")
+        raise SettingsError("response: table needs x and y", hint="see docs/profile.md")
     return ResponseCurve(
         block.kind,
         block.gamma,
@@ -620,9 +639,10 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
     """The profile as the plain mapping that YAML and JSON take; infinity becomes the text ``inf``."""
     lens, ext = profile.intrinsics, profile.extensions
     distortion: Any = "none"
-    if lens and lens.model != "none":
-        names = COEFFICIENT_NAMES[lens.model]
-        distortion = {"model": lens.model, **dict(zip(names, lens.coefficients, strict=True))}
+    shape = lens or profile.lens_shape
+    if shape and shape.model != "none":
+        names = COEFFICIENT_NAMES[shape.model]
+        distortion = {"model": shape.model, **dict(zip(names, shape.coefficients, strict=True))}
     pose = [[*row, shift] for row, shift in zip(profile.r_cam_imu, profile.p_cam_imu_m, strict=True)]
     depth = profile.depth_m
     extensions: dict[str, Any] = {}
@@ -665,8 +685,8 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         "intrinsics": {
             "fx_px": lens.fx_px if lens else None,
             "fy_px": lens.fy_px if lens else None,
-            "cx_px": lens.cx_px if lens else None,
-            "cy_px": lens.cy_px if lens else None,
+            "cx_px": shape.cx_px if shape else None,
+            "cy_px": shape.cy_px if shape else None,
             "distortion": distortion,
         },
         "shutter": {

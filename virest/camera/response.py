@@ -177,7 +177,7 @@ def _require_curve(curve: ResponseCurve) -> None:
         raise SettingsError(f"response: {what}", hint="the curve must rise and be finite (forward_model, section 4)")
 
     if curve.kind not in KINDS:
-        refuse(f"kind '{curve.kind}' is none of {', '.join(KINDS)}")
+        refuse(f"kind '{curve.kind}' is not one of {', '.join(KINDS)}")
     if curve.kind == "gamma" and not 0.1 <= curve.gamma <= 10.0:
         refuse(f"gamma is {curve.gamma:g}, outside 0.1 to 10")
     if not 0.1 <= curve.extra_gamma <= 10.0:

@@ -33,9 +33,9 @@ class Shutter:
 
     def __post_init__(self) -> None:
         if self.readout_direction not in READOUT_DIRECTIONS:
-            raise SettingsError(f"readout_direction '{self.readout_direction}' is none of {READOUT_DIRECTIONS}")
+            raise SettingsError(f"readout_direction '{self.readout_direction}' is not one of {READOUT_DIRECTIONS}")
         if self.timestamp not in STAMP_FRACTION:
-            raise SettingsError(f"timestamp '{self.timestamp}' is none of {tuple(STAMP_FRACTION)}")
+            raise SettingsError(f"timestamp '{self.timestamp}' is not one of {tuple(STAMP_FRACTION)}")
 
     @property
     def reads_columns(self) -> bool:

@@ -4,6 +4,9 @@ EuRoC / ASL       mav0/ with cam*/data.csv and imu0/data.csv; the sequence, its 
 ARKit app         frames.csv, imu.csv and the movie
 MARSLogger, iOS   movie_metadata.csv with `exposure duration`, or raw_accel_gyro.csv, and the movie
 Gyroflow          a .gcsv beside the movie
+Sensor Logger     Gyroscope.csv with `time, seconds_elapsed`, and a movie below Camera/
+OpenCamera-Sensors  VID_*gyro.csv and VID_*timestamps.csv
+Stray Scanner     camera_matrix.csv, odometry.csv, imu.csv and rgb.mp4
 MARSLogger        movie.mp4, gyro_accel.csv, …
 pictures          pictures with stamps, gyro_accel.csv or imu.csv
 telemetry         nothing but a movie: GoPro, Sony, Insta360 keep the samples inside
@@ -28,10 +31,13 @@ from virest.capture.marslogger_android import (
 )
 from virest.capture.marslogger_folder import read_marslogger
 from virest.capture.marslogger_ios import ARKIT_FRAMES, ARKIT_IMU, RAW_GYRO, read_ios_arkit, read_ios_marslogger
+from virest.capture.opencamera_sensors import is_opencamera_sensors, read_opencamera_sensors
 from virest.capture.picture_folder import IMU_FILES, read_picture_folder
 from virest.capture.pictures import MOVIE_SUFFIXES, find_picture_source
 from virest.capture.records import Note
+from virest.capture.sensor_logger import is_sensor_logger, read_sensor_logger
 from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source, list_names
+from virest.capture.stray_scanner import is_stray_scanner, read_stray_scanner
 from virest.capture.telemetry import read_telemetry
 from virest.capture.video import probe_movie
 from virest.errors import CaptureError
@@ -74,7 +80,8 @@ def partial_readers(folder: Path) -> dict[Path, Callable[[Path], Any]]:
     place = find_euroc(folder)
     if reader is read_euroc and place is not None:
         return {place.pictures: probe_movie, place.imu / LIST: read_imu_rows}
-    if reader in (read_gyroflow, read_telemetry, read_picture_folder, read_ios_marslogger, read_ios_arkit):
+    loggers = (read_sensor_logger, read_opencamera_sensors, read_stray_scanner)
+    if reader in (read_gyroflow, read_telemetry, read_picture_folder, read_ios_marslogger, read_ios_arkit, *loggers):
         movies = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOVIE_SUFFIXES]
         return dict.fromkeys(movies, probe_movie)
     tables = {MOVIE: probe_movie, STAMPS: read_frame_timestamps, METADATA: read_movie_metadata, GYRO: read_gyro_accel}
@@ -91,6 +98,12 @@ def _choose(folder: Path, names: set[str]) -> Reader | None:
     movies = [name for name in names if Path(name).suffix.lower() in MOVIE_SUFFIXES]
     if any(name.lower().endswith(GCSV) for name in names) and GYRO not in names:
         return read_gyroflow
+    if is_sensor_logger(folder, names):
+        return read_sensor_logger
+    if is_opencamera_sensors(names):
+        return read_opencamera_sensors
+    if is_stray_scanner(names):
+        return read_stray_scanner
     if MOVIE not in names and set(IMU_FILES) & names and find_picture_source(folder) is not None:
         return read_picture_folder
     if len(movies) == 1 and not {GYRO, STAMPS, METADATA, EPOCHS} & names:

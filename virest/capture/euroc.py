@@ -65,7 +65,7 @@ class EurocPlace:
 
     @property
     def pictures(self) -> Path:
-        """The list of the camera's pictures, or their folder where there is no list."""
+        """The list of the camera's pictures, or their folder where there is not a list."""
         return self.camera / LIST if is_present(self.camera / LIST) else self.camera / "data"
 
 
@@ -262,7 +262,7 @@ def _number(value: Any, name: str) -> float:
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
-        raise CaptureError(f"{name}: {str(value)[:40]!r} is no number", hint="repair it") from None
+        raise CaptureError(f"{name}: {str(value)[:40]!r} is not a number", hint="repair it") from None
 
 
 def _pose(block: Any, name: str) -> Array | None:

@@ -6,8 +6,8 @@ joined by time, and whatever is left out is counted and explained.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from virest.capture.join import (
 )
 from virest.capture.location import locate
 from virest.capture.profile_source import default_profile, resolve_profile
-from virest.capture.records import NO_STAMP, STARTUP, Capture, CaptureMetadata, Frame, Note
+from virest.capture.records import NO_STAMP, STALL, STARTUP, Capture, CaptureMetadata, Frame, Note
 from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source
 from virest.capture.tables import GyroTable, MetadataTable, StampTable
 from virest.capture.video import read_gray
@@ -96,7 +96,7 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     metadata = _summarise(files, notes)
     time_s = (joined.stamps_ns + shift_ns - zero_ns) / 1e9
     began = _startup(files, joined, time_s, imu, metadata, notes, look_at_pictures)
-    frames = _frames(files, joined, shift_ns, time_s, imu, gaps, metadata, began)
+    frames = _frames(files, joined, shift_ns, time_s, imu, gaps, metadata, began, notes)
     _note_imu(imu, gaps, notes)
     _note_frames(frames, notes)
     return Capture(
@@ -110,6 +110,7 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
         metadata=metadata,
         clock_source=files.epochs.source,
         clock_shift_ns=shift_ns,
+        clock_difference_ns=files.epochs.mean_difference_ns,
         imu_gaps_s=gaps,
         keyframes=files.movie.keyframes,
         bits_per_px=files.movie.bits_per_px,
@@ -118,6 +119,7 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
         stamp_0_ns=zero_ns,
         repeats=began.repeats,
         startup_lag_s=began.lag_s,
+        stalls=began.stalls,
         kind=files.kind,
         metadata_file=files.names.metadata,
         recorded_profile=files.profile,
@@ -136,7 +138,7 @@ def require_folder(path: Path) -> Path:
     except (OSError, RuntimeError, ValueError) as fault:
         reason = getattr(fault, "strerror", None) or str(fault)
         raise CaptureError(f"{path}: {reason}", hint="check the path and its links") from None
-    raise CaptureError(f"{path}: is no folder", hint="pass the folder that holds movie.mp4")
+    raise CaptureError(f"{path}: is not a folder", hint="pass the folder that holds movie.mp4")
 
 
 def _note_movie(files: Source, notes: list[Note]) -> None:
@@ -173,6 +175,12 @@ def _note_alignment(alignment: Alignment, frames: int, rows: int, movie: str, wh
         matched = int((alignment.rows >= 0).sum())
         text = f"{movie} has {frames} frames, {what} {rows} rows: {matched} frames joined by sliding PTS over the rows"
         notes.append(Note("warning" if matched < frames or rows != frames else "info", "stamps-slid", text))
+    if alignment.drift_ns:
+        text = (
+            f"PTS of {movie} and {what} part slowly, by {alignment.drift_ns / 1e6:+.3f} ms over {frames} frames: "
+            f"joined row by row, the times of {what} count"
+        )
+        notes.append(Note("warning", "stamps-drift", text))
     if alignment.rivals:
         text = (
             f"{alignment.rivals} other positions of the movie among the rows of {what} fit as well (even spacing): the "
@@ -192,7 +200,7 @@ def _note_metadata(
             hint="the files are of different sessions; remove the metadata to go on without exposures",
         )
     if lost:
-        text = f"{lost} of {len(joined)} frames have no row in {name}: their exposure is unknown"
+        text = f"{lost} of {len(joined)} frames have no row in {name}"
         notes.append(Note("warning", "metadata-missing", text))
     spare = len(meta_ns) - len(np.unique(joined[joined >= 0]))
     if spare:
@@ -286,18 +294,53 @@ def _startup(
 ) -> start.Startup:
     period = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     repeats: tuple[int, ...] = ()
+    later: tuple[int, ...] = ()
     if look_at_pictures and len(time_s) > 2:
         look = int(np.searchsorted(time_s, time_s[0] + start.LOOK_S))
         focal = metadata.fx_px or GUESSED_FOCAL * max(files.movie.width, files.movie.height)
-        motion = start.expected_motion_px(time_s[:look], imu.time_s, imu.gyro_rad_s, focal, period)
-        if (motion > start.MIN_MOTION_PX).any():
-            stream = read_gray(files.movie_path, files.movie, range(look))
-            pictures = [p if p is None else p[::2, ::2].copy() for _, p in stream]
-            repeats = start.find_repeats(start.picture_differences(pictures), motion)
+        motion = start.expected_motion_px(time_s, imu.time_s, imu.gyro_rad_s, focal, period)
+        if (motion[:look] > start.MIN_MOTION_PX).any():
+            repeats = start.find_repeats(_differences(files, range(look), look), motion[:look])
+        later = _later_repeats(files, look, motion)
     began = start.judge_startup(joined.unix_lag_s, repeats, len(time_s), period)
     if began.frames:
         notes.append(_startup_note(began))
-    return began
+    stalls = start.find_stalls(later, joined.unix_lag_s, max(began.frames, 1), period)
+    if stalls:
+        notes.append(_stall_note(stalls, later))
+    return replace(began, stalls=stalls)
+
+
+def _differences(files: Source, frames: Iterable[int], count: int) -> NDArray[np.float64]:
+    """(count,) difference of each picture to its predecessor, where both are among the frames (rising); else NaN."""
+    pictures: list[NDArray[np.uint8] | None] = [None] * count
+    for number, picture in read_gray(files.movie_path, files.movie, frames):
+        pictures[number] = None if picture is None else picture[::2, ::2].copy()
+    return start.picture_differences(pictures)
+
+
+def _later_repeats(files: Source, look: int, motion_px: NDArray[np.float64]) -> tuple[int, ...]:
+    """Frames beyond the start-up that repeat their predecessor: those that took few bytes are decoded."""
+    size = files.movie.packet_bytes
+    if size is None or len(size) != len(motion_px):
+        return ()
+    wanted = [k for k in start.suspects(size, files.movie.keyframes, look) if motion_px[k] > start.MIN_MOTION_PX]
+    found: tuple[int, ...] = ()
+    for reach in (
+        1,
+        2 * start.REPEATS_APART,
+    ):  # a key frame takes its bytes, repeated or not: others tell where to look
+        around = sorted({n for k in wanted for n in range(max(k - reach, look), k + reach + 1) if n < len(size)})
+        found = start.find_repeats(_differences(files, around, len(size)), motion_px) if around else ()
+        wanted = list(found)
+    return found
+
+
+def _stall_note(stalls: tuple[tuple[int, int], ...], repeats: tuple[int, ...]) -> Note:
+    runs = ", ".join(f"{first}–{last}" for first, last in stalls[:8]) + (" …" if len(stalls) > 8 else "")
+    seen = f"; frames {', '.join(map(str, repeats))} repeat their predecessor" if repeats else ""
+    text = f"the encoder stalled: frames {runs} may show pictures later than their stamps and are left out{seen}"
+    return Note("warning", "encoder-stall", text)
 
 
 def _startup_note(began: start.Startup) -> Note:
@@ -323,16 +366,20 @@ def _frames(
     gaps: tuple[tuple[float, float], ...],
     metadata: CaptureMetadata,
     began: start.Startup,
+    notes: list[Note],
 ) -> tuple[Frame, ...]:
     readout_s = metadata.readout_time_s or 0.0
+    exposures_s = _exposures_s(files, joined, time_s, notes)
     imu_period_s = median_period_s(imu.time_s)
     frames = []
     for i, row in enumerate(joined.metadata_rows.tolist()):
-        exposure_s = _value(files.metadata.exposure_s, row) if files.metadata else None
+        exposure_s = exposures_s[i]
         reasons: list[tuple[str, str]] = []
         if i < began.frames:
             late = f"(at frame 0 by {began.lag_s or 0.0:.2f} s)"
             reasons.append((STARTUP, f"start-up: content later than its stamp {late}"))
+        if any(first <= i <= last for first, last in began.stalls):
+            reasons.append((STALL, "encoder stall: content may be later than its stamp"))
         if not joined.has_stamp[i]:
             reasons.append((NO_STAMP, f"no row in {files.names.stamps if files.stamps else files.names.metadata}"))
         start_s = float(time_s[i])
@@ -352,6 +399,23 @@ def _frames(
             )
         )
     return tuple(frames)
+
+
+def _exposures_s(files: Source, joined: _Joined, time_s: NDArray[np.float64], notes: list[Note]) -> list[float | None]:
+    """Exposure of each frame; one that was not logged lies between its neighbours', which an automatic one follows."""
+    if files.metadata is None:
+        return [None] * len(time_s)
+    rows = joined.metadata_rows
+    logged = np.where(rows >= 0, files.metadata.exposure_s[rows], np.nan)
+    known = np.isfinite(logged)
+    if not known.any():
+        return [None] * len(time_s)
+    missing = np.flatnonzero(~known)
+    if len(missing):
+        shown = ", ".join(map(str, missing[:12])) + (" …" if len(missing) > 12 else "")
+        text = f"{len(missing)} of {len(known)} frames have no exposure time, their neighbours' serve: {shown}"
+        notes.append(Note("warning", "exposure-interpolated", text))
+    return [float(value) for value in np.interp(time_s, time_s[known], logged[known])]
 
 
 def _value(column: NDArray[np.float64], row: int) -> float | None:

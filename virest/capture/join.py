@@ -15,6 +15,8 @@ STAMP_STEP_NS = 1000
 """Stamps are cut to whole microseconds."""
 COARSEST_TICK_NS = 1e6
 """A movie clock coarser than this says nothing about which stamp is meant."""
+MOST_DRIFT = 1e-3
+"""Part by which a movie's nominal frame rate may differ from the sensor's; crystals differ by a twentieth of it."""
 MIN_MATCHED_FRACTION = 0.8
 """Below this share of frames with a stamp, movie and stamps are taken as different recordings."""
 MAX_CANDIDATES = 20_000
@@ -40,6 +42,8 @@ class Alignment:
     """Other offsets that fit as well."""
     worst_ns: float = 0.0
     """Largest difference between PTS and stamp among the joined."""
+    drift_ns: float = 0.0
+    """How far PTS and stamps part slowly from first to last frame, where they do."""
 
 
 def pts_tolerance_ns(tick_ns: float) -> float:
@@ -79,6 +83,9 @@ def align_frames(
         difference = stamps_ns - stamps_ns[0] - pts_ns
         if np.abs(difference).max() <= tolerance_ns:
             return Alignment(np.arange(len(pts_ns)), int(stamps_ns[0]), False, 0, float(np.abs(difference).max()))
+        if _drifts_slowly(difference, pts_ns, tolerance_ns):
+            worst, drift = float(np.abs(difference).max()), float(difference[-1])
+            return Alignment(np.arange(len(pts_ns)), int(stamps_ns[0]), False, 0, worst, drift)
     offsets, scores = _best_offsets(pts_ns, stamps_ns, tolerance_ns)
     if not len(offsets) or scores[0] < max(1, MIN_MATCHED_FRACTION * len(pts_ns)):
         raise _misfit(pts_ns, stamps_ns, tolerance_ns, int(scores[0]) if len(scores) else 0, what)
@@ -91,6 +98,20 @@ def align_frames(
     found = rows >= 0
     worst = float(np.abs(stamps_ns[rows[found]] - pts_ns[found] - offset).max())
     return Alignment(rows, offset, True, len(offsets) - 1, worst)
+
+
+def _drifts_slowly(difference_ns: Int64, pts_ns: Int64, tolerance_ns: float) -> bool:
+    """Whether stamps part from PTS smoothly: no step, and no more than another clock's rate makes of it.
+
+    A recorder that writes its nominal rate into the movie does so; a lost frame is a step of a period.
+    """
+    if len(pts_ns) < 3:
+        return False
+    steps, rate = np.abs(np.diff(difference_ns)), np.abs(difference_ns) / np.maximum(pts_ns, 1)
+    period = float(np.median(np.diff(pts_ns)))
+    settled = pts_ns > 10 * period
+    smooth = bool((steps <= tolerance_ns + MOST_DRIFT * period).all())
+    return smooth and bool((rate[settled] <= MOST_DRIFT + tolerance_ns / np.maximum(pts_ns[settled], 1)).all())
 
 
 def _best_offsets(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float) -> tuple[Int64, Int64]:

@@ -51,14 +51,16 @@ def locate(text: str | os.PathLike[str]) -> Path:
         return Path(rest)
     _file_system(protocol)
     if not rest.strip("/") or {".", ".."} & set(rest.split("/")):
-        raise SettingsError(f"{text}: is no full address", hint=f"write {protocol}://BUCKET/FOLDER, without . and ..")
+        raise SettingsError(
+            f"{text}: is not a full address", hint=f"write {protocol}://BUCKET/FOLDER, without . and .."
+        )
     return cast(Path, RemotePath(protocol, PurePosixPath("/", rest).as_posix().lstrip("/")))
 
 
 def unreachable(path: RemotePath, fault: OSError) -> VideoError:
     """The error of an address that gives no bytes: no damage of the recording, so no frame is to be called failed."""
     text = f"{path}: cannot be reached ({fault.strerror or fault})"
-    return VideoError(text, hint="check the network and the store, then go on with --resume", unreachable=True)
+    return VideoError(text, hint="check the network and the store, then continue with --resume", unreachable=True)
 
 
 def is_unreachable(error: BaseException) -> bool:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from virest.camera.field import Field
-from virest.camera.intrinsics import Intrinsics
 from virest.camera.kalibr import is_kalibr, parse_camchain
 from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, load_yaml_mapping, parse_profile
 from virest.camera.shutter import Shutter
@@ -57,9 +56,7 @@ def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfil
     logged, source = capture.metadata, f"{capture.metadata_file}, median"
     if profile.intrinsics is None and (fx := logged.fx_px or logged.fy_px):
         fy = logged.fy_px or fx
-        centre = (capture.width - 1) / 2, (capture.height - 1) / 2
-        lens = Intrinsics(capture.width, capture.height, fx, fy, *centre)
-        profile = profile.with_estimate("fx_px", fx, None, source, intrinsics=lens)
+        profile = profile.with_estimate("fx_px", fx, None, source, intrinsics=profile.lens_of(fx, fy))
     if not profile.readout_known and logged.readout_time_s is not None:
         shutter = replace(profile.shutter, readout_time_s=logged.readout_time_s)
         profile = profile.with_estimate(

@@ -13,6 +13,7 @@ STARTUP = "start-up"
 NO_IMU = "no-imu"
 IMU_GAP = "imu-gap"
 NO_STAMP = "no-stamp"
+STALL = "stall"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +32,7 @@ class Frame:
     skip_reason: str | None = None
     """Why the frame cannot be processed (start-up content lag, no IMU, IMU gap, no stamp); None: it can."""
     skip_codes: tuple[str, ...] = ()
-    """The same as stable names: ``start-up``, ``no-imu``, ``imu-gap``, ``no-stamp``."""
+    """The same as stable names: ``start-up``, ``no-imu``, ``imu-gap``, ``no-stamp``, ``stall``."""
     focus_dioptres: float | None = None
     """Focus distance as logged, 1/m; None: unknown."""
 
@@ -85,6 +86,8 @@ class Capture:
     """``REALTIME``, ``UNKNOWN`` or ``not logged``."""
     clock_shift_ns: int
     """What was added to the camera's stamps to bring them to the IMU's clock."""
+    clock_difference_ns: int | None = None
+    """IMU clock − the camera's other clock as edge_epochs.txt has it, applied or not; None: no such rows."""
     imu_gaps_s: tuple[tuple[float, float], ...] = ()
     """(start, end) of each hole in the inertial data."""
     keyframes: tuple[int, ...] = ()
@@ -98,6 +101,8 @@ class Capture:
     """Row 0 of frame_timestamps.txt on the IMU's clock: the zero of every time_s."""
     repeats: tuple[int, ...] = ()
     """Frames of the first two seconds that repeat their predecessor although the phone turned."""
+    stalls: tuple[tuple[int, int], ...] = ()
+    """(first, last) frame of each later stall of the encoder, whose pictures may be later than their stamps."""
     startup_lag_s: float | None = None
     """How much later than its stamp frame 0's picture is, at least; None: no lag seen."""
     kind: str = "MARSLogger"

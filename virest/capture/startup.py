@@ -26,6 +26,15 @@ MOTION_WINDOW_S = (-0.05, 0.45)
 """Where the picture's true time may lie from its stamp."""
 STEADY_PERCENTILE = 5.0
 MIN_LAGS = 5
+SUSPECT_SIZE = 0.75
+"""Part of its neighbours' median size below which a coded frame may be a repeat; the repeats of honor_v10 have 0.35 to
+0.65 of it."""
+MOST_SUSPECTS = 24
+"""Frames beyond the start-up that are decoded for it, the smallest first: the cost does not grow with the movie."""
+MOST_STALLED = 0.25
+"""Where more of the frames leave the encoder late than this part, that is how it works and no stall."""
+REPEATS_APART = 6
+"""Repeats that use a lag up come at most this many frames apart, the first one as long after the stall's beginning."""
 SETTLED_FRAMES = 10
 """Repeats come at most six frames apart; so many quiet frames must follow before the start-up counts as over."""
 
@@ -40,6 +49,8 @@ class Startup:
     """Least lag of frame 0 that explains what was seen; None without a lag."""
     repeats: tuple[int, ...] = ()
     """Frames that repeat their predecessor."""
+    stalls: tuple[tuple[int, int], ...] = ()
+    """(first, last) frame of each later run whose pictures may be later than their stamps."""
     unix_lag_s: tuple[float, float] | None = None
     """Time from capture to encoder output at the first frame, and when steady; None: no Unix columns."""
 
@@ -84,6 +95,41 @@ def expected_motion_px(
     return mean * focal_px * period_s
 
 
+def suspects(packet_bytes: NDArray[np.int64], keyframes: tuple[int, ...], first: int) -> list[int]:
+    """Frames from ``first`` on that an encoder spent so little on that they may repeat their predecessor, rising."""
+    if len(packet_bytes) - first < 2 * NEIGHBOURS:
+        return []
+    size = packet_bytes.astype(float)
+    size[list(keyframes)] = np.nan
+    padded = np.pad(size, NEIGHBOURS, constant_values=np.nan)
+    usual = np.nanmedian(np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1), axis=1)
+    part = size / usual
+    part[:first] = np.nan
+    found = np.flatnonzero(part < SUSPECT_SIZE)
+    return sorted(found[np.argsort(part[found], kind="stable")][:MOST_SUSPECTS].tolist())
+
+
+def find_stalls(
+    repeats: tuple[int, ...], unix_lag_s: NDArray[np.float64] | None, first: int, period_s: float
+) -> tuple[tuple[int, int], ...]:
+    """(first, last) of the runs of frames from ``first`` on that may show pictures later than their stamps.
+
+    An encoder that pauses draws what is current when it goes on, and repeats use the lead up: from REPEATS_APART frames
+    before a repeat to the last one.  Unix columns: the time from capture to encoder output rises above its median by
+    more than two periods.
+    """
+    late: set[int] = set()
+    for repeat in repeats:
+        late |= set(range(max(repeat - REPEATS_APART, first), repeat + 1))
+    if unix_lag_s is not None and np.isfinite(unix_lag_s[first:]).sum() >= MIN_LAGS:
+        steady = float(np.nanpercentile(unix_lag_s[first:], 50))
+        above = np.flatnonzero(unix_lag_s[first:] > steady + 2 * period_s)
+        late |= {first + int(k) for k in above} if len(above) < MOST_STALLED * (len(unix_lag_s) - first) else set()
+    numbers = np.array(sorted(late), int)
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(numbers) else []
+    return tuple((int(run[0]), int(run[-1])) for run in runs)
+
+
 def judge_startup(
     unix_lag_s: NDArray[np.float64] | None, repeats: tuple[int, ...], frame_count: int, period_s: float
 ) -> Startup:
@@ -99,7 +145,7 @@ def judge_startup(
     if not frames:
         return Startup(unix_lag_s=shown)
     fallen = first - steady if first is not None and steady is not None and late else 0.0
-    return Startup(frames, max(fallen, len(repeats) * period_s), repeats, shown)
+    return Startup(frames, max(fallen, len(repeats) * period_s), repeats, unix_lag_s=shown)
 
 
 def _unix_witness(lag_s: NDArray[np.float64] | None, period_s: float) -> tuple[float | None, float | None, int]:

@@ -77,7 +77,7 @@ def read_bracket(folder: Path, exposures_csv: Path | None = None) -> tuple[list[
     decoded, and pictures of different sizes.
     """
     if not folder.is_dir():
-        reason = "is no folder" if folder.exists() else "no such folder"
+        reason = "is not a folder" if folder.exists() else "no such folder"
         raise CaptureError(f"{folder}: {reason}", hint="pass a folder of bracketed pictures, or a capture")
     names = sorted(p.name for p in folder.iterdir() if _is_picture(p))
     if not names:

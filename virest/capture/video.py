@@ -91,6 +91,8 @@ class MovieIndex:
     """Of a folder of pictures: their paths, from the folder or from the list's folder; empty for a movie."""
     bits_per_px: float = inf
     """What the encoder spent on a pixel of a frame, in the mean; inf for pictures, which are taken as they are."""
+    packet_bytes: NDArray[np.int64] | None = None
+    """(n,) size of each coded frame; None for pictures."""
 
     def __len__(self) -> int:
         return len(self.pts_ticks)
@@ -289,6 +291,7 @@ def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> 
         int(stream.frames or 0),
         int(len(table) - len(kept)),
         bits_per_px=8.0 * float(kept[:, 3].mean()) / (width * height),
+        packet_bytes=kept[:, 3].copy(),
     )
 
 

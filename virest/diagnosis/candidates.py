@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import Evidence, Model, free_scene
+from virest.motion.recorder_lag import Schedule
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_fit import Term
 from virest.motion.track_model import TrackTable, ground, predict

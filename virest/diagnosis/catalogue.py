@@ -1,13 +1,15 @@
 """The causes that have names: where each shows, what its parameters are, where a profile keeps it.
 
-One line an effect.  Points: geometric_effects; brightness: photometry_effects; blur: local_blur_fit.
+One line an effect.  Points: geometric_effects; brightness: photometry_effects; blur: local_blur_fit; edges:
+edge_overshoot.  A phone's denoiser has no line: at 0.15 to 0.3 bit a pixel the encoder takes more of the noise in flat
+places than a strong denoiser does, and how much depends on the encoder more than on the denoiser.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from virest.diagnosis.findings import BLUR, GEOMETRY, PHOTOMETRY
+from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +20,7 @@ class Cause:
     """The quantity in which it is judged."""
     parameters: tuple[str, ...]
     profile_key: str
-    """Where a profile keeps it."""
+    """Where a profile keeps it; empty: nowhere, for restoring does not undo it."""
 
 
 FALSE_ALARM = 1e-3
@@ -47,6 +49,7 @@ CATALOGUE: dict[str, Cause] = {
     "flicker": Cause(PHOTOMETRY, ("amplitude", "frequency_hz", "phase_rad"), "extensions.flicker"),
     "gain_drift": Cause(PHOTOMETRY, ("gain",), "extensions.gain"),
     "defocus": Cause(BLUR, ("sigma_px",), "extensions.defocus"),
+    "sharpening": Cause(EDGES, ("amount", "radius_px"), ""),
 }
 
 MAX_P = FALSE_ALARM / len(CATALOGUE)

@@ -11,6 +11,8 @@ from virest.camera.profile import CameraProfile
 
 CONSISTENT, EXPLAINED, UNEXPLAINED = "consistent", "explained", "unexplained"
 GEOMETRY, PHOTOMETRY, BLUR = "geometry_rms_px", "photometric_rms", "blur_rms_px"
+EDGES = "edge_profile_rms"
+"""Of the mean profile across edges, as part of the step."""
 JOINED = " + "
 """Between the names of two causes that enter together."""
 
@@ -31,7 +33,7 @@ class HeldOutGain:
     """How well frames that took no part in the fit are predicted, without and with a cause."""
 
     quantity: str
-    """``geometry_rms_px``, ``photometric_rms`` or ``blur_rms_px``."""
+    """``geometry_rms_px``, ``photometric_rms``, ``blur_rms_px`` or ``edge_profile_rms``."""
     before: float
     after: float
     noise: float | None

@@ -19,7 +19,6 @@ from scipy import stats
 
 from virest.calibration.geometry import right_way_round
 from virest.calibration.physical_limits import is_depth
-from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
 from virest.diagnosis.catalogue import FALSE_ALARM, MAX_P
@@ -47,6 +46,7 @@ from virest.diagnosis.trials import (
     t_ratio,
 )
 from virest.motion import profile_terms as terms_of
+from virest.motion.recorder_lag import Schedule
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from virest.calibration.start_up import lag_schedules
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
+from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
@@ -35,6 +35,7 @@ from virest.diagnosis.remaining import points_left, remaining_structure, residua
 from virest.errors import CaptureError
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import observe_tracks
+from virest.motion.recorder_lag import lag_schedules
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_model import predict
@@ -73,6 +74,8 @@ def diagnose_capture(
     say("curve", 0.92)
     story.judge_curve(pictures)
     story.settle_light()
+    say("edges", 0.95)
+    story.judge_edges(gray)
     say("what is left", 0.97)
     return story.told()
 
@@ -119,6 +122,7 @@ class _Story:
     light: PictureVerdict
     blur: PictureVerdict | None = None
     curve: PictureVerdict | None = None
+    edges: PictureVerdict | None = None
     findings: list[Finding] = field(default_factory=list)
     """Of the points, and what blur made of them."""
     notes: list[str] = field(default_factory=list)
@@ -210,11 +214,18 @@ class _Story:
         self.light, profile = settle_light(self.light, self.curve, self.points.start, causes)
         self.curve = replace(self.curve, profile=profile)
 
+    def judge_edges(self, gray: Reader) -> None:
+        """What the phone did to its edges; no blur overshoots, so the paths need not be right."""
+        assert self.curve is not None
+        shown, extended = replace(self.capture, frames=self._all_frames()), self.curve.profile
+        self.edges = judge_sharpening(shown, extended, integrate_gyro(self.capture.imu, extended), gray)
+
     def told(self) -> Diagnosis:
         """The verdict, with everything that led to it."""
         assert self.blur is not None
         assert self.curve is not None
-        looks = (self.light, self.blur, self.curve)
+        assert self.edges is not None
+        looks = (self.light, self.blur, self.curve, self.edges)
         findings = [*self.findings, *(finding for look in looks for finding in look.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         left = remaining_structure(self.geometric, self.light)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.calibration.start_up import Schedule
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
@@ -25,6 +24,7 @@ from virest.motion.coarse_alignment import align_coarsely, align_with_skew
 from virest.motion.integration import integrate_gyro
 from virest.motion.lively_frames import lively_frames
 from virest.motion.observed_tracks import CELLS, ObservedTracks
+from virest.motion.recorder_lag import Schedule
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term
 from virest.motion.track_noise import step_noise_px

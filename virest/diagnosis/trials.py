@@ -19,8 +19,8 @@ from virest.motion.track_model import TrackTable
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 JUDGE_POINTS = 3500
-LAGGING_BLOCK, MOST_LAGGING_BLOCKS = 3, 8
-"""Pairs in a block of those that a start-up moves, at least, and blocks at most."""
+LAGGING_BLOCK = 2
+"""Pairs in a block of those that a start-up moves: neighbours share a frame, and nothing was fitted that more share."""
 
 
 FOLDS = (0, 1)
@@ -185,7 +185,7 @@ def lagging_gain(evidence: Evidence, before: Judged, after: Judged) -> Array:
     moved = np.array([pair.first <= last for pair in evidence.observed.pairs])
     both = min(len(before.pair_loss), len(after.pair_loss), len(moved))
     gain = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
-    parts = np.array_split(gain, max(min(len(gain) // LAGGING_BLOCK, MOST_LAGGING_BLOCKS), 3))
+    parts = np.array_split(gain, max(len(gain) // LAGGING_BLOCK, 1))
     return np.array([part.mean() for part in parts if len(part)])
 
 

@@ -19,6 +19,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.motion.integration import integrate_gyro
+from virest.motion.observed_tracks import guessed_lens
 from virest.motion.point_fit import (
     PointFit,
     PointModel,
@@ -66,8 +67,6 @@ AGREEMENT_SLACK_S = 0.03
 """An offset wrong by this is a matter for calibration, not a sign that pictures and gyroscope are strangers."""
 CLEARLY_BETTER = 30.0
 """Chi-square of one from which on another offset is clearly better; errors of pairs go together, so more than nine."""
-GUESSED_FOCAL = 0.8
-"""Of the longer side: a phone's main camera; where nothing is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +239,7 @@ def _observe(
     shutter = profile.shutter
     readout_s = float(priors(profile)[0][4])
     centre_s = shutter.first_row_start_s(time_s, exposure_s) + 0.5 * (shutter.true_exposure_s(exposure_s) + readout_s)
-    lens = profile.intrinsics or _guessed_lens(profile)
+    lens = profile.intrinsics or guessed_lens(profile)
     turns = picture_turns(lens, kept, centre_s[[pair.first for pair in kept]], centre_s[[pair.second for pair in kept]])
     kept = _thinned(kept)
     return _Observed(kept, time_s, exposure_s, known, lens, profile, turns, integrate_gyro(imu, profile)), ""
@@ -257,13 +256,6 @@ def _thinned(pairs: list[TrackPair]) -> list[TrackPair]:
         )
         for pair in pairs
     ]
-
-
-def _guessed_lens(profile: CameraProfile) -> Intrinsics:
-    focal = GUESSED_FOCAL * max(profile.width, profile.height)
-    return Intrinsics(
-        profile.width, profile.height, focal, focal, 0.5 * (profile.width - 1), 0.5 * (profile.height - 1)
-    )
 
 
 def _scan(observed: _Observed, search_s: float) -> OffsetScan:

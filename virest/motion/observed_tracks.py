@@ -144,10 +144,7 @@ def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: Camera
 
 def guessed_lens(profile: CameraProfile) -> Intrinsics:
     """A phone's main camera, where nothing is known."""
-    focal = GUESSED_FOCAL * max(profile.width, profile.height)
-    return Intrinsics(
-        profile.width, profile.height, focal, focal, 0.5 * (profile.width - 1), 0.5 * (profile.height - 1)
-    )
+    return profile.lens_of(GUESSED_FOCAL * max(profile.width, profile.height))
 
 
 def _selected(pair: TrackPair, use: NDArray[np.bool_]) -> TrackPair:

@@ -198,7 +198,7 @@ def _luma(picture: Picture) -> Array:
 
 
 def canvas(width_in: float, height_in: float) -> Any:
-    """An empty figure."""
+    """An empty figure of this size in inches, without a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -208,7 +208,7 @@ def canvas(width_in: float, height_in: float) -> Any:
 
 
 def as_file(figure: Any, image_format: str) -> bytes:
-    """The figure as a file's bytes."""
+    """The figure as the bytes of a file; image_format: one of FORMATS."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=image_format, dpi=DPI, metadata={} if image_format == "png" else None)
     return buffer.getvalue()

@@ -38,16 +38,18 @@ CAUSE_WORDS = {
     "flicker": "the light pulses",
     "gain_drift": "brightness changes that exposure and ISO do not explain",
     "defocus": "the picture is out of focus",
+    "sharpening": "the phone sharpened its pictures",
 }
 QUANTITY_WORDS = {
     "geometry_rms_px": "points, px",
     "photometric_rms": "brightness, grey levels",
     "blur_rms_px": "blur, px",
+    "edge_profile_rms": "edges, part of the step",
 }
 FIGURE_WORDS = {
     "residuals": "What is left between tracked and predicted points, over row, time, radius and rate",
     "ladder": "What was tried on each rung of the ladder, the best on top",
-    "pictures": "A lively frame beside its simulation",
+    "pictures": "A high-motion frame beside its simulation",
 }
 UNITS = {
     "_rad_s": "rad/s",

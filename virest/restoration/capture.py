@@ -30,7 +30,10 @@ from virest.restoration.neighbours.sights import FrameNeighbours, Sight, with_ne
 from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 
 UNTRUSTED = "the inertial log does not follow the camera"
-FOCAL_UNKNOWN = "focal length unknown and not to be had from the pictures; give fx_px in camera.yaml"
+LAG_TO_THE_END = 0.8
+"""Lags that repeats are still using up this far into the movie may outlast it."""
+ALMOST = 1e-6
+FOCAL_UNKNOWN = "focal length unknown; it could not be estimated from the frames: give fx_px in camera.yaml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,25 +162,31 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     """All frames of a movie, those of the recorder's start-up at the times and exposures of what they show.
 
     frame_lag: slot k shows capture k + lag − repeats so far; exact repeats use the lag up over the first slots.
-    repeats: slots that were seen to repeat; where they are not as many as the lag, they are taken as evenly spread.
+    repeats: slots that were seen to repeat; where they are not as many as the lag, they are taken as evenly spread,
+    unless the movie ends before the lag is used up: then all slots keep what is left of it.
     Frames that only the start-up speaks against may then be used.
     """
     lagging = profile.extensions.frame_lag_frames
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
-    lag = round(profile.extensions.frame_lag_s / period_s) if period_s > 0 else 0
+    periods = profile.extensions.frame_lag_s / period_s if period_s > 0 else 0.0
+    lag, last = round(periods), lagging
     if not lagging or not lag:
         return tuple(frames)
-    seen = np.array([slot for slot in repeats if 0 < slot <= lagging])
-    spread = np.round(np.arange(1, lag + 1) * lagging / lag).astype(int)
-    used = np.sort(seen) if len(seen) == lag else spread
+    used = np.sort(np.array([slot for slot in repeats if 0 < slot <= lagging], int))
+    unfinished = 0 < len(used) < periods and lagging >= LAG_TO_THE_END * len(frames)
+    if unfinished:
+        lag, last = int(periods + ALMOST), len(frames) - 1
+    elif len(used) != lag:
+        used = np.round(np.arange(1, lag + 1) * lagging / lag).astype(int)
+    rest_s = (periods - lag) * period_s if unfinished else 0.0
     shows = np.arange(len(frames)) + lag - np.searchsorted(used, np.arange(len(frames)), side="right")
-    early = [_showing(frame, frames, int(shows[k]), period_s) for k, frame in enumerate(frames[: lagging + 1])]
-    return (*early, *frames[lagging + 1 :])
+    early = [_showing(frame, frames, int(shows[k]), period_s, rest_s) for k, frame in enumerate(frames[: last + 1])]
+    return (*early, *frames[last + 1 :])
 
 
-def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float) -> Frame:
+def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float, later_s: float) -> Frame:
     """A slot's frame with the time and exposure of the capture that it shows; stamp and place stay the slot's."""
     source = frames[min(capture, len(frames) - 1)]
-    time_s = source.time_s + max(capture - len(frames) + 1, 0) * period_s
+    time_s = source.time_s + max(capture - len(frames) + 1, 0) * period_s + later_s
     frame = replace(frame, time_s=time_s, exposure_s=source.exposure_s)
     return replace(frame, skip_reason=None, skip_codes=()) if frame.only_startup else frame

@@ -15,8 +15,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.kernel_spread import kernel_spread
+from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
@@ -85,6 +85,8 @@ class RestoredFrame:
     """motion, depth_m, depth_source, blur, shutter, response, deblur: the log's line."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent: estimate, deblur, shutter."""
+    source_px: NDArray[np.float32] | None = None
+    """(height, width, 2) where in the recorded picture each pixel came from; None: from its own place."""
 
 
 def restore_frame(
@@ -108,6 +110,8 @@ def restore_frame(
     clock = _Clock()
     if refined is not None:
         motion = refined.motion
+        if seen is not None and refined.turn is not None:
+            seen = _exposed_as(motion, seen)
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     parameters = degradation_parameters(motion, trajectory, settings)
@@ -146,8 +150,17 @@ def restore_frame(
     status = "copied" if restored is picture else "restored"
     warnings = (*_limits(motion), *why_not)
     return RestoredFrame(
-        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds
+        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source
     )
+
+
+def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
+    """A motion that its neighbours bear out, over the exposure that another account gives it, about the same middle.
+
+    Neighbours tell where the picture moved, whatever clocks say; the exposure's length they do not see.
+    """
+    start_s = motion.start_s + 0.5 * (motion.exposure_s - seen.exposure_s)
+    return replace(motion, start_s=start_s, exposure_s=seen.exposure_s)
 
 
 def deblurred_luma(

@@ -6,7 +6,7 @@ the pictures show; the camera's travel and the scene's depth are found where the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,6 @@ from virest.degradation.row_motion import FrameTranslation, frame_times_s
 from virest.motion.alignment import (
     AGREEMENT_SLACK_S,
     COARSE_STEP_S,
-    GUESSED_FOCAL,
     OffsetEstimate,
     check_agreement,
     choose_pairs,
@@ -29,28 +28,25 @@ from virest.motion.alignment import (
 )
 from virest.motion.coarse_alignment import align_coarsely
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import observe_tracks
+from virest.motion.observed_tracks import GUESSED_FOCAL, observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
+from virest.restoration.conflict_plan import MAX_FOCAL_SPREAD, MAX_OFFSET_STD_S, explains_points, settle
 from virest.restoration.frame import deblurred_luma
+from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbours.sights import Sight
 from virest.restoration.neighbours.survey import kept_lumas, survey_gain, survey_runs, survey_turns
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import PRESETS, RestorationSettings
 
-GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
-MAX_OFFSET_STD_S = 0.003
-"""An estimated offset known no better than this restores nothing: at a hand's 30 rad/s² the rates, and so the blur
-paths, would be off by 0.1 rad/s."""
-MAX_FOCAL_SPREAD = 0.05
-"""An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
 MIN_COARSE_EXPLAINED = 0.5
 """Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
 OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
 """A stated offset this far from the pictures' is warned of; a bias below three of this may be tracking's own."""
 OTHER_OFFSET = "the pictures put the time offset at"
+UNCHECKED = "agreement of frames and gyroscope could not be tested"
 OTHER_PATHS = "the pictures show blur paths"
 NOT_ESTIMATED = "translation and depth not estimated: rotation only"
 
@@ -65,6 +61,15 @@ def plan_restoration(
 
     read_gray: gives (index, luma) of the frames asked for, in order.  The cost does not grow with the movie.
     """
+    lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
+    if lag is None:
+        return _planned(capture, profile, settings, read_gray)
+    return with_lag(_planned(at_lag(capture, profile, lag), profile, settings, read_gray), lag)
+
+
+def _planned(
+    capture: Capture, profile: CameraProfile, settings: RestorationSettings, read_gray: GrayReader
+) -> RestorationPlan:
     plan = RestorationPlan(
         profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
     )
@@ -88,14 +93,22 @@ def plan_restoration(
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
         plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))
-    alignment = None
+    alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
         plan = _with_clock(plan, profile, alignment)
+    if alignment is None or not explains_points(alignment):
+        settled, followed = settle(plan, profile, capture, tracked)
+        if settled.profile is not plan.profile and runs:
+            alignment = _aligned(settled.profile, profile, capture, all_pairs)
+            settled = _with_clock(settled, profile, alignment)
+        plan = settled
     if plan.copy_reason is None and not _clock_agrees(alignment, plan.profile):
         pairs = _through_resting_lens(tracked, capture, plan.profile)
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
-        if not agreement.agrees:
+        if np.isnan(agreement.motion_px) and not followed:
+            plan = replace(plan, warnings=(*plan.warnings, f"{UNCHECKED} ({agreement.reason})"))
+        if not agreement.agrees and not followed:
             plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
             estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
@@ -417,8 +430,9 @@ def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> 
     if plan.profile.time_offset_s is not None:
         return plan
     if not estimate.determined:
-        warning = f"time offset not determined ({estimate.reason}): 0 taken"
-        return replace(plan, profile=replace(plan.profile, time_offset_s=0.0), warnings=(*plan.warnings, warning))
+        warning = f"time offset not determined ({estimate.reason})"
+        plan = replace(plan, profile=replace(plan.profile, time_offset_s=0.0), warnings=(*plan.warnings, warning))
+        return plan if plan.copy_reason else replace(plan, copy_reason="time offset not determined: virest calibrate")
     offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
     profile = plan.profile.with_estimate(
         "time_offset_s", offset_s, estimate.std_s, "tracked points against the gyroscope", time_offset_s=offset_s

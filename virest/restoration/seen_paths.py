@@ -184,6 +184,8 @@ def _best(evidence: Array) -> float:
 
 def telling(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
     """At most MOST_FRAMES of some frames, evenly over the half of them whose paths are nearest to BEST_PATH_PX."""
+    if not numbers:
+        return ()
     off = np.abs(np.log(np.maximum(path_px, 1e-3) / BEST_PATH_PX))
     near = [n for n, distance in zip(numbers, off, strict=True) if distance <= np.median(off)]
     return tuple(near[:: -(-len(near) // MOST_FRAMES)])

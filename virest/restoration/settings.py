@@ -13,7 +13,7 @@ DEBLUR_METHODS = (
     "hyper-laplacian",
     "hyper-laplacian-global",
 )
-JOINT_METHODS = ("gradient-wiener", "hyper-laplacian", "hyper-laplacian-global")
+JOINT_METHODS = ("gradient-wiener", "hyper-laplacian")
 """Those that restore a frame together with its neighbours."""
 SHUTTER_METHODS = ("none", "perspective", "rowwise")
 REFERENCES = ("exposure-start", "frame-middle")
@@ -53,7 +53,5 @@ PRESETS: dict[str, RestorationSettings] = {
     "balanced": RestorationSettings(
         "balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=1
     ),
-    "best": RestorationSettings(
-        "best", "hyper-laplacian-global", iterations=8, inner_iterations=6, tile_px=104, strength=1.0, neighbours=2
-    ),
+    "best": RestorationSettings("best", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3),
 }

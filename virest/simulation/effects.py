@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
+from virest.simulation.phone_isp import OFF, PhoneIsp
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
 OPPOSITE = dict(zip(DIRECTIONS, ("bottom_to_top", "top_to_bottom", "right_to_left", "left_to_right"), strict=True))
@@ -51,6 +52,8 @@ class Effect:
     """How many of the last parameters may be left out of VALUE; they are drawn."""
     endless: bool = False
     """Whether infinity is a value (scene_depth: rotation only)."""
+    strengths: tuple[str, ...] = ()
+    """Strengths of the phone's own processing that take the values, where no profile keeps them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +92,13 @@ def hide_effects(
         shown = {effect.parameters[0]: values} if listed else dict(zip(effect.parameters, values, strict=True))
         applied.append(AppliedEffect(name, shown))
     return true, tuple(applied)
+
+
+def hidden_isp(applied: Sequence[AppliedEffect], isp: PhoneIsp = OFF) -> PhoneIsp:
+    """The phone's own processing with those effects in it that no profile keeps."""
+    for one in applied:
+        isp = replace(isp, **dict(zip(EFFECTS[one.name].strengths, one.parameters.values(), strict=False)))
+    return isp
 
 
 def _find_effect(name: str) -> Effect:
@@ -296,5 +306,12 @@ EFFECTS: dict[str, Effect] = {
     "gain_drift": Effect(("gain",), lambda p, c: _gain_walk(c, 0.12), _replace_gain, spread=True),
     "defocus": Effect(
         ("sigma_px",), lambda p, c: [_between(c, 1.0, 2.0)], lambda p, v: _extend(p, defocus_sigma_px=v[0])
+    ),
+    "sharpening": Effect(
+        ("amount", "radius_px"),
+        lambda p, c: [_between(c, 0.7, 1.2), _between(c, 1.0, 1.8)],
+        lambda p, v: p,
+        optional=1,
+        strengths=("sharpen", "sharpen_radius_px"),
     ),
 }

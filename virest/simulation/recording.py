@@ -28,6 +28,7 @@ from virest.simulation.session import (
     TICKS_PER_S,
     ImuLog,
     Session,
+    phone_pictures,
     render_picture,
     render_truth,
     sample_imu,
@@ -207,10 +208,11 @@ def _rendered(
 ) -> Iterable[Picture]:
     """Each slot's picture; the truth pictures are written on the way. Repeats are not rendered again."""
     total = len(session.shows)
+    phone = phone_pictures(session)
     picture: Picture | None = None
     for slot in range(total):
         if picture is None or session.shows[slot] != session.shows[slot - 1]:
-            picture = render_picture(session, slot)
+            picture = render_picture(session, slot, phone)
         if options.truth_frames:
             _write_png(truth / "frames" / f"{slot:06d}.png", render_truth(session, slot))
         if options.middle_truth:
@@ -343,7 +345,8 @@ def _write_effects(truth: Path, session: Session, applied: tuple[AppliedEffect, 
     ]
     content = {
         "effects": [{"name": a.name, "parameters": a.parameters} for a in applied],
-        "settings": {k: v for k, v in asdict(session.settings).items() if k != "auto_exposure" or v},
+        "settings": {k: v for k, v in asdict(session.settings).items() if k != "isp" and (k != "auto_exposure" or v)},
+        **({"isp": session.settings.isp.in_force()} if session.settings.isp.in_force() else {}),
         "scene_plane": {
             "depth_m": scene.depth_m if np.isfinite(scene.depth_m) else "inf",
             "normal": list(scene.normal),

@@ -37,9 +37,19 @@ def grey_of_light(light: Image, curve: ResponseCurve) -> Image:
 
 def eight_bit(grey: Image, noise_levels: float, rng: np.random.Generator | None) -> NDArray[np.uint8]:
     """Grey levels 0 to 255 with Gaussian noise of ``noise_levels`` (none without rng), rounded."""
+    return round_levels(noisy_levels(grey, noise_levels, rng))
+
+
+def noisy_levels(grey: Image, noise_levels: float, rng: np.random.Generator | None) -> Image:
+    """Grey levels with Gaussian noise (none without rng), neither clipped nor rounded."""
     levels = 255.0 * grey
     if rng is not None and noise_levels > 0:
         levels = levels + np.float32(noise_levels) * rng.standard_normal(levels.shape, dtype=np.float32)
+    return levels
+
+
+def round_levels(levels: Image) -> NDArray[np.uint8]:
+    """Whole grey levels, 0 to 255."""
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 

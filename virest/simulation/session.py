@@ -23,8 +23,11 @@ from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposu
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
 from virest.simulation.hidden import NOTHING, Hidden, gyro_reading
+from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate
+from virest.simulation.phone_isp import OFF, PhoneIsp
+from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
 from virest.simulation.scenes import Scene, make_scene
-from virest.simulation.sensor import eight_bit, grey_of_light, sensor_light
+from virest.simulation.sensor import eight_bit, grey_of_light, noisy_levels, round_levels, sensor_light
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -72,6 +75,8 @@ class SessionSettings:
     seed: int = 0
     oversampling: float = 2.0
     """Chart pixels per picture pixel."""
+    isp: PhoneIsp = OFF
+    """The phone's own processing; its offset and stabiliser stand in the true profile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +215,11 @@ def plan_session(
     )  # fmt: skip
 
 
-def render_picture(session: Session, slot: int) -> Picture:
-    """Take the picture for a slot of the movie, before the encoder: (h, w, 3) RGB."""
+def render_picture(session: Session, slot: int, phone: PhonePictures | None = None) -> Picture:
+    """Take the picture for a slot of the movie, before the encoder: (h, w, 3) RGB.
+
+    phone: the phone's pipeline, which remembers the pictures before this one; None: the curve and noise alone.
+    """
     capture = int(session.shows[slot])
     light = expose(
         session.scene,
@@ -222,16 +230,26 @@ def render_picture(session: Session, slot: int) -> Picture:
     )
     light = sensor_light(light, session.true, _gain(session, slot), defocus=True)
     rng = np.random.default_rng([session.settings.seed, 3, capture])
-    return eight_bit(grey_of_light(light, _curve(session)), session.settings.noise_levels, rng)
+    levels = noisy_levels(_grey(session, light), session.settings.noise_levels, rng)
+    return round_levels(levels if phone is None else 255.0 * phone.develop(levels / 255.0))
 
 
 def render_truth(session: Session, slot: int, *, middle: bool = False) -> Picture:
-    """Take what a global shutter without blur, defocus, flicker, noise sees at the slot's reference time: (h, w, 3)."""
+    """Take what a global shutter without blur, defocus, flicker, noise sees at the slot's reference time: (h, w, 3).
+
+    Of the phone's processing it has what acts on every pixel alike, the highlights and the global tone curve.
+    """
     capture = int(session.shows[slot])
     time_s = session.middle_s(capture) if middle else session.first_row_start_s(capture)
     light = instant(session.scene, session.motion, session.view, time_s)
     light = sensor_light(light, session.true, _gain(session, slot), defocus=False)
-    return eight_bit(grey_of_light(light, _curve(session)), 0.0, None)
+    return eight_bit(tone_curve(_grey(session, light), session.settings.isp.tone), 0.0, None)
+
+
+def phone_pictures(session: Session) -> PhonePictures | None:
+    """A new pipeline of the session's phone; None where it does nothing between the noise and the encoder."""
+    settings = session.settings
+    return PhonePictures(settings.isp, settings.noise_levels / 255) if settings.isp.develops else None
 
 
 def sample_imu(session: Session) -> ImuLog:
@@ -244,12 +262,14 @@ def sample_imu(session: Session) -> ImuLog:
     time_s: Array = time_ns.astype(float) * 1e-9
     rng = np.random.default_rng([settings.seed, 4])
     imu_from_cam = np.array(true.r_cam_imu).T
-    rate = session.motion.rate_rad_s(time_s) @ imu_from_cam.T
+    rate = _gyro_rate(session, time_s) @ imu_from_cam.T
     force = session.motion.specific_force_m_s2(time_s, np.array(true.p_cam_imu_m), GRAVITY_WORLD_M_S2) @ imu_from_cam.T
-    gyro = gyro_reading(true, time_s, rate, force) + settings.gyro_noise_rad_s * rng.normal(size=rate.shape)
+    gyro = gyro_reading(true, time_s, rate, force) + _gyro_noise(settings, rate.shape, rng)
     if session.hidden.gyro is not None:
         gyro = session.hidden.gyro(time_s, gyro, force)
     force = force + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
+    if settings.isp.gyro_jitter_s:
+        time_ns = jittered_ns(time_ns, settings.isp.gyro_jitter_s, np.random.default_rng([settings.seed, 7]))
     return ImuLog(int(session.stamp_ns[0]) + time_ns, gyro, force)
 
 
@@ -378,6 +398,25 @@ def _gain(session: Session, slot: int) -> float:
     capture = int(session.shows[slot])
     first = int(np.argmax(session.shows == capture))
     return float(session.exposures.light[capture]) * (gain[first] if first < len(gain) else 1.0)
+
+
+def _gyro_rate(session: Session, time_s: Array) -> Array:
+    """Rates (n, 3) as the gyroscope passes them on, camera axes."""
+    corner_hz = session.settings.isp.gyro_lowpass_hz
+    rate = session.motion.rate_rad_s
+    return low_passed_rate(rate, time_s, corner_hz) if corner_hz else rate(time_s)
+
+
+def _gyro_noise(settings: SessionSettings, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+    isp = settings.isp
+    if isp.gyro_noise:
+        return gyro_noise(isp.gyro_noise, settings.imu_rate_hz, isp.gyro_lowpass_hz, shape, rng)
+    return settings.gyro_noise_rad_s * rng.normal(size=shape)
+
+
+def _grey(session: Session, light: Array) -> Array:
+    """Grey in [0, 1] behind the sensor's curve, highlights rolled off before it."""
+    return grey_of_light(roll_off_highlights(light, session.settings.isp.highlights), _curve(session))
 
 
 def _curve(session: Session) -> ResponseCurve:

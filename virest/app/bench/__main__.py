@@ -1,6 +1,7 @@
 """Print the tables and write bench-out/bench.json, or compare two of those.
 
 $ python -m virest.app.bench --only quality --quick
+$ python -m virest.app.bench --only honesty --quick --preset balanced --keep captures
 $ python -m virest.app.bench --compare OLD.json NEW.json
 """
 
@@ -27,6 +28,7 @@ from virest.app.bench.cost import cost_section
 from virest.app.bench.curves import curves_section
 from virest.app.bench.diagnosis import diagnosis_section
 from virest.app.bench.growth import growth_section
+from virest.app.bench.honesty import honesty_section
 from virest.app.bench.memory import memory_section
 from virest.app.bench.quality import quality_section
 from virest.app.bench.real import real_section
@@ -34,12 +36,13 @@ from virest.app.bench.shutter import shutter_section
 from virest.app.bench.soak import soak_section
 from virest.app.bench.speed import speed_section
 from virest.app.bench.summary import summary_text
-from virest.app.bench.workload import Scale
+from virest.app.bench.workload import PRESETS, Scale
 from virest.app.console import emit
 
 Section = Callable[[Path, Scale], tuple[dict[str, Any], str]]
 SECTIONS: dict[str, Section] = {
     "quality": quality_section,
+    "honesty": honesty_section,
     "shutter": shutter_section,
     "speed": speed_section,
     "growth": growth_section,
@@ -63,10 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         old, new = map(read_report, options.compare)
         emit(compare_text(old, new, options.noise))
         return
-    scale = Scale(quick=options.quick, full=options.full, seeds=options.seeds)
+    presets = tuple(options.preset or PRESETS)
+    scale = Scale(quick=options.quick, full=options.full, presets=presets, seeds=options.seeds)
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
-    work = Path(tempfile.mkdtemp(prefix="work-", dir=options.out))
+    work = options.keep or Path(tempfile.mkdtemp(prefix="work-", dir=options.out))
     try:
         for name in options.only or SECTIONS:
             report[name], text = SECTIONS[name](work, scale)
@@ -74,7 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _write(options.out / "bench.json", report)
         emit(summary_text(report))
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        if work != options.keep:
+            shutil.rmtree(work, ignore_errors=True)
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -83,6 +88,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="a few frames: a look, no measurement")
     size.add_argument("--full", action="store_true", help="memory up to 3000 frames")
+    parser.add_argument("--preset", action="append", choices=PRESETS, help="of honesty; may be repeated [all]")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and runs here, use captures again")
     parser.add_argument("--seeds", type=int, default=100, help="captures of --only calibration [100]")
     parser.add_argument("--out", type=Path, default=Path("bench-out"), help="folder of bench.json [bench-out]")
     parser.add_argument("--compare", nargs=2, type=Path, metavar=("OLD", "NEW"), help="measure nothing, compare these")

@@ -19,6 +19,7 @@ NAMES = (
     "preset",
     "capture",
     "kind",
+    "set",
     "camera",
     "scene",
     "told",
@@ -42,7 +43,8 @@ MORE_IS_BETTER = ("frames_per_s", "_db", "share_of_floor", "share_of_floor_by_cp
                   "right", "good_done", "cores_that_fill_the_link")  # fmt: skip
 LESS_IS_BETTER = ("_s", "_mb", "s_per_frame", "cpu_s_per_frame", "part_of_asked", "cpu_part_of_asked", "exponent",
                   "wall_exponent", "estimate_share", "estimate_share_with_planning", "grown", "dollars",
-                  "core_hours", "straightened_median_px", "straightened_p90_px")  # fmt: skip
+                  "core_hours", "straightened_median_px", "straightened_p90_px", "promise_off", "worse_share",
+                  "promised_and_worse")  # fmt: skip
 """The last part of a figure's path that says anything; with an underscore in front, its end."""
 NO_FIGURES = ("load", "others_cores", "busiest_others_cores", "asked_s", "exit_code")
 """Of the machine or of the question, told elsewhere."""

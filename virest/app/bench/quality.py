@@ -29,6 +29,7 @@ KIND_TITLES = {
     "fine": "the same at 1 bit/px",
     "long": "long blur, strong noise: 15-45 px",
     "bright": "bright clipped areas: 5-20 px",
+    "phone": "as phones film, nominal profile",
 }
 
 

@@ -14,6 +14,8 @@ from virest.app.bench.tables import table
 Report = dict[str, Any]
 NOT_RUN = "not run"
 LEAST_FLOOR_SHARE, LEAST_SCALING, MOST_ESTIMATION = 0.6, 1.8, 0.05
+LEAST_PHONE_GAIN_DB = {"fast": 1.2, "balanced": 1.6, "best": 1.8}
+MOST_PROMISE_OFF_DB = 0.5
 LEAST_RATE = {"balanced": 8.0, "best": 0.3}
 MOST_WORKER_MB, MOST_GROWTH = 400.0, 1.05
 MOST_EXPONENT = 1.1
@@ -176,9 +178,28 @@ def _command_row(row: Report) -> Row:
     return Row(row["title"], asked, measured, met)
 
 
+def _honesty_rows(honesty: Report) -> list[Row]:
+    """Of each set as a whole; the gain asked for is that of the phones."""
+    rows: list[Row] = []
+    for entry in honesty["summary"]:
+        if entry["capture"] is not None:
+            continue
+        title, least = f"{entry['set']}, {entry['preset']}", LEAST_PHONE_GAIN_DB[entry["preset"]]
+        gain, worse, off = (entry[key] for key in ("mean_gain_db", "worse_share", "promise_off"))
+        asked, met = (f">= {least:g} dB", YES if gain >= least else NO) if entry["set"] == "phone" else (OPEN, OPEN)
+        rows.append(Row(f"{title}: mean gain", asked, f"{gain:+.2f} dB", met))
+        rows.append(Row(f"{title}: frames made worse", "none", f"{percent(worse)}, worst {entry['worst_db']:+.2f} dB",
+                        NO if worse else YES))  # fmt: skip
+        if off is not None:
+            met = YES if off <= MOST_PROMISE_OFF_DB else NO
+            rows.append(Row(f"{title}: |promise - gain|", f"<= {MOST_PROMISE_OFF_DB:g} dB", f"{off:.2f} dB", met))
+    return rows
+
+
 SECTIONS: dict[str, tuple[Callable[[Report], list[Row]], str]] = {
     "speed": (_speed_rows, "speed, floor, scaling, estimation, peers"),
     "growth": (_growth_rows, "growth with frames, pixels, tiles"),
     "memory": (_memory_rows, "memory"),
     "commands": (_command_rows, "help, inspect, calibrate, diagnose"),
+    "honesty": (_honesty_rows, "gain, frames made worse, promises"),
 }

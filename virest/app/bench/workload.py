@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from virest.app.simulate import simulate_command
 from virest.capture.video import probe_movie, read_frames
+from virest.simulation.phone_isp import PhoneIsp
 from virest.simulation.recording import RecordingOptions, write_movie
 
 Picture = NDArray[np.uint8]
@@ -38,6 +40,8 @@ class Scale:
 
     quick: bool = False
     full: bool = False
+    presets: tuple[str, ...] = PRESETS
+    """Those that ``honesty`` measures."""
     seeds: int = 100
     """Captures that calibrations are compared with truth on."""
 
@@ -53,10 +57,16 @@ class Workload:
 
     name: str
     kind: str
-    """``ordinary``, ``photographs``, ``fine``, ``long`` or ``bright``."""
+    """``ordinary``, ``photographs``, ``fine``, ``long``, ``bright``, ``phone`` or ``defocused``."""
     blur_range_px: tuple[float, float]
     """Frames whose blur at the centre lies in here count in the means; all count in the minimum."""
     options: dict[str, Any] = field(default_factory=dict)
+    true_profile: bool = False
+    """Processed with truth/camera.yaml: nothing about the camera is wrong."""
+
+    def arguments(self, capture: Path) -> tuple[str, ...]:
+        """What ``virest process`` is told beside the preset."""
+        return ("--config", str(capture / "truth" / "camera.yaml")) if self.true_profile else ()
 
 
 def _workload(
@@ -92,11 +102,71 @@ WORKLOADS = (
 QUICK = ("leaves", "photographs", "long", "bright")
 
 
+def _phone(
+    name: str, scene: str, exposure_ms: float, rate: float, noise: float, blur_range_px: tuple[float, float], **isp: Any
+) -> Workload:
+    """640x480 at a phone's bit rate; the strengths are set here, so that ``--isp phone`` may change."""
+    plain = _workload(f"phone-{name}", "phone", blur_range_px, scene, exposure_ms, rate, noise)
+    own = {"readout_ms": PHONE_READOUT_MS, "isp": PhoneIsp(**{**PHONE, **isp})}
+    return dataclasses.replace(plain, options={**plain.options, **own})
+
+
+PHONE_READOUT_MS = 12.0
+"""Where the stabiliser is wrong the rows are straightened wrong: with 20 ms that, not the blur, decides the PSNR."""
+PHONE: dict[str, Any] = {
+    "tone": 0.4,
+    "highlights": 0.25,
+    "local_tone": 0.1,
+    "denoise": 1.5,
+    "temporal_denoise": 0.4,
+    "sharpen": 0.5,
+    "sharpen_radius_px": 1.0,
+    "bits_per_px": 0.3,
+    "gyro_noise": 0.001,
+    "gyro_jitter_s": 0.0002,
+    "gyro_lowpass_hz": 60.0,
+}
+"""What the phones have in common: 0.01 rad/s of gyroscope noise at 200 samples/s, before its low pass of 60 Hz."""
+PHONES = (
+    _phone("calm", "text", 12.0, 0.6, 1.5, (1.0, 10.0), offset_s=0.002),
+    _phone("fast", "photographs", 16.0, 1.6, 2.0, ORDINARY_PX, offset_s=-0.002),
+    _phone("stabilised", "leaves", 20.0, 0.9, 1.5, ORDINARY_PX, stabiliser_rest=0.2),
+    _phone("dim", "text", 30.0, 0.9, 5.0, ORDINARY_PX, offset_s=0.002, denoise=2.0, temporal_denoise=0.6,
+           bits_per_px=0.15),
+)  # fmt: skip
+
+
 def quality_workloads(scale: Scale) -> list[Workload]:
     """Choose the captures of the quality table; with --quick a few small ones of four frames."""
     if not scale.quick:
-        return list(WORKLOADS)
-    return [Workload(w.name, w.kind, w.blur_range_px, {**w.options, "frames": 4}) for w in WORKLOADS if w.name in QUICK]
+        return [*WORKLOADS, *PHONES]
+    return [_shortened(w, 4) for w in (*WORKLOADS, *PHONES) if w.name in QUICK or w in PHONES]
+
+
+def _defocused(name: str, scene: str, exposure_ms: float, rate: float, sigma_px: float) -> Workload:
+    plain = _workload(name, "defocused", (0.0, 20.0), scene, exposure_ms, rate, 1.5)
+    return dataclasses.replace(
+        plain, options={**plain.options, "effects": [f"defocus={sigma_px:g}"]}, true_profile=True
+    )
+
+
+DEFOCUSED = (
+    _defocused("defocused-calm", "leaves", 4.0, 0.6, 1.8),
+    _defocused("defocused-fast", "photographs", 12.0, 1.4, 1.8),
+    _defocused("defocused-more", "text", 8.0, 1.0, 2.8),
+)
+"""Each with its true profile: a right model that must not ruin the frames."""
+HONEST_QUICK = ("leaves", "phone-fast", "phone-stabilised", "defocused-calm")
+
+
+def honesty_workloads(scale: Scale) -> list[Workload]:
+    """Choose the captures of the honesty table: obedient, defocused, phones; with --quick four of six frames."""
+    every = [*(w for w in WORKLOADS if not w.name.endswith("-p")), *DEFOCUSED, *PHONES]
+    return [_shortened(w, 6) for w in every if w.name in HONEST_QUICK] if scale.quick else every
+
+
+def _shortened(workload: Workload, frames: int) -> Workload:
+    return dataclasses.replace(workload, options={**workload.options, "frames": frames})
 
 
 def simulated(work: Path, name: str, **options: Any) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import signal
 import sys
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import typer
@@ -14,11 +15,15 @@ from virest.app.cli.calibrate import calibrate
 from virest.app.cli.calibrate_curve import calibrate_curve
 from virest.app.cli.criticise import criticise
 from virest.app.cli.diagnose import diagnose
+from virest.app.cli.doctor import doctor
 from virest.app.cli.evaluate import evaluate
 from virest.app.cli.export import export
+from virest.app.cli.import_bag import import_bag
 from virest.app.cli.inspect import inspect
-from virest.app.cli.options import Version
+from virest.app.cli.options import GroupedCommand, Version
+from virest.app.cli.preview import preview
 from virest.app.cli.process import process
+from virest.app.cli.profile import profile
 from virest.app.cli.report import report
 from virest.app.cli.simulate import simulate
 from virest.errors import OutputError
@@ -35,11 +40,11 @@ _SYSTEM_HINTS = {
 }
 
 app = typer.Typer(
-    add_completion=False,
+    add_completion=True,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     help="Deblur and straighten phone captures with the phone's own gyroscope.",
 )
 _ClickException: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
@@ -54,19 +59,49 @@ def _virest(version: Version = False) -> None:
     pass
 
 
-for command in (process, inspect, simulate, calibrate, diagnose, criticise, report, export):
-    app.command()(command)
-app.command("calibrate-curve")(calibrate_curve)
-app.add_typer(evaluate, name="evaluate")
+COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
+    "process": (process, "Deblur and straighten captures: the main job."),
+    "preview": (preview, "One frame before and after, in seconds."),
+    "inspect": (inspect, "What is in a capture, and what is wrong with it."),
+    "calibrate": (calibrate, "Fit clock, readout, axes and bias to a capture."),
+    "calibrate-curve": (calibrate_curve, "Fit the exposure curve."),
+    "diagnose": (diagnose, "What the camera model gets wrong, and why."),
+    "criticise": (criticise, "What the residuals of any calibration depend on."),
+    "simulate": (simulate, "Write a capture with known truth."),
+    "import": (import_bag, "A ROS bag or MCAP file becomes a capture."),
+    "export": (export, "Frames and IMU for SLAM, COLMAP, nerfstudio, Gyroflow."),
+    "report": (report, "A run as one HTML page."),
+    "doctor": (doctor, "Check the installation."),
+}
+"""Each command with the line that ``virest --help`` shows."""
+for name, (command, line) in COMMANDS.items():
+    app.command(name, short_help=line, cls=GroupedCommand)(command)
+app.add_typer(evaluate, name="evaluate", short_help="Measure quality against truth and other methods.")
+app.add_typer(profile, name="profile", short_help="Start a camera profile; known phones.")
 
 
 def _terminate(number: int, _frame: Any) -> NoReturn:
     raise _Terminated(number)
 
 
+def program() -> Any:
+    """The commands as the parser has them; arguments are shown by name, without their Python type."""
+    command = typer.main.get_command(app)
+    _hide_types(command)
+    return command
+
+
+def _hide_types(command: Any) -> None:
+    for parameter in command.params:
+        if parameter.param_type_name == "argument":
+            parameter.display_type_rich = lambda ctx: None
+    for inner in getattr(command, "commands", {}).values():
+        _hide_types(inner)
+
+
 def run(arguments: list[str] | None = None) -> int:
     """Run one command and turn whatever happens into an exit code."""
-    command = typer.main.get_command(app)
+    command = program()
     try:
         with command.make_context("virest", list(sys.argv[1:] if arguments is None else arguments)) as context:
             code = command.invoke(context)
@@ -77,10 +112,10 @@ def run(arguments: list[str] | None = None) -> int:
         _report_usage(error)
         return USAGE
     except _Terminated:
-        console.CONSOLE.line("terminated; what is done stays, --resume goes on from there")
+        console.CONSOLE.line("terminated; finished work is kept, --resume continues from there")
         return TERMINATED
     except (KeyboardInterrupt, typer.Abort):
-        console.CONSOLE.line("interrupted; what is done stays, --resume goes on from there")
+        console.CONSOLE.line("interrupted; finished work is kept, --resume continues from there")
         return INTERRUPTED
     except BrokenPipeError:
         console.silence_stdout()
@@ -107,8 +142,9 @@ def _report_usage(error: Any) -> None:
 
 def main() -> NoReturn:
     """The console script."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _terminate)
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):  # Windows has no SIGHUP
+            signal.signal(getattr(signal, name), _terminate)
     code = run()
     try:
         if sys.stdout is not None:

@@ -70,7 +70,7 @@ def calibrate(
     plan = plan_calibration(Path(paths[0]), config, names)
     with side_by_side(cores()) as each, console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
         facts, text = run_calibration(plan, output, bar.update if bar else None, each)
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 
 

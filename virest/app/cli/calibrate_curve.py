@@ -26,6 +26,7 @@ def calibrate_curve(
         "curve.yaml"
     ),
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Curve, data, residuals: png, svg or pdf.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -46,6 +47,8 @@ def calibrate_curve(
 
     if plot is not None and not plot_format_known(plot):
         raise typer.BadParameter(f"--plot {plot.name}: the name must end in .png, .svg or .pdf")
-    facts, text = fit_and_write(source, exposures=exposures, kind=kind or "auto", out=out, plot=plot)
-    emit_facts(facts, text, as_json=json)
+    facts, text = fit_and_write(
+        source, exposures=exposures, kind=kind or "auto", out=out, plot=plot, overwrite=overwrite
+    )
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0

@@ -33,7 +33,7 @@ def diagnose(
     readout_time  readout_time_s  0.022  0.01493  5.607e-05   1.339  0.1836  100%  geometry_rms_px  -
     readout_time: the rows are read within 0.01493 s
     restored: sharpness 7.018 recorded, 7.575 as given, 7.72 extended; neighbours disagree by 1.657 -> 0.1961 px
-    unexplained: nothing of size; 0.02081 px along time
+    unexplained: no significant residual; 0.02081 px along time
     wrote virest-out/shaken/diagnosis.json, extended.yaml and figures
     verdict: explained
     $ virest process shaken --config virest-out/shaken/extended.yaml --out better
@@ -44,6 +44,6 @@ def diagnose(
     from virest.app.side_by_side import side_by_side
 
     with side_by_side(cores()) as each, console.progress_bar(100, "diagnose", quiet=quiet) as bar:
-        outcome = run_diagnosis(capture, DiagnosisOptions(out, config, overwrite), on_bar(bar), each)
-    emit_facts(outcome.facts, outcome.text, as_json=json)
+        outcome = run_diagnosis(console.folder_of(capture), DiagnosisOptions(out, config, overwrite), on_bar(bar), each)
+    emit_facts(outcome.facts, outcome.text, as_json=json, quiet=quiet)
     return outcome.check_code if check else 0

@@ -80,7 +80,7 @@ def shutter(
     options = ShutterOptions(tuple(paths), config, chosen, board, out, quick)
     with console.progress_bar(100, "evaluate shutter", quiet=quiet) as bar:
         facts, text = run_shutter(options, on_bar(bar))
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 
 
@@ -117,7 +117,7 @@ def deblur(
     if captures and not paths:
         return 0
     if (restored is None) != (reference is None):
-        raise typer.BadParameter("--restored and --reference go together")
+        raise typer.BadParameter("--restored and --reference belong together")
     if restored is not None and paths:
         raise typer.BadParameter("give captures, or --restored and --reference, not both")
     _require_captures(paths, {"--config": config, "--frames": frames})
@@ -128,7 +128,7 @@ def deblur(
     options = DeblurOptions(tuple(paths), config, chosen, restored, reference, out, quick)
     with console.progress_bar(100, "evaluate deblur", quiet=quiet) as bar:
         facts, text = run_deblur(options, on_bar(bar))
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 
 

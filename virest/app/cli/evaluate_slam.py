@@ -64,5 +64,5 @@ def slam(
     options = SlamOptions(command, seeds, devices, quick, out, preset, timeout_s)
     with console.progress_bar(100, "evaluate slam", quiet=quiet) as bar:
         facts, text, code = run_slam(paths, options, on_bar(bar))
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return code

@@ -10,20 +10,20 @@ import typer
 from virest.app import console
 from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, one_of, parse_frames
 
-FORMATS, STAMPS = ("euroc", "tum"), ("logged", "instant")
+FORMATS, STAMPS = ("euroc", "tum", "nerfstudio", "colmap", "gyroflow"), ("logged", "instant")
 
 
 def export(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its name from stdin.")],
     format: Annotated[
-        str, typer.Option("--format", metavar="NAME", callback=one_of(FORMATS), help="euroc or tum.")
+        str, typer.Option("--format", metavar="NAME", callback=one_of(FORMATS), help=f"{', '.join(FORMATS)}.")
     ] = "euroc",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The export goes into DIR/<capture>.")] = Path(
         "virest-export"
     ),
     restored: Annotated[
         Path | None,
-        typer.Option("--restored", metavar="RUN_DIR", help="Pictures of this finished run of virest process."),
+        typer.Option("--restored", metavar="RUN_DIR", help="Frames of this finished run of virest process."),
     ] = None,
     config: Config = None,
     frames: Annotated[
@@ -38,6 +38,9 @@ def export(
             help="logged, or instant: moved to the instant that a picture stands for.",
         ),
     ] = "logged",
+    poses: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Camera trajectory (TUM), for nerfstudio and colmap.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an export that exists.")] = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -48,8 +51,8 @@ def export(
 
     \b
     $ virest export walk --format euroc --restored virest-out/walk
-    walk: 60 restored pictures over 1.97 s and 640 inertial rows as euroc
-    a picture stands for the instant 0.00 ms after its stamp
+    walk: 60 restored frames over 1.97 s and 640 inertial rows as euroc
+    a frame shows the instant 0.00 ms after its stamp
     wrote virest-export/walk
 
     \b
@@ -62,9 +65,9 @@ def export(
         raise typer.BadParameter(f"standard input names {len(paths)} captures; one is exported at a time")
     from virest.app.export import ExportOptions, plan_export, run_export
 
-    options = ExportOptions(out, format, restored, config, chosen, stamps, overwrite)
+    options = ExportOptions(out, format, restored, config, chosen, stamps, overwrite, poses)
     plan = plan_export(paths[0], options)
     with console.progress_bar(len(plan.frames), plan.capture.name, quiet=quiet) as bar:
         facts, text = run_export(plan, bar.update if bar else None)
-    emit_facts(facts, text, as_json=json)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0

@@ -23,6 +23,8 @@ from virest.app.cli.options import (
     one_of,
     one_thread_each,
     parse_frames,
+    parse_neighbours,
+    parse_shard,
 )
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS
 
@@ -54,12 +56,34 @@ def process(
             metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Time of the picture. [exposure-start]"
         ),
     ] = None,
+    neighbours: Annotated[
+        str | None,
+        typer.Option(metavar="N|auto", help="Frames before and after that help to restore each. [auto: the preset's]"),
+    ] = None,
     jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes. [the cores]")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler does the work.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue what was interrupted or failed.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
     keep_start_up: Annotated[
         bool, typer.Option("--keep-start-up", help="Process the frames of the recorder's start-up too.")
+    ] = False,
+    video: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Write a film (MP4); {capture} stands for the capture's name.")
+    ] = None,
+    side_by_side: Annotated[
+        bool, typer.Option("--side-by-side", help="The film shows recorded beside restored frames.")
+    ] = False,
+    no_frames: Annotated[bool, typer.Option("--no-frames", help="Keep no PNGs; needs --video.")] = False,
+    mask: Annotated[bool, typer.Option("--mask", help="Write masks/: 255 recorded data, 0 repeated edge.")] = False,
+    crop: Annotated[
+        bool, typer.Option("--crop", help="Cut all frames to the area that holds recorded data in each of them.")
+    ] = False,
+    skip_copied: Annotated[
+        bool, typer.Option("--skip-copied", help="Write no PNG for frames that are only copied.")
+    ] = False,
+    shard: Annotated[str | None, typer.Option(metavar="i/N", help="Only the i-th of N parts of the captures.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print frames, predicted gain, time and bytes; write nothing.")
     ] = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -71,8 +95,13 @@ def process(
     \b
     $ virest process 2022_03_09_15_21_07 --frames 30:90
     virest: 2022_03_09_15_21_07: camera profile from the capture's metadata
-    capture              restored  copied  skipped  failed  frames/s  verdict   output
-    2022_03_09_15_21_07        58       2        0       0       4.3  restored  virest-out/2022_03_09_15_21_07
+    capture              restored  copied  skipped  failed  frames/s  verdict
+    2022_03_09_15_21_07        58       2        0       0       4.3  restored
+    wrote virest-out/2022_03_09_15_21_07
+    next: virest report virest-out/2022_03_09_15_21_07 shows it; ...
+
+    \b
+    $ virest process walk --video walk.mp4 --side-by-side --no-frames
 
     \b
     $ find /data -name movie.mp4 -printf '%h\\n' | virest process - --json | jq .blur.length_px
@@ -82,11 +111,18 @@ def process(
         raise typer.BadParameter("choose one of --resume and --overwrite")
     if scheduler is not None and find_spec("distributed") is None:
         raise typer.BadParameter("--scheduler needs the extra [cluster]: pip install 'virest[cluster]'")
-    chosen = parse_frames(frames)
+    for wanted, given in (("--side-by-side", side_by_side), ("--no-frames", no_frames)):
+        if given and video is None:
+            raise typer.BadParameter(f"{wanted} needs --video FILE")
+    chosen, part = parse_frames(frames), parse_shard(shard)
     paths = capture_paths(captures)
     if not paths:
         return 0
+    if video is not None and len(paths) > 1 and "{capture}" not in video:
+        raise typer.BadParameter("--video: several captures need {capture} in the film's name")
     one_thread_each()
+    from virest.app.finish import FinishWishes
+    from virest.app.jobs import PictureWishes
     from virest.app.process import ProcessOptions, process_captures
     from virest.app.settings import compose_settings
     from virest.capture.location import locate
@@ -98,6 +134,7 @@ def process(
         shutter=shutter,
         reference=reference,
         keep_start_up=keep_start_up or None,
+        neighbours=parse_neighbours(neighbours),
     )
     options = ProcessOptions(
         locate(out),
@@ -108,8 +145,14 @@ def process(
         scheduler,
         "resume" if resume else "overwrite" if overwrite else "new",
         shlex.join(["virest", *sys.argv[1:]]),
+        PictureWishes(mask, skip_copied),
+        FinishWishes(video, side_by_side, not no_frames, crop),
         json,
         quiet,
         verbose,
     )
-    return process_captures(paths, options)
+    if dry_run:
+        from virest.app.dry_run import predict_captures
+
+        return predict_captures(paths, options, part)
+    return process_captures(paths, options, part)

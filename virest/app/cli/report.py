@@ -48,5 +48,5 @@ def report(
     from virest.app.report import ReportOptions, write_report
 
     outcome = write_report(run_dir, ReportOptions(out, frames, capture, overwrite))
-    emit_facts(outcome.facts, outcome.text, as_json=json)
+    emit_facts(outcome.facts, outcome.text, as_json=json, quiet=quiet)
     return outcome.exit_code

@@ -10,6 +10,22 @@ import typer
 
 from virest.app import console
 from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of, one_thread_each, parse_frames
+from virest.app.cli.phone_options import (
+    BitsPerPx,
+    Denoise,
+    GyroJitter,
+    GyroLowpass,
+    GyroNoise,
+    Highlights,
+    Isp,
+    LocalTone,
+    OffsetMs,
+    Sharpen,
+    StabiliserRest,
+    TemporalDenoise,
+    Tone,
+    one_or_two,
+)
 from virest.restoration.settings import REFERENCES
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
@@ -75,6 +91,19 @@ def simulate(
     ] = REFERENCES[0],
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="The same seed gives the same capture.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a simulated capture.")] = False,
+    isp: Isp = None,
+    tone: Tone = None,
+    highlights: Highlights = None,
+    local_tone: LocalTone = None,
+    denoise: Denoise = None,
+    temporal_denoise: TemporalDenoise = None,
+    sharpen: Sharpen = None,
+    gyro_noise: GyroNoise = None,
+    gyro_jitter_ms: GyroJitter = None,
+    gyro_lowpass: GyroLowpass = None,
+    stabiliser_rest: StabiliserRest = None,
+    offset_ms: OffsetMs = None,
+    bits_per_px: BitsPerPx = None,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -92,6 +121,10 @@ def simulate(
     $ virest calibrate-curve bracket
 
     \b
+    $ virest simulate phone --isp phone --sharpen 0 --offset-ms 5 --noise 3
+    phone: 12 frames of 720x1280, blur 5.9 px, effects: none, phone: tone 0.4, local_tone 0.2, ...
+
+    \b
     $ virest simulate again --like 2022_03_09_15_21_07 --frames 30:90 --effect flicker=0.2,100
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
@@ -99,14 +132,24 @@ def simulate(
         _require_only(context, LIKE_OPTIONS, "--like takes it from the capture")
         wishes = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
         facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **wishes)
-        emit_facts(facts, _describe_simulation(facts), as_json=json)
+        emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
         return 0
     count = _parse_count(frames, 12)
     exposures_ms = _parse_exposures(exposure_ms)
     auto_exposure_ev, auto_exposure_steps = _parse_auto_exposure(auto_exposure)
+    amount, radius_px = one_or_two("--sharpen", sharpen)
+    rest, rest_cutoff_hz = one_or_two("--stabiliser-rest", stabiliser_rest)
     one_thread_each()
     from virest.app.simulate import simulate_command
     from virest.camera.profile import read_profile
+    from virest.simulation.phone_isp import make_isp
+
+    phone = make_isp(
+        isp, tone=tone, highlights=highlights, local_tone=local_tone, denoise=denoise,
+        temporal_denoise=temporal_denoise, sharpen=amount, sharpen_radius_px=radius_px, gyro_noise=gyro_noise,
+        gyro_jitter_s=_seconds(gyro_jitter_ms), gyro_lowpass_hz=gyro_lowpass, stabiliser_rest=rest,
+        stabiliser_cutoff_hz=rest_cutoff_hz, offset_s=_seconds(offset_ms), bits_per_px=bits_per_px,
+    )  # fmt: skip
 
     with console.progress_bar(count, "simulate", quiet=quiet) as bar:
         facts = simulate_command(
@@ -131,9 +174,10 @@ def simulate(
             reference=reference,
             seed=seed,
             overwrite=overwrite,
+            isp=phone,
             progress=(lambda _done, _total: bar.update(1)) if bar else None,
         )
-    emit_facts(facts, _describe_simulation(facts), as_json=json)
+    emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
     return 0
 
 
@@ -156,7 +200,13 @@ def _describe_simulation(facts: dict[str, Any]) -> str:
         for effect in facts["effects"]
     ]
     size = f"{facts['frames']} frames of {facts['width']}x{facts['height']}"
-    return f"{facts['capture']}: {size}, blur {facts['blur_px']} px, effects: {', '.join(effects) or 'none'}"
+    phone = ", ".join(f"{name} {value:g}" for name, value in facts.get("isp", {}).items())
+    text = f"{facts['capture']}: {size}, blur {facts['blur_px']} px, effects: {', '.join(effects) or 'none'}"
+    return text + (f", phone: {phone}" if phone else "")
+
+
+def _seconds(milliseconds: float | None) -> float | None:
+    return None if milliseconds is None else milliseconds / 1000
 
 
 def _require_only(context: typer.Context, allowed: tuple[str, ...], why: str) -> None:
@@ -171,7 +221,7 @@ def _parse_count(text: str | None, default: int) -> int:
     if text is None:
         return default
     if not re.fullmatch(r"\s*[+-]?\d{1,9}\s*", text, re.ASCII):
-        raise typer.BadParameter(f"--frames {text!r} is no number; A:B is for --like")
+        raise typer.BadParameter(f"--frames {text!r} is not a number; A:B is for --like")
     return int(text)
 
 
@@ -180,7 +230,7 @@ def _parse_exposures(text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no list of milliseconds; write 10 or 5,10,20") from None
+        raise typer.BadParameter(f"{text!r} is not a list of milliseconds; write 10 or 5,10,20") from None
 
 
 def _parse_auto_exposure(text: str | None) -> tuple[float | None, int | None]:

@@ -6,6 +6,7 @@ for (const viewer of document.querySelectorAll("[data-viewer]")) {
   const buttons = [...viewer.querySelectorAll("[data-show]")];
   const full = viewer.querySelector("[data-full]");
   const arrows = viewer.querySelector("[data-arrows]");
+  const flick = viewer.querySelector("[data-flicker]");
 
   const draw = (frame) => {
     const range = frame.querySelector("[data-cut]");
@@ -20,7 +21,17 @@ for (const viewer of document.querySelectorAll("[data-viewer]")) {
     range.setAttribute("aria-valuetext", `${range.value} percent recorded`);
   };
   const drawAll = () => frames.forEach(draw);
+  let cut = "50";
+  let flicker = 0;
+  const cutAll = (value) => {
+    for (const range of viewer.querySelectorAll("[data-cut]")) range.value = value;
+    drawAll();
+  };
   const show = (chosen) => {
+    const shown = frames.find((frame) => !frame.hidden)?.querySelector("[data-cut]");
+    if (shown && !flicker) cut = shown.value;
+    const range = frames[chosen].querySelector("[data-cut]");
+    if (range && !flicker) range.value = cut;  // the divider stays where the reader put it
     frames.forEach((frame, k) => { frame.hidden = k !== chosen; });
     buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(k === chosen)));
     draw(frames[chosen]);
@@ -51,6 +62,26 @@ for (const viewer of document.querySelectorAll("[data-viewer]")) {
     });
   }
   buttons.forEach((button, k) => button.addEventListener("click", () => show(k)));
+  const strip = () => buttons.forEach((button, k) => {
+    const image = frames[k].querySelector(".after img") || frames[k].querySelector("img");
+    if (!image || !image.naturalWidth || button.querySelector("canvas")) return;
+    const canvas = document.createElement("canvas");
+    canvas.height = 48;
+    canvas.width = Math.round((48 * image.naturalWidth) / image.naturalHeight);
+    canvas.setAttribute("aria-hidden", "true");
+    canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height);
+    button.prepend(canvas);
+  });
+  window.addEventListener("load", strip);
+  if (flick) flick.addEventListener("change", () => {
+    clearInterval(flicker);
+    flicker = 0;
+    if (!flick.checked) { cutAll(cut); return; }
+    const shown = frames.find((frame) => !frame.hidden)?.querySelector("[data-cut]");
+    if (shown) cut = shown.value;
+    let recorded = false;
+    flicker = setInterval(() => { recorded = !recorded; cutAll(recorded ? "100" : "0"); }, 600);
+  });
   arrows.addEventListener("change", () => viewer.classList.toggle("no-arrows", !arrows.checked));
   full.addEventListener("change", () => {
     viewer.classList.toggle("full", full.checked);

@@ -15,8 +15,8 @@ import numpy as np
 SEEN_BY_TRUTH = 0.65
 """Gain against the true picture for a gain of 1 against the neighbours: median over the sets of
 ``make bench ARGS="--only honesty"``, of which no frame lost where neighbours confirmed a gain of half a decibel."""
-LEAST_PAIRS = 3
-"""A median of fewer has no scatter."""
+LEAST_PAIRS = 2
+"""A single one has no scatter."""
 
 
 @dataclass(frozen=True, slots=True)

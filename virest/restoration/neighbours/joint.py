@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.degradation.blur import Image
-from virest.degradation.neighbour import NeighbourView
 from virest.degradation.kernels import KernelField
+from virest.degradation.neighbour import NeighbourView
 from virest.restoration.neighbours.registration import TileAgreement
 
 Array = NDArray[np.float64]

@@ -116,7 +116,7 @@ class TileAgreement:
 def tile_agreement(view: NeighbourView, first: Image, second: Image) -> TileAgreement | None:
     """Compare all tiles of two reduced pictures; None where a path does not fit into a tile."""
     times = view.frame.profile.height / first.shape[0]
-    tops_lefts = _tiles(*first.shape, most=first.size)
+    tops_lefts = _tiles(first.shape[0], first.shape[1], first.size)
     kernels = _kernel_spectra(view, tops_lefts, times)
     if kernels is None:
         return None
@@ -245,7 +245,7 @@ def _common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
 
 
 def _tile_shifts(a: NDArray[np.complex64], b: NDArray[np.complex64], start_px: Array) -> tuple[Array, Array]:
-    """Shifts (n, 2) of each tile and their precision (n,), 1 / px², by the phases' scatter (0: shows something else)."""
+    """Shifts (n, 2) of tiles and their precision (n,), 1 / px², by the phases' scatter; 0: it shows something else."""
     wx, wy = _frequencies()
     product, shift = np.conj(a) * b, np.tile(start_px, (len(a), 1))
     radius = np.hypot(wx, wy) / (2 * np.pi)

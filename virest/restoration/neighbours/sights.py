@@ -149,5 +149,8 @@ def turn_between(
     """The turn rate missing between two frames; None where one of them tells nothing. lens: of the trajectory."""
     if not first.usable or not second.usable:
         return None
-    assert first.motion is not None and second.motion is not None
+    assert first.motion is not None
+    assert second.motion is not None
+    if first.motion.start_s == second.motion.start_s:  # a repeated picture shows nothing of another instant
+        return None
     return pair_turn(neighbour_view(first.motion, second.motion, trajectory, lens), first_light, second_light)

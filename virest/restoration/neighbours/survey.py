@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ def survey_turns(
             return None
         return turn_between(sights[first], sights[second], light[first], light[second], trajectory, lens)
 
-    turns = [[between(a, b) for a, b in zip(run, run[1:], strict=False)] for run in runs]
+    turns = [[between(a, b) for a, b in pairwise(run)] for run in runs]
     return missing_turn(turns, motions)
 
 

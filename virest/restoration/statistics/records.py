@@ -139,8 +139,8 @@ class PictureStatistics:
     def expected_gain_db(self) -> float:
         """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured.
 
-        Left as it is, a picture misses (1 − K) F, |1 − K|² = 1 − 2 Re K + |K|²; where a path reverses a frequency that is
-        more than all of it.
+        Left as it is, a picture misses (1 − K) F, |1 − K|² = 1 − 2 Re K + |K|²; where a path reverses a frequency
+        that is more than all of it.
         """
         if not self.measured:
             return 0.0

@@ -1,0 +1,142 @@
+"""``import virest``: opening, restoring and deblurring on arrays, and the commands' records, without a file written."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import virest
+from virest.camera.response import ResponseCurve
+from virest.errors import CalibrationError, CaptureError, SettingsError
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "leaves"
+FRAME = 5
+
+
+def psnr_db(first: np.ndarray, second: np.ndarray, border: int = 40) -> float:
+    """Of two pictures, without their borders."""
+    inner = np.s_[border:-border, border:-border]
+    error = first[inner].astype(float) - second[inner].astype(float)
+    return float(10 * np.log10(255**2 / np.mean(error**2)))
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    """The sharp frame of the sample."""
+    picture = cv2.imread(str(SAMPLE / "truth" / "frames" / f"{FRAME:06d}.png"))
+    assert picture is not None
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def test_importing_virest_loads_no_heavy_library() -> None:
+    """The package's door loads nothing but itself; numpy and OpenCV come with the first function that needs them."""
+    code = "import sys, virest; print([m for m in ('numpy', 'cv2', 'scipy', 'pandas', 'pydantic') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_name_of_the_interface_is_there() -> None:
+    """What ``__all__`` promises can be had; what it does not promise is an AttributeError."""
+    assert all(getattr(virest, name) is not None for name in virest.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = virest.nothing
+
+
+def test_a_frame_is_restored_by_one_call(truth: np.ndarray) -> None:
+    """A frame, inertial samples and a profile give a picture that is nearer to the truth than the recorded one."""
+    capture = virest.open(SAMPLE)
+    recorded, stamp = capture.read_frame(FRAME), capture.frames[FRAME]
+    restored = virest.restore(
+        recorded, capture.imu, capture.profile, time_s=stamp.time_s, exposure_s=stamp.exposure_s, preset="fast"
+    )
+    assert restored.status == "restored"
+    assert restored.picture is not None
+    assert psnr_db(restored.picture, truth) > psnr_db(recorded, truth) + 3.0
+    again = capture.restore(FRAME, preset="fast").picture
+    assert again is not None
+    assert psnr_db(again, truth) > psnr_db(recorded, truth) + 3.0
+
+
+def test_a_grey_frame_stays_grey() -> None:
+    """A frame (height, width) comes back as such."""
+    capture = virest.open(SAMPLE)
+    grey = cv2.cvtColor(capture.read_frame(FRAME), cv2.COLOR_RGB2GRAY)
+    stamp = capture.frames[FRAME]
+    restored = virest.restore(grey, capture.imu, capture.profile, time_s=stamp.time_s, exposure_s=None, preset="fast")
+    assert restored.picture is not None
+    assert restored.picture.shape == grey.shape
+
+
+def _blurred(sharp: np.ndarray, kernel: np.ndarray, curve: ResponseCurve, rng: np.random.Generator) -> np.ndarray:
+    """The picture convolved in linear light, with noise: independent of the package's kernels."""
+    light = curve.linear_table()[sharp]
+    turned = kernel[::-1, ::-1] / kernel.sum()
+    light = cv2.filter2D(light, -1, turned, anchor=(kernel.shape[1] // 2, kernel.shape[0] // 2))
+    grey = 255 * curve.encode(light) + rng.normal(0, 1.5, light.shape)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("colour", [True, False])
+def test_a_kernel_is_undone_without_moving_the_picture(truth: np.ndarray, colour: bool) -> None:
+    """Of a picture blurred by a lopsided kernel the sharp one comes back in its place."""
+    sharp = truth[300:700, 100:620] if colour else cv2.cvtColor(truth[300:700, 100:620], cv2.COLOR_RGB2GRAY)
+    kernel = np.zeros((15, 19))
+    kernel[7, 9:18] = 1.0
+    kernel[7:13, 17] += 2.0
+    recorded = _blurred(sharp, kernel, ResponseCurve("srgb"), np.random.default_rng(3))
+    restored = virest.deblur(recorded, kernel)
+    assert restored.shape == recorded.shape
+    assert psnr_db(restored, sharp) > psnr_db(recorded, sharp) + 4.0
+
+
+def test_a_path_is_undone_without_moving_the_picture(truth: np.ndarray) -> None:
+    """Of a picture whose points moved along a path the sharp one comes back, as it was when the path began."""
+    sharp = truth[300:700, 100:620]
+    kernel = np.zeros((19, 19))
+    kernel[9, 9:19] = 1.0
+    recorded = _blurred(sharp, kernel, ResponseCurve("gamma", gamma=2.2), np.random.default_rng(4))
+    restored = virest.deblur(recorded, path_px=np.array([[-0.5, 0.0], [9.5, 0.0]]), response="gamma:2.2")
+    assert psnr_db(restored, sharp) > psnr_db(recorded, sharp) + 4.0
+
+
+def test_wrong_arguments_are_errors_with_a_hint() -> None:
+    """Sizes, kinds and names that cannot be are one line each, not a traceback of numpy."""
+    capture = virest.open(SAMPLE)
+    with pytest.raises(SettingsError, match="uint8"):
+        virest.deblur(np.zeros((64, 64)), np.ones((3, 3)))
+    with pytest.raises(SettingsError, match="too small"):
+        virest.deblur(np.zeros((40, 40), np.uint8), np.ones((1, 9)))
+    with pytest.raises(SettingsError, match="either a kernel or path_px"):
+        virest.deblur(np.zeros((64, 64), np.uint8))
+    with pytest.raises(SettingsError, match="the profile 720x1280"):
+        virest.restore(np.zeros((8, 8), np.uint8), capture.imu, capture.profile, time_s=0, exposure_s=0.01)
+    with pytest.raises(SettingsError, match="no setting 'shuter'"):
+        capture.restore(0, shuter="none")
+    with pytest.raises(CaptureError, match="no frame 99"):
+        capture.read_frame(99)
+
+
+def test_calibrating_gives_the_record_and_writes_only_what_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Calibrating returns what ``--json`` prints; without ``out`` nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    options = {"width": 256, "height": 192, "frames": 18, "seed": 2, "rate_rad_s": 1.5, "exposure_ms": 6.0}
+    assert virest.simulate("walk", effects=["time_offset=0.02"], **options)["frames"] == 18
+    before = sorted(tmp_path.rglob("*"))
+    found = virest.calibrate("walk")
+    offset = next(value for value in found["values"] if value["name"] == "time_offset_s")
+    assert offset["value"] == pytest.approx(0.02, abs=5e-4)
+    with pytest.raises(SettingsError, match="did you mean 'focal'"):
+        virest.calibrate("walk", extra=["focl"])
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_capture_that_does_not_tell_is_an_error(tmp_path: Path) -> None:
+    """A camera at rest determines nothing."""
+    virest.simulate(tmp_path / "rest", width=320, height=240, frames=8, rate_rad_s=0.0)
+    with pytest.raises(CalibrationError):
+        virest.calibrate(tmp_path / "rest")

@@ -1,0 +1,59 @@
+"""Refusals that tell how to go on, and results that are written although they are rough."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motion.synthetic_tracks import Setup, recorded
+
+from virest.app.calibrate import _require_offset
+from virest.app.calibrate_curve import calibrate_curve
+from virest.calibration.geometry import ROUGH_OFFSET_S, CalibratedValue, GeometryCalibration, _rough
+from virest.errors import CalibrationError, OutputError
+from virest.motion.profile_terms import TIME_OFFSET
+from virest.motion.track_fit import TrackFit, fit_tracks
+
+
+def fit_of(recording) -> TrackFit:
+    """An offset fitted to a recording's points."""
+    return fit_tracks(recording.imu, recording.table(), recording.profile, [TIME_OFFSET])
+
+
+def calibrated(value: CalibratedValue) -> GeometryCalibration:
+    """A calibration of which only one value matters."""
+    recording = recorded(Setup(seed=5, frames=14))
+    fit = fit_of(recording)
+    return GeometryCalibration(recording.profile, (value,), (), "none", 0.1, 0.1, 0.2, 0.9, 0.0, 13, 500, (), fit)
+
+
+@pytest.mark.parametrize(("std_s", "rough"), [(0.0032, True), (1.5 * ROUGH_OFFSET_S, False)])
+def test_an_offset_known_roughly_is_written_and_says_so(std_s: float, rough: bool) -> None:
+    """3.2 ms is no reason to write nothing; a deviation of half a frame is."""
+    fit = fit_of(recorded(Setup(seed=5, frames=14)))
+    value = _rough(CalibratedValue("time_offset_s", None, 0.45, std_s, determined=False), fit)
+    assert value.rough is rough
+    assert bool(value.note) is rough
+    if rough:
+        _require_offset(calibrated(value))
+    else:
+        with pytest.raises(CalibrationError, match=r"15\.0 ms"):
+            _require_offset(calibrated(value))
+
+
+def test_an_offset_that_one_moment_tells_is_not_even_rough() -> None:
+    """Nothing bears a single block of time out."""
+    fit = replace(fit_of(recorded(Setup(seed=5, frames=14))), stretches=np.array([1.1]))
+    assert not _rough(CalibratedValue("time_offset_s", None, 0.45, 0.0032, determined=False), fit).rough
+
+
+def test_a_curve_that_exists_is_replaced_only_where_that_is_asked_for(tmp_path: Path) -> None:
+    """The refusal comes before any work and names the option."""
+    out = tmp_path / "curve.yaml"
+    out.write_text("mine")
+    with pytest.raises(OutputError) as refused:
+        calibrate_curve(tmp_path / "nothing", out=out)
+    assert "--overwrite" in (refused.value.hint or "")
+    assert out.read_text() == "mine"

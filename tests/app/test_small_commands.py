@@ -1,0 +1,118 @@
+"""`virest preview`, `virest doctor`, `virest profile`: one picture, one check, one file."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import cv2
+import pytest
+import yaml
+
+from virest.app import doctor
+from virest.camera.phones import READOUTS
+from virest.camera.profile import read_profile
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_a_preview_shows_the_most_blurred_frame(swing: Path, virest_here, tmp_path: Path) -> None:
+    """One picture of three panels; another frame by number; an existing picture stays."""
+    done = virest_here("preview", swing / "movie.mp4", "--json", "--preset", "fast")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    picture = cv2.imread(str(tmp_path / facts["path"]))
+    assert picture is not None
+    assert picture.shape[1] > 2 * picture.shape[0]
+    assert facts["status"] == "restored"
+    number = (facts["frame"] + 4) % 10
+    other = virest_here("preview", swing, "--frame", number, "--out", "other.png", "--json", "--preset", "fast")
+    assert json.loads(other.stdout)["blur_px"] < facts["blur_px"]
+    again = virest_here("preview", swing)
+    assert again.returncode == 8
+    assert "--overwrite" in again.stderr
+
+
+def test_the_doctor_says_what_is_here(virest_here, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything needed is here; what is missing is named and fails."""
+    done = virest_here("doctor", "--json")
+    assert done.returncode == 0, done.stdout
+    facts = json.loads(done.stdout)
+    assert facts["missing"] == []
+    assert "h264" in facts["decoders"]
+    monkeypatch.setattr(doctor, "NEEDED", (*doctor.NEEDED, "no-such-package"))
+    _, text, code = doctor.examine()
+    assert code == 1
+    assert text.endswith("missing: no-such-package")
+
+
+def test_the_doctor_names_what_is_slow() -> None:
+    """Few cores, little memory, a slow core: each with its reason."""
+    facts = {"cores": 8, "memory_bytes": 1.5e9, "free_bytes_here": 1e9, "fft_s": 0.05, "vector_instructions": False,
+             "decoders": ["h264"]}  # fmt: skip
+    notes = " ".join(doctor._notes(facts))
+    for word in ("--jobs 4", "vector instructions", "5.0 times", "GB free", "HEVC"):
+        assert word in notes
+    assert "one core" in doctor._notes({"cores": 1, "memory_bytes": None, "free_bytes_here": 1e12})[0]
+
+
+def test_a_profile_is_begun_from_a_capture(tiny: Path, virest_here, tmp_path: Path) -> None:
+    """What the recorder logged is in it, what it did not is null, and the program reads it."""
+    (tiny / "camera.yaml").unlink()
+    done = virest_here("profile", "new", tiny, "--out", "mine.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "unknown: time offset, response" in done.stdout
+    profile = read_profile(tmp_path / "mine.yaml")
+    assert profile.intrinsics is not None
+    assert (profile.intrinsics.fx_px, profile.shutter.readout_time_s) == (130.0, 0.02)
+    assert profile.time_offset_s is None
+    assert "# shutter:" in (tmp_path / "mine.yaml").read_text()
+
+
+def test_a_profile_is_begun_from_a_known_phone(virest_here, tmp_path: Path) -> None:
+    """The readout time comes with its source; another mode's is not taken."""
+    done = virest_here("profile", "new", "--device", "honor view", "--size", "720x1280", "--fov-deg", "60")
+    assert done.returncode == 0, done.stderr
+    content = yaml.safe_load((tmp_path / "camera.yaml").read_text())
+    assert content["shutter"]["readout_time_s"] == pytest.approx(0.02068)
+    assert content["intrinsics"]["fx_px"] == pytest.approx(640 / 3**-0.5)
+    assert "kalibr" in content["estimates"]["readout_time_s"]["source"]
+    other = virest_here("profile", "new", "--device", "honor view", "--size", "1920x1080", "--out", "b.yaml")
+    assert other.returncode == 3
+    assert "1280x720" in other.stderr
+    unknown = virest_here("profile", "new", "--device", "toaster", "--size", "1920x1080", "--out", "b.yaml")
+    assert "virest profile devices" in unknown.stderr
+    assert not (tmp_path / "b.yaml").exists()
+
+
+def test_every_known_readout_is_documented_with_its_source(virest_here) -> None:
+    """The table of the documentation is that of the program; each entry has a size, a time and a source."""
+    page = (ROOT / "docs" / "phones.md").read_text("utf-8")
+    for entry in READOUTS:
+        assert 0.001 < entry.readout_s < 0.1
+        assert f"| {entry.device} | {entry.width}×{entry.height} |" in page
+        assert entry.source in page
+    done = virest_here("profile", "devices", "galaxy", "--json")
+    assert [d["readout_s"] for d in json.loads(done.stdout)["devices"]] == [0.03, 0.03267]
+
+
+def test_help_shows_no_types_and_cuts_no_description(virest_here) -> None:
+    """Arguments bear their names, not Python's types; every command has a whole line; pages are 100 columns at most."""
+    shown = virest_here("--help").stdout
+    commands = shown.partition("Commands:")[2].strip().splitlines()
+    assert all(line.rstrip().endswith(".") and "..." not in line for line in commands)
+    for command in ("process", "simulate", "report", "export", "profile new", "evaluate slam"):
+        page = virest_here(*command.split(), "--help").stdout
+        assert not re.search(r"<(list|str|path|file)", page), command
+        assert "Usage: virest" in page
+
+
+def test_a_bad_folder_is_told_in_few_lines(virest_here, tmp_path: Path) -> None:
+    """What is missing stands in one line, not in one for each file."""
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "gyro_accel.csv").write_text("t,x\n")
+    done = virest_here("inspect", "bad")
+    assert done.returncode == 4
+    assert "missing too: movie.mp4, frame_timestamps.txt, movie_metadata.csv" in done.stdout
+    assert len(done.stdout.splitlines()) <= 6

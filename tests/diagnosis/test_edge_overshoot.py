@@ -1,0 +1,124 @@
+"""Sharpening is found by the overshoot beside edges, and told from what else shapes an edge."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from virest.app.diagnose import Source, open_source
+from virest.app.simulate import simulate_command
+from virest.diagnosis.catalogue import MAX_P
+from virest.diagnosis.edge_overshoot import (
+    GRID_PX,
+    EdgeProfiles,
+    Sharpening,
+    fit_sharpening,
+    judge_sharpening,
+    sharpened_step,
+)
+from virest.diagnosis.picture_ladder import PictureVerdict, climb_blur
+from virest.motion.integration import integrate_gyro
+from virest.motion.trajectory import Trajectory
+from virest.simulation.phone_isp import PhoneIsp
+
+
+def edges(rng, shape, count=600, widths=(0.6, 1.4)):
+    """Edges of a scene in 24 frames: some sharper, some softer, with a decoded movie's noise."""
+    profile = np.stack([shape(width) for width in rng.uniform(*widths, count)])
+    noise = np.repeat(0.02 * rng.standard_normal((count, (len(GRID_PX) + 3) // 4)), 4, axis=1)[:, : len(GRID_PX)]
+    half_width = np.array([np.interp(0.84, row, GRID_PX) for row in np.maximum.accumulate(profile, axis=1)])
+    return EdgeProfiles(profile + noise, half_width, np.arange(count) % 24 / 30)
+
+
+def found(rng, shape, **kind) -> Sharpening:
+    """What the fit makes of them."""
+    result = fit_sharpening(edges(rng, shape, **kind))
+    assert result is not None
+    return result
+
+
+@pytest.mark.parametrize(("amount", "radius_px"), [(0.8, 1.6), (1.5, 1.1)])
+def test_amount_and_radius_come_back_within_their_deviations(rng, amount, radius_px):
+    """Two and a half of them; the mask predicts held-out blocks better, and the deviations say something."""
+    seen = found(rng, lambda width: sharpened_step(width, amount, radius_px))
+    assert seen.p_value < MAX_P
+    assert abs(seen.amount - amount) < 2.5 * seen.amount_std < 2.5 * amount
+    assert abs(seen.radius_px - radius_px) < 2.5 * seen.radius_std_px < 2.5 * radius_px
+    assert seen.rms_after < 0.5 * seen.rms_before
+
+
+@pytest.mark.parametrize("soft_px", [0.0, 1.5])
+def test_defocus_and_curve_overshoot_nowhere(rng, soft_px):
+    """A step in light, defocused or not, behind a curve of gamma 2: no sharpening, at the stated rate of alarms."""
+
+    def bent(width):
+        grey = np.sqrt(0.05 + 0.6 * ndtr(GRID_PX / np.hypot(width, soft_px)))
+        grey = (grey - grey[0]) / (grey[-1] - grey[0])
+        middle = np.interp(0.5, grey, GRID_PX)
+        return np.interp(GRID_PX + middle, GRID_PX, grey)
+
+    for _ in range(5):
+        assert found(rng, bent).p_value > 100 * MAX_P
+
+
+def test_a_scene_that_has_lines_beside_its_edges_is_not_sharpened(rng):
+    """Bright seams, as of print on glossy paper: an unsharp mask overshoots on both sides alike."""
+
+    def seamed(width):
+        return ndtr(GRID_PX / width) + 0.12 * np.exp(-0.5 * ((GRID_PX - 2.0) / 0.8) ** 2)
+
+    assert found(rng, seamed).p_value > MAX_P
+
+
+def test_few_edges_tell_nothing(rng):
+    """Rather no answer than one from twenty edges."""
+    assert fit_sharpening(edges(rng, lambda width: ndtr(GRID_PX / width), count=20)) is None
+
+
+def opened(folder: Path, **options) -> tuple[Source, Trajectory]:
+    """Simulate a board as a capture, and its motion by the capture's own profile."""
+    simulate_command(
+        folder, scene="board", width=480, height=360, frames=20, seed=3, exposure_ms=5.0, rate_rad_s=0.8, **options
+    )
+    source = open_source(folder)
+    return source, integrate_gyro(source.capture.imu, source.profile)
+
+
+def judged(source: Source, trajectory: Trajectory) -> PictureVerdict:
+    """What its edges say."""
+    return judge_sharpening(source.capture, source.profile, trajectory, source.gray)
+
+
+@pytest.fixture(scope="module")
+def processed(tmp_path_factory) -> tuple[Source, Trajectory]:
+    """A phone denoises in space and time, and sharpens; at the recorder's bit rate."""
+    isp = PhoneIsp(denoise=1.5, temporal_denoise=0.4)
+    return opened(tmp_path_factory.mktemp("edges") / "phone", isp=isp, effects=["sharpening=0.9,1.4"])
+
+
+def test_a_hidden_sharpening_is_named_with_its_size(processed):
+    """From the movie alone, within two and a half deviations."""
+    (finding,) = judged(*processed).findings
+    assert finding.name == "sharpening"
+    for name, truth in (("amount", 0.9), ("radius_px", 1.4)):
+        change = finding.parameters[name]
+        assert abs(change.estimate - truth) < 2.5 * change.std < 1.5 * truth, (name, change)
+    assert finding.held_out.gain > 0.5
+    assert "unsharp" in finding.sentence
+
+
+def test_sharpening_and_denoising_are_no_defocus_and_no_other_exposure(processed):
+    """Nothing is named by the widths of edges and the ratios of spectra."""
+    source, trajectory = processed
+    verdict, is_exposure = climb_blur(source.capture, source.profile, trajectory, source.gray, None)
+    assert verdict.blur_rms_px is not None
+    assert not verdict.findings
+    assert not is_exposure
+
+
+def test_what_is_not_sharpened_is_not_named(tmp_path):
+    """Out of focus and under another curve: neither overshoots, and there are edges enough to tell."""
+    verdict = judged(*opened(tmp_path / "plain", effects=["defocus=0.8", "response_curve=1.3"]))
+    assert not verdict.findings
+    assert not verdict.notes

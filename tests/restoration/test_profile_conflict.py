@@ -1,0 +1,100 @@
+"""A profile that tracked points contradict: the cause is found and taken, and nothing is taken from a right one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from motion.synthetic_tracks import Recording, Setup, recorded
+
+from virest.camera.profile import CameraProfile, Extensions
+from virest.restoration.profile_conflict import Settled, settle_conflict
+
+HAND = Setup(seed=71, frames=26, points=40, gyro_noise_rad_s=0.002)
+
+
+def settled(recording: Recording, profile: CameraProfile, *, offset_known: bool = True) -> Settled:
+    """What the recording's points make of a profile."""
+    return settle_conflict(recording.observed, recording.imu, profile, offset_known=offset_known)
+
+
+def focal_px(profile: CameraProfile) -> float:
+    """Of a profile that has one."""
+    assert profile.intrinsics is not None
+    return profile.intrinsics.fx_px
+
+
+@pytest.mark.parametrize("factor", [0.55, 1.75])
+def test_a_focal_length_stated_wrong_is_put_right(factor: float) -> None:
+    """Far off or near by; the principal point stays, and where the value comes from is noted."""
+    recording = recorded(HAND)
+    lens = recording.profile.intrinsics
+    assert lens is not None
+    found = settled(recording, replace(recording.profile, intrinsics=lens.scaled_focal(factor)))
+    assert found.contradicted
+    assert focal_px(found.profile) == pytest.approx(520.0, rel=0.005)
+    assert found.profile.intrinsics is not None
+    assert found.profile.intrinsics.cx_px == lens.cx_px
+    assert found.profile.estimates["fx_px"].std is not None
+    assert found.after_px < 1.2 * found.noise_px < found.before_px
+
+
+@pytest.mark.parametrize("fraction", [0.2])
+def test_a_stabiliser_that_no_profile_names_is_found(fraction: float) -> None:
+    """By its fraction and cutoff, and nothing else is taken for it."""
+    recording = recorded(replace(HAND, stabilised=(fraction, 0.8)))
+    found = settled(recording, replace(recording.profile, extensions=Extensions()))
+    assert found.profile.extensions.stabilisation_fraction == pytest.approx(fraction, abs=0.02)
+    assert found.profile.extensions.stabilisation_cutoff_hz == pytest.approx(0.8, rel=0.15)
+    assert len(found.taken) == 1
+    assert set(found.profile.estimates) == {"stabilisation_fraction", "stabilisation_cutoff_hz"}
+
+
+def test_clocks_that_drift_are_found_where_the_offset_is_stated_and_where_it_is_not() -> None:
+    """Skews of 0.01 over two seconds; an unknown offset is fitted along."""
+    recording = recorded(replace(HAND, clock_skew=0.01, frames=50, points=25))
+    given = replace(recording.profile, clock_skew=0.0)
+    assert settled(recording, given).profile.clock_skew == pytest.approx(0.01, abs=3e-4)
+    started = replace(given, time_offset_s=0.021)
+    found = settled(recording, started, offset_known=False)
+    assert found.profile.clock_skew == pytest.approx(0.01, abs=3e-4)
+    assert found.offset is not None
+    assert found.offset[0] == pytest.approx(0.013, abs=5e-4)
+
+
+def test_a_stabiliser_and_a_wrong_focal_length_are_told_apart() -> None:
+    """Two causes enter one after the other."""
+    recording = recorded(replace(HAND, stabilised=(0.5, 1.0)))
+    lens = recording.profile.intrinsics
+    assert lens is not None
+    given = replace(recording.profile, extensions=Extensions(), intrinsics=lens.scaled_focal(0.85))
+    found = settled(recording, given)
+    assert focal_px(found.profile) == pytest.approx(520.0, rel=0.01)
+    assert found.profile.extensions.stabilisation_fraction == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    "setup",
+    [
+        HAND,
+        replace(HAND, outliers=0.2),
+        replace(HAND, gyro_bias_rad_s=(0.03, -0.02, 0.01)),
+        replace(HAND, rate_rad_s=0.05),
+    ],
+    ids=["right", "moving object", "gyroscope's bias", "hardly moving"],
+)
+def test_a_right_profile_is_left_as_it_is(setup: Setup) -> None:
+    """Nothing is taken: not from a thing that moves by itself, nor from a bias, nor from a camera nearly at rest."""
+    recording = recorded(setup)
+    given = replace(recording.profile, gyro_bias_rad_s=HAND.gyro_bias_rad_s)
+    found = settled(recording, given)
+    assert not found.taken
+    assert found.profile is given
+
+
+def test_what_no_cause_explains_is_said_and_not_taken() -> None:
+    """Points that follow another gyroscope: the profile stays, and is called contradicted."""
+    recording, stranger = recorded(HAND), recorded(replace(HAND, seed=72))
+    found = settle_conflict(recording.observed, stranger.imu, recording.profile, offset_known=True)
+    assert found.contradicted
+    assert found.profile is recording.profile

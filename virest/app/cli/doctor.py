@@ -1,0 +1,23 @@
+"""`virest doctor`: is everything here, and what would be slow."""
+
+from __future__ import annotations
+
+from virest.app import console
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
+
+
+def doctor(json: Json = False, quiet: Quiet = False, verbose: Verbose = False, version: Version = False) -> int:
+    """Check the installation: versions, cores, memory, codecs, extras, and what would be slow, with the reason.
+
+    \b
+    $ virest doctor
+    virest 0.2.0, Python 3.11.9, Linux x86_64
+    ...
+    everything that virest needs is here
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    from virest.app.doctor import examine
+
+    facts, text, code = examine()
+    emit_facts(facts, text, as_json=json, quiet=quiet)
+    return code

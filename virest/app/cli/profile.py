@@ -1,0 +1,78 @@
+"""`virest profile`: start a camera profile; known phones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
+
+profile = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Start a camera profile; readout times of known phones."
+)
+
+
+@profile.command("new", short_help="Write a camera profile to start from.")
+def new(
+    capture: Annotated[
+        str | None, typer.Argument(metavar="[CAPTURE]", help="Take what this capture's recorder logged.")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Readout time from the table of known phones.")
+    ] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Frame size, where no capture is given.")] = None,
+    focal_px: Annotated[float | None, typer.Option(metavar="PX", min=1.0, help="Focal length in pixels.")] = None,
+    fov_deg: Annotated[
+        float | None, typer.Option(metavar="DEG", help="Field of view along the long side, for the focal length.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The profile goes here.")] = Path("camera.yaml"),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Write a camera profile with all that is known, commented; what is not known is null.
+
+    \b
+    $ virest profile new sample_data/text
+    base: text, sample_data/text/camera.yaml
+    wrote camera.yaml
+
+    \b
+    $ virest profile new --device "Honor View" --size 1280x720 --fov-deg 66
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    from virest.app.new_profile import NewProfile, parse_size, run_new_profile
+
+    folder = None if capture is None else Path(console.folder_of(capture))
+    wishes = NewProfile(folder, device, None if size is None else parse_size(size), focal_px, fov_deg, out, overwrite)
+    facts, text = run_new_profile(wishes)
+    emit_facts(facts, text, as_json=json, quiet=quiet)
+    return 0
+
+
+@profile.command("devices", short_help="Readout times of known phones.")
+def devices(
+    text: Annotated[str, typer.Argument(metavar="[TEXT]", help="Only devices whose name holds these words.")] = "",
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """List published readout times with their sources.
+
+    \b
+    $ virest profile devices honor
+    device           mode  readout ms     ±  source
+    Honor View 10  1280x720     20.68  0.13  J. Huai
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    from virest.app.new_profile import known_devices
+
+    facts, shown = known_devices(text)
+    emit_facts(facts, shown, as_json=json, quiet=quiet)
+    return 0

@@ -1,0 +1,141 @@
+"""``virest process --dry-run``: what a run would give and take, from a few frames; nothing is written."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from virest.app import console
+from virest.app.names import shard_of
+from virest.app.outputs import json_line
+from virest.app.planning import Job, Planned, ProcessOptions, plan_capture
+from virest.app.png import png_bytes
+from virest.capture.folder import Frame
+from virest.capture.video import MovieIndex, read_frames
+from virest.errors import VirestError
+from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
+
+PROBED = 3
+"""Frames of a capture that are restored: the first is left out of the time, since tables are made for it."""
+PARTLY_FAILED = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What one capture would give and take."""
+
+    name: str
+    frames: int
+    skipped: int
+    blur_px: float | None
+    """Median over the probed frames, at the centre."""
+    gain_db: float | None
+    """Median predicted gain; None: deblurring is not expected to help."""
+    seconds: float
+    """For the chosen number of processes, planning included."""
+    bytes: float
+
+    def facts(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {"capture": self.name, **{k: v for k, v in dataclasses.asdict(self).items() if k != "name"}}
+
+
+def predict_captures(paths: list[str], options: ProcessOptions, shard: tuple[int, int] = (1, 1)) -> int:
+    """Predict each capture of a batch and print a table, or a line of JSON each.  Returns the exit code."""
+    paths, names = shard_of(paths, shard)
+    apart = dataclasses.replace(options, mode="overwrite")  # an existing run is no obstacle to looking
+    forecasts, codes = [], []
+    for path, name in zip(paths, names, strict=True):
+        try:
+            forecast = predict(path, name, apart)
+            forecasts.append(forecast)
+            codes.append(0)
+            if options.json_lines:
+                console.emit(json_line(forecast.facts()))
+        except VirestError as error:
+            codes.append(console.report_error(error, name))
+    if forecasts and not options.json_lines:
+        console.emit(_table(forecasts))
+    failures = [code for code in codes if code]
+    return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
+
+
+def predict(path: str, name: str, options: ProcessOptions) -> Forecast:
+    """Plan a capture and restore a few of its frames in memory.  Raises the errors that a run would raise."""
+    planned: Planned = plan_capture(path, name, options)
+    if planned.error is not None:
+        raise planned.error
+    assert planned.job is not None
+    assert planned.index is not None
+    assert planned.plan is not None
+    job = planned.job
+    usable = [frame for frame in job.selected if frame.skip_reason is None]
+    probed = [_restored(job, planned.index, planned.plan, frame) for frame in _spread(usable)]
+    known = [found for found in probed if found is not None]
+    per_frame_s = float(np.median([found[0] for found in known[1:] or known])) if known else 0.0
+    blur = [found[2] for found in known if found[2] is not None]
+    gain = [found[3] for found in known if found[3] is not None]
+    return Forecast(
+        name,
+        len(usable),
+        len(job.selected) - len(usable),
+        float(np.median(blur)) if blur else None,
+        float(np.median(gain)) if gain else None,
+        planned.seconds + per_frame_s * len(usable) / options.jobs,
+        float(np.mean([found[1] for found in known])) * len(usable) if known else 0.0,
+    )
+
+
+def _spread(frames: Sequence[Frame]) -> list[Frame]:
+    """A few frames from all over."""
+    places = np.linspace(0, max(len(frames) - 1, 0), min(PROBED, len(frames))).round().astype(int)
+    return [frames[k] for k in places.tolist()]
+
+
+def _restored(
+    job: Job, index: MovieIndex, plan: RestorationPlan, frame: Frame
+) -> tuple[float, int, float | None, float | None] | None:
+    """Seconds, bytes of the PNG, blur in pixels and predicted gain of a frame; None where it cannot be decoded."""
+    frames = {f.index: f for f in at_true_times(job.capture.frames, plan.profile, job.capture.repeats)}
+    first, last = max(frame.index - plan.reach, 0), min(frame.index + plan.reach, len(frames) - 1)
+    decoded = {n: p for n, p in read_frames(job.capture.movie, index, first, last) if p is not None}
+    if frame.index not in decoded:
+        return None
+    near = [(frames[n], decoded[n]) for n in sorted(decoded) if n != frame.index and not frames[n].skip_reason]
+    near = sorted([*near, (frame, decoded[frame.index])], key=lambda pair: pair[0].index)
+    began = time.perf_counter()
+    restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}), None)
+    if restored is None or restored.picture is None:
+        return None
+    size = len(png_bytes(restored.picture))
+    seconds = time.perf_counter() - began
+    parameters = restored.parameters
+    return seconds, size, parameters["blur"]["length_px"], parameters["deblur"].get("expected_gain_db")
+
+
+def _table(forecasts: list[Forecast]) -> str:
+    def shown(value: float | None) -> str:
+        return "-" if value is None else f"{value:.1f}"
+
+    rows = [
+        [
+            f.name,
+            str(f.frames),
+            str(f.skipped),
+            shown(f.blur_px),
+            shown(f.gain_db),
+            f"{f.seconds:.0f}",
+            f"{f.bytes / 1e6:.1f}",
+        ]
+        for f in forecasts
+    ]
+    if len(forecasts) > 1:
+        total_s, total = sum(f.seconds for f in forecasts), sum(f.bytes for f in forecasts)
+        rows.append(["total", str(sum(f.frames for f in forecasts)), str(sum(f.skipped for f in forecasts)), "", "",
+                     f"{total_s:.0f}", f"{total / 1e6:.1f}"])  # fmt: skip
+    return console.table(["capture", "frames", "skipped", "blur px", "gain dB", "time s", "MB"], rows, words=0)

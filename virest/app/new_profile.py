@@ -1,0 +1,154 @@
+"""``virest profile``: a camera profile to start from, and the readout times of known phones."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from virest.app.console import table
+from virest.app.outputs import write_whole
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.phones import READOUTS, Readout, find_readouts
+from virest.camera.profile import CameraProfile, format_profile, profile_mapping
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.profile_source import phone_profile
+from virest.errors import OutputError, SettingsError
+
+Json = dict[str, Any]
+COMMENTS = {
+    "intrinsics": "fx_px null: estimated from the capture; virest calibrate --with focal",
+    "shutter": "readout: first row to one past the last, null: no straightening; direction in the stored picture",
+    "scene": "depth_m null: estimated; .inf: rotation only",
+    "T_cam_imu": "x_cam = T_cam_imu @ x_imu",
+    "time_offset_s": "t_imu = t_cam (1 + clock_skew) + this; null: estimated from the capture",
+    "gyro_bias_rad_s": "measured = gyro_scale x true + bias",
+    "response": "linear | srgb | gamma | five_segment | table; virest calibrate-curve",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class NewProfile:
+    """What ``virest profile new`` was asked for."""
+
+    capture: Path | None = None
+    device: str | None = None
+    size: tuple[int, int] | None = None
+    """Width, height."""
+    focal_px: float | None = None
+    fov_deg: float | None = None
+    """Along the frame's long side."""
+    out: Path = Path("camera.yaml")
+    overwrite: bool = False
+
+
+def run_new_profile(wishes: NewProfile) -> tuple[Json, str]:
+    """Write the profile; the mapping for ``--json`` and the text for people."""
+    if wishes.out.exists() and not wishes.overwrite:
+        raise OutputError(f"{wishes.out}: exists already", hint="name another by --out, or pass --overwrite")
+    profile, source = _base(wishes)
+    notes = [f"base: {source}"]
+    if (focal := _focal_px(wishes, profile)) is not None:
+        centre = (profile.width - 1) / 2, (profile.height - 1) / 2
+        lens = Intrinsics(profile.width, profile.height, focal, focal, *centre)
+        profile = replace(profile, intrinsics=lens)
+    if wishes.device is not None:
+        entry = _entry(wishes.device, profile)
+        shutter = replace(profile.shutter, readout_time_s=entry.readout_s)
+        profile = profile.with_estimate(
+            "readout_time_s", entry.readout_s, entry.std_s, entry.source, shutter=shutter, readout_known=True
+        )
+        profile = replace(profile, device=entry.device)
+        notes.append(
+            f"readout {1e3 * entry.readout_s:.2f} ms of {entry.device} at {entry.width}x{entry.height}: {entry.source}"
+        )
+    write_whole(wishes.out, commented(profile, notes).encode())
+    unknown = [name for name, known in (
+        ("focal length", profile.intrinsics is not None), ("readout time", profile.readout_known),
+        ("time offset", profile.time_offset_s is not None), ("response", profile.response is not None),
+    ) if not known]  # fmt: skip
+    if unknown:
+        notes.append(f"unknown: {', '.join(unknown)}; virest calibrate fits what the motion determines")
+    facts = {"profile": profile_mapping(profile), "path": str(wishes.out), "notes": notes}
+    return facts, "\n".join([*notes, f"wrote {wishes.out}"])
+
+
+def commented(profile: CameraProfile, notes: list[str]) -> str:
+    """The profile's YAML with a word on each key that readers ask about."""
+    lines = [f"# {note}" for note in notes]
+    for line in format_profile(profile).splitlines():
+        key = line.strip().partition(":")[0]
+        comment = COMMENTS.get(key)
+        if comment and "#" not in line:
+            lines.append(f"{line[: len(line) - len(line.lstrip())]}# {key}: {comment}")
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def known_devices(text: str) -> tuple[Json, str]:
+    """Entries of the table of readout times whose device matches."""
+    entries = find_readouts(text) if text else READOUTS
+    facts = {
+        "devices": [
+            {"device": e.device, "width": e.width, "height": e.height, "frame_rate_hz": e.frame_rate_hz,
+             "readout_s": e.readout_s, "std_s": e.std_s, "source": e.source}
+            for e in entries
+        ]
+    }  # fmt: skip
+    if not entries:
+        return facts, f"no device matches {text!r}; virest calibrate measures a readout time from a capture"
+    rows = [
+        [e.device, f"{e.width}x{e.height}", _ms(e.readout_s, 4), _ms(e.std_s, 2), e.source.partition(",")[0]]
+        for e in entries
+    ]
+    return facts, table(["device", "mode", "readout ms", "±", "source"], rows, words=1)
+
+
+def _ms(seconds: float | None, digits: int) -> str:
+    return "" if seconds is None else f"{1e3 * seconds:.{digits}g}"
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height of ``WxH``."""
+    found = re.fullmatch(r"\s*(\d{1,5})\s*[x×]\s*(\d{1,5})\s*", text)
+    if not found or not 0 < int(found[1]) <= 16384 or not 0 < int(found[2]) <= 16384:
+        raise SettingsError(f"size {text!r} is not WxH", hint="write 1920x1080, as stored in the movie")
+    return int(found[1]), int(found[2])
+
+
+def _base(wishes: NewProfile) -> tuple[CameraProfile, str]:
+    if wishes.capture is not None:
+        capture = read_capture(wishes.capture)
+        profile, source = resolve_profile(capture)
+        return profile, f"{capture.name}, {source}"
+    if wishes.size is None:
+        raise SettingsError("neither a capture nor a frame size is given", hint="pass CAPTURE, or --size WxH")
+    return phone_profile(*wishes.size), "a phone's usual axes"
+
+
+def _focal_px(wishes: NewProfile, profile: CameraProfile) -> float | None:
+    if wishes.focal_px is not None:
+        return wishes.focal_px
+    if wishes.fov_deg is None:
+        return None
+    if not 1 < wishes.fov_deg < 170:
+        raise SettingsError(f"field of view {wishes.fov_deg:g} is not in 1 to 170 degrees", hint="along the long side")
+    return max(profile.width, profile.height) / 2 / math.tan(math.radians(wishes.fov_deg) / 2)
+
+
+def _entry(device: str, profile: CameraProfile) -> Readout:
+    """The table's entry for the device, in the profile's mode where there are several."""
+    found = find_readouts(device)
+    if not found:
+        raise SettingsError(f"no readout time of {device!r} is known", hint="virest profile devices lists them")
+    size = sorted((profile.width, profile.height))
+    same = [entry for entry in found if sorted((entry.width, entry.height)) == size]
+    if not same:
+        modes = ", ".join(f"{entry.device} {entry.width}x{entry.height}" for entry in found)
+        raise SettingsError(
+            f"no readout time of {device!r} at {profile.width}x{profile.height} is known ({modes})",
+            hint="a readout holds for one mode; virest calibrate measures it",
+        )
+    return same[0]

@@ -1,0 +1,67 @@
+"""What became of the captures of a call, as a table of at most 80 columns, and which command helps next."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from virest.app import console
+from virest.app.account import PARTLY_FAILED, STATUSES
+
+MOST_NAME, MOST_VERDICT = 26, 24
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureOutcome:
+    """What became of one capture."""
+
+    name: str
+    path: str
+    """As it was given."""
+    folder: Path
+    counts: dict[str, int]
+    """Frames by status."""
+    verdict: str
+    seconds: float
+    """Wall-clock time of restoring, as the progress bar counts it; reading and planning come before."""
+    advice: str = ""
+    """The command that would make more of this capture; empty: none is known to."""
+    film: Path | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """9 where a frame failed."""
+        return PARTLY_FAILED if self.counts.get("failed") else 0
+
+
+def summary(outcomes: list[CaptureOutcome]) -> str:
+    """A table of the captures, where the results are, and what to do next."""
+    rows = []
+    for outcome in outcomes:
+        counts = [str(outcome.counts.get(status, 0)) for status in STATUSES]
+        rate = sum(map(int, counts)) / outcome.seconds if outcome.seconds else 0.0
+        verdict = outcome.verdict if len(outcomes) == 1 else _cut(outcome.verdict, MOST_VERDICT)
+        rows.append([_cut(outcome.name, MOST_NAME), *counts, f"{rate:.1f}" if rate else "-", verdict.partition(":")[0]])
+    lines = [console.table(["capture", *STATUSES, "frames/s", "verdict"], rows, words=1)]
+    lines += [f"wrote {outcome.folder}" for outcome in outcomes]
+    lines += [f"wrote {outcome.film}" for outcome in outcomes if outcome.film is not None]
+    return "\n".join([*lines, *next_steps(outcomes)])
+
+
+def next_steps(outcomes: list[CaptureOutcome]) -> list[str]:
+    """One line for a call: the command that helps most."""
+    if len(outcomes) > 1:
+        return [f"next: virest report {shlex.quote(str(outcomes[0].folder.parent))} shows them all"]
+    only = outcomes[0]
+    path, folder = shlex.quote(only.path), shlex.quote(str(only.folder))
+    extended = only.folder / "extended.yaml"
+    if only.advice:
+        return [f"next: {only.advice.replace('CAPTURE', path)}"]
+    if extended.is_file():
+        return [f"next: virest report {folder} shows it; a diagnosis is there: --config {shlex.quote(str(extended))}"]
+    return [f"next: virest report {folder} shows it; virest diagnose {path} tests the camera model"]
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"

@@ -1,0 +1,152 @@
+"""Write the documentation's pictures from simulated captures: ``python -m virest.app.pictures docs/images``.
+
+``make figures`` calls it, and virest.app.gallery for the gallery of effects.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.app.console import emit
+from virest.app.outputs import write_whole
+from virest.app.simulate import simulate_command
+from virest.camera.profile import CameraProfile
+from virest.capture.folder import Capture, read_capture, resolve_profile
+from virest.capture.video import probe_movie, read_frames
+from virest.degradation.blur import tile_grid
+from virest.degradation.kernels import blur_chords, kernel_field
+from virest.degradation.row_motion import row_motion
+from virest.motion.integration import integrate_gyro
+from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_figure
+from virest.restoration.capture import RestorationPlan, restore_frames
+from virest.restoration.settings import PRESETS
+
+Picture = NDArray[np.uint8]
+COLOURS = 192
+"""Of a palette picture: a third of the bytes. Photographs keep all of theirs."""
+PHOTOGRAPHS = ("before_after", "blur_paths")
+ARROW_STEP_PX = 80
+
+
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """One frame as recorded, as restored, and as it truly was."""
+
+    capture: Capture
+    profile: CameraProfile
+    frame: int
+    recorded: Picture
+    restored: Picture
+    truth: Picture
+
+
+def write_pictures(folder: Path) -> None:
+    """Write all pictures below ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as work:
+        photographs, board = _photographs(Path(work)), _board(Path(work))
+        files = {
+            "before_after": _before_after(photographs),
+            "rolling_shutter": _rolling_shutter(board),
+            "blur_paths": _blur_paths(photographs),
+            "rows": _rows(photographs),
+            "axes": axes_figure(),
+        }
+    for name, data in files.items():
+        file = data if name in PHOTOGRAPHS else compact(data)
+        write_whole(folder / f"{name}.png", file)
+        emit(f"{name}.png: {len(file) / 1000:.0f} KB")
+
+
+def compact(png: bytes) -> bytes:
+    """The same picture with a palette."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.open(io.BytesIO(png)).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
+        out, "png", optimize=True
+    )
+    return out.getvalue()
+
+
+def _photographs(work: Path) -> _Shot:
+    simulate_command(
+        work / "photographs", scene="photographs", width=960, height=720, frames=8, exposure_ms=12.0, readout_ms=25.0,
+        rate_rad_s=1.3, noise_levels=1.2, seed=52,
+    )  # fmt: skip
+    return _shot(work / "photographs", 4)
+
+
+def _board(work: Path) -> _Shot:
+    simulate_command(
+        work / "board", scene="board", width=960, height=720, frames=8, exposure_ms=5.0, readout_ms=30.0,
+        rate_rad_s=2.2, bitrate_bits_per_px=1.0, seed=41,
+    )  # fmt: skip
+    return _shot(work / "board", 4)
+
+
+def _shot(folder: Path, frame: int) -> _Shot:
+    capture = read_capture(folder)
+    profile = resolve_profile(capture)[0]
+    plan = RestorationPlan(profile, PRESETS["best"])
+    index, picture = next(read_frames(capture.movie, probe_movie(capture.movie), frame, frame))
+    restored = next(restore_frames([(capture.frames[index], picture)], capture.imu, plan)).picture
+    truth = cv2.imread(str(folder / "truth" / "frames" / f"{frame:06d}.png"))
+    if picture is None or restored is None or truth is None:
+        raise RuntimeError(f"{folder}: frame {frame} was not restored")
+    return _Shot(capture, profile, frame, picture, restored, np.ascontiguousarray(truth[..., ::-1]))
+
+
+def _before_after(shot: _Shot, side: int = 330, corner: tuple[int, int] = (600, 352)) -> bytes:
+    x, y = corner
+    pictures = (("as recorded", shot.recorded), ("restored", shot.restored), ("truth", shot.truth))
+    return strip_figure([(name, picture[y : y + side, x : x + side]) for name, picture in pictures])
+
+
+def _rolling_shutter(shot: _Shot) -> bytes:
+    names = ("as recorded", "restored", "truth")
+    pictures = (shot.recorded, shot.restored, shot.truth)
+    half = [cv2.resize(p, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA) for p in pictures]
+    return strip_figure([(name, np.asarray(picture)) for name, picture in zip(names, half, strict=True)])
+
+
+def _blur_paths(shot: _Shot) -> bytes:
+    """The frame's own forward model: chords and kernels as the restoration uses them."""
+    frame = shot.capture.frames[shot.frame]
+    trajectory = integrate_gyro(shot.capture.imu, shot.profile)
+    motion = row_motion(trajectory, shot.profile, frame.time_s, frame.exposure_s, "exposure-start")
+    height, width = shot.recorded.shape[:2]
+    centres = tile_grid(height, width, ARROW_STEP_PX, 0).centres_px
+    kernels = kernel_field(motion, centres).arrays(positive=True)
+    columns = len(np.unique(centres[:, 0]))
+    last = len(centres) - 1
+    shown = (0, columns - 1, last // 2, last - columns // 2, last - columns + 1, last)
+    return blur_figure(shot.recorded, centres, blur_chords(motion, centres), kernels, shown)
+
+
+def _rows(shot: _Shot) -> bytes:
+    shutter, height = shot.profile.shutter, shot.profile.height
+    exposure_s = shot.capture.frames[shot.frame].exposure_s or 0.0
+    plain = replace(shutter, readout_direction="top_to_bottom")
+    row_start_s = plain.readout_time_s * np.arange(height) / height
+    return rows_figure(row_start_s, exposure_s, plain.readout_time_s / 2 + exposure_s / 2)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """``python -m virest.app.pictures FOLDER``."""
+    parser = argparse.ArgumentParser(prog="python -m virest.app.pictures", description=__doc__)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("docs/images"))
+    write_pictures(parser.parse_args(arguments).folder)
+
+
+if __name__ == "__main__":
+    main()

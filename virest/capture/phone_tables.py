@@ -1,0 +1,39 @@
+"""What the readers of phone loggers share: separate gyroscope and accelerometer files, and the movie's own stamps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from virest.capture.records import Note
+from virest.capture.source import ORIGIN_NS
+from virest.capture.tables import Float64, Int64, StampTable
+from virest.capture.video import MovieIndex
+
+G_M_S2 = 9.80665
+NO_EXPOSURES = "the recorder logs no exposure times: frames are straightened, not deblurred, until they are known"
+
+
+def at_times(time_ns: Int64, other_ns: Int64, values: Float64) -> Float64:
+    """Samples (n, 3) of another sensor at these times, by straight lines; NaN beyond its own."""
+    if len(other_ns) < 2:
+        return np.full((len(time_ns), 3), np.nan)
+    zero = int(other_ns[0])
+    at, known = (time_ns - zero) * 1e-9, (other_ns - zero) * 1e-9
+    return np.stack([np.interp(at, known, values[:, k], np.nan, np.nan) for k in range(3)], axis=1)
+
+
+def movie_stamps(movie: MovieIndex, start_ns: int = ORIGIN_NS) -> StampTable:
+    """The movie's own time stamps, from a start on the inertial clock."""
+    return StampTable(movie.pts_ns + start_ns, None, len(movie), {})
+
+
+def note_exposures(notes: list[Note]) -> None:
+    """Say that deblurring needs what these recorders do not write."""
+    notes.append(Note("warning", "exposure-unknown", NO_EXPOSURES))
+
+
+def without_accelerometer(folder: Path, what: str, notes: list[Note]) -> None:
+    """Say that the accelerometer cannot be used, and why."""
+    notes.append(Note("warning", "accel-implausible", f"{folder.name}: {what}: the accelerometer is not used"))

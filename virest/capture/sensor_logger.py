@@ -1,0 +1,117 @@
+"""Sensor Logger (Android and iOS): a CSV file per sensor, and a movie below ``Camera/`` or beside them.
+
+    Gyroscope.csv           time (ns since 1970), seconds_elapsed, z, y, x (rad/s); columns are found by name
+    TotalAcceleration.csv   the same, m/s², with gravity; else Accelerometer.csv (without gravity) + Gravity.csv
+    Metadata.csv            `platform` is android or ios; on iOS accelerations have the other sign
+    Camera/<epoch ms>.mp4   named by the start of the session, some hundred milliseconds before its first frame
+
+Axes are the device's: x right, y up, z out of the screen.  Source: the app's published reference pages on coordinates,
+units and video synchronisation.  The movie's start is known to a second at best, so the time offset
+is left to be found.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from virest.capture.files import is_present, label, scan_text
+from virest.capture.phone_tables import at_times, movie_stamps, note_exposures, without_accelerometer
+from virest.capture.profile_source import phone_profile
+from virest.capture.records import Note
+from virest.capture.source import ONE_CLOCK, FileNames, Source, find_movie, present
+from virest.capture.tables import EdgeEpochs, Float64, GyroTable, Rows, make_gyro_table, read_rows
+from virest.capture.video import probe_movie
+from virest.errors import ImuError
+
+GYROSCOPE, TOTAL, LINEAR, GRAVITY = "Gyroscope.csv", "TotalAcceleration.csv", "Accelerometer.csv", "Gravity.csv"
+METADATA_CSV, CAMERA = "Metadata.csv", "Camera"
+HEAD = ("time", "seconds_elapsed")
+AXES = ("x", "y", "z")
+STEPS_PER_S = {10: 1, 13: 10**3, 16: 10**6, 19: 10**9}
+"""Digits of a time since 1970 in seconds, milliseconds, microseconds, nanoseconds."""
+HINT = "copy the whole folder that the app exports"
+
+
+def is_sensor_logger(folder: Path, names: set[str]) -> bool:
+    """Whether the folder holds this app's gyroscope file, told by its header."""
+    if GYROSCOPE not in names or not (folder / GYROSCOPE).is_file():
+        return False
+    try:
+        return columns_of(folder / GYROSCOPE)[:2] == HEAD
+    except ImuError:
+        return False
+
+
+def read_sensor_logger(folder: Path, notes: list[Note]) -> Source:
+    """Read an exported recording.  Raises CaptureError for what is missing or cannot be used."""
+    sensor = _read_sensor(folder / GYROSCOPE)
+    place = folder / CAMERA if (folder / CAMERA).is_dir() else folder
+    path = find_movie(place)
+    movie = probe_movie(path)
+    accel = _specific_force(folder, sensor, notes)
+    gyro: GyroTable = make_gyro_table(
+        folder / GYROSCOPE, sensor.time_ns, np.hstack([sensor.values, accel]), sensor.rows, sensor.dropped
+    )
+    start_ns = named_start_ns(path)
+    if start_ns is None or not gyro.time_ns[0] - 10**10 <= start_ns <= gyro.time_ns[-1]:
+        start_ns = int(gyro.time_ns[0])
+        text = f"{label(path)}: its name tells no start within the recording; taken as that of {GYROSCOPE}"
+        notes.append(Note("warning", "stamps-ambiguous", text))
+    note_exposures(notes)
+    names = FileNames(path.name, f"the PTS of {path.name}", path.name, GYROSCOPE)
+    inputs = (path, *present(folder, GYROSCOPE, TOTAL, LINEAR, GRAVITY, METADATA_CSV))
+    profile = phone_profile(movie.width, movie.height, "Sensor Logger")
+    epochs = EdgeEpochs(ONE_CLOCK, ())
+    return Source(
+        "Sensor Logger", path, movie, gyro, movie_stamps(movie, start_ns), None, epochs, names, profile, inputs
+    )
+
+
+def columns_of(path: Path) -> tuple[str, ...]:
+    """Names in a CSV file's first line, in small letters.  Raises ImuError where it is no text."""
+    head = scan_text(path, ImuError, HINT).head.lstrip("\ufeff").splitlines()
+    return tuple(name.strip().lower() for name in head[0].split(",")) if head else ()
+
+
+def named_start_ns(movie: Path) -> int | None:
+    """The start that a movie's name tells, in nanoseconds since 1970; None where it is no such number."""
+    digits = re.fullmatch(r"\d{10}(?:\d{3}){0,3}", movie.stem)
+    if digits is None:
+        return None
+    return int(movie.stem) * (10**9 // STEPS_PER_S[len(movie.stem)])
+
+
+def _read_sensor(path: Path) -> Rows:
+    """Time and x, y, z of a sensor's file, whatever the order of its columns."""
+    columns = columns_of(path)
+    missing = [axis for axis in AXES if axis not in columns]
+    if missing or columns[:1] != ("time",):
+        raise ImuError(f"{label(path)}: columns are {', '.join(columns)[:80]}", hint="time, seconds_elapsed, z, y, x")
+    return read_rows(path, [columns.index(axis) for axis in AXES], required=3, hint=HINT)
+
+
+def _specific_force(folder: Path, gyro: Rows, notes: list[Note]) -> Float64:
+    """What the accelerometer feels, m/s², +9.8 upwards at rest, at the gyroscope's times; NaN where it is not known."""
+    files = [name for name in (TOTAL,) if is_present(folder / name)]
+    files = files or [name for name in (LINEAR, GRAVITY) if is_present(folder / name)]
+    if files == [LINEAR] or files == [GRAVITY] or not files:
+        without_accelerometer(folder, f"it needs {TOTAL}, or {LINEAR} and {GRAVITY}", notes)
+        return np.full((len(gyro.time_ns), 3), np.nan)
+    parts = [_read_sensor(folder / name) for name in files]
+    total = np.sum([at_times(gyro.time_ns, part.time_ns, part.values) for part in parts], axis=0)
+    return -total if _is_ios(folder) else total
+
+
+def _is_ios(folder: Path) -> bool:
+    """Whether Metadata.csv names iOS, where accelerations have the other sign."""
+    path = folder / METADATA_CSV
+    if not path.is_file():
+        return False
+    lines = scan_text(path, ImuError, HINT).head.lstrip("\ufeff").splitlines()
+    if len(lines) < 2:
+        return False
+    said = dict(zip((name.strip().lower() for name in lines[0].split(",")), lines[1].split(","), strict=False))
+    return said.get("platform", "").strip().lower() == "ios"

@@ -1,0 +1,290 @@
+"""Sharpening that the phone applied, from the overshoot beside isolated edges that hardly blur.
+
+No blur of light takes a step above its bright side or below its dark one, and no response curve does; an unsharp mask
+``y + amount (y − G_radius ∗ y)`` does both.  Across a step that lens and path spread by a Gaussian of width s the
+profile is, as part of the step's height,
+
+    z(u) = Φ(u/s) + amount (Φ(u/s) − Φ(u/√(s² + radius²))),
+
+the linear form of Polesel, Ramponi & Mathews 2000 (doi:10.1109/83.826787).  A curve bends a profile and does not take
+it beyond its ends, so the mean of z(u) and 1 − z(−u) is fitted.  Where the step is wider than the mask, amount and
+radius show as amount · radius² alone; what phones use (AMOUNT, RADIUS_PX) then decides, and the deviations say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.optimize import least_squares
+from scipy.special import ndtr
+
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture, Frame
+from virest.diagnosis.catalogue import MAX_P
+from virest.diagnosis.findings import EDGES, Finding, HeldOutGain, ParameterChange, Rung
+from virest.diagnosis.local_blur import STILL_PX, frames_to_read, time_blocks
+from virest.diagnosis.local_blur_edges import TANGENT_PX, EdgeSettings, find_edges
+from virest.diagnosis.local_blur_model import across, path_tensors
+from virest.diagnosis.picture_ladder import PictureVerdict, Reader
+from virest.motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
+
+REACH_PX, STEP_PX = 9.0, 0.5
+PLATEAU_PX = 5.0
+"""Beyond this a profile must be flat; an unsharp mask of 2 px has faded by then."""
+MAX_PLATEAU_RMS = 0.04
+"""Of the plateaus about their levels, as part of the step."""
+MIN_STEP_LEVELS = 30.0
+UNCLIPPED_LEVELS = (6.0, 249.0)
+MAX_OFF_PX = 1.0
+"""Between a crest of the slope and the middle of its step."""
+SHARPEST = 0.4
+"""Part of the edges that is used, the sharpest: a soft step overshoots less."""
+MIN_USED = 60
+GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
+RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
+"""Of phones' unsharp masks, and how far it varies (in the logarithm): 0.8 to 2 px."""
+AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
+"""Of phones' unsharp masks, and how far it varies."""
+PROFILE_STD = 0.003
+"""Misfit of the mean profile, as part of the step; neighbours within a pixel share it."""
+BARE_OVERSHOOT, BARE_STD = 0.006, 0.007
+"""Of decoded movies that nobody sharpened, mean and spread: coding, interpolation, and the choice of sharp edges."""
+BARE_RADII_PX = (0.6, 2.2)
+"""How far a bare overshoot reaches: from interpolation's to that of edges which were picked for their sharpness."""
+SIZE_ERROR = 0.2
+"""Relative, of amount and radius: coding damps the overshoot at some frequencies more than at others."""
+BOUNDS = ([0.2, 0.0, np.log(0.4)], [3.0, 6.0, np.log(4.0)])
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeProfiles:
+    """Profiles across isolated edges that hardly moved, dark to bright, 0 and 1 at the plateaus."""
+
+    profile: Array
+    """(n, m) on GRID_PX, 0.5 at the middle."""
+    width_px: Array
+    """(n,) half of the distance between 0.16 and 0.84."""
+    stamp_s: Array
+    """(n,) of the frame."""
+
+    def __len__(self) -> int:
+        return len(self.profile)
+
+
+@dataclass(frozen=True, slots=True)
+class Sharpening:
+    """An unsharp mask that the edges show."""
+
+    amount: float
+    amount_std: float
+    radius_px: float
+    radius_std_px: float
+    overshoot: float
+    """Beyond the plateaus, both sides' mean, as part of the step."""
+    z: float
+    """Of the overshoot, less that of bare movies, in its deviations; of the weaker of the two sides."""
+    rms_before: float
+    """Of the mean profile on held-out time blocks, as part of the step, without and with the mask."""
+    rms_after: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such an overshoot on both sides where nobody sharpened."""
+        return float(stats.norm.sf(self.z))
+
+
+def judge_sharpening(capture: Capture, profile: CameraProfile, trajectory: Trajectory, gray: Reader) -> PictureVerdict:
+    """Name the sharpening, where edges overshoot by more than coding alone makes them."""
+    verdict = PictureVerdict(profile)
+    wanted = frames_to_read(capture)
+    found = fit_sharpening(observe_profiles(gray(wanted), capture.frames, profile, trajectory)) if wanted else None
+    if found is None:
+        verdict.notes.append("too few sharp, isolated edges: sharpening was not judged")
+    elif found.p_value < MAX_P:
+        values = {"amount": (found.amount, found.amount_std), "radius_px": (found.radius_px, found.radius_std_px)}
+        changes = {name: ParameterChange(0.0, value, std) for name, (value, std) in values.items()}
+        gain = HeldOutGain(EDGES, found.rms_before, found.rms_after, None)
+        sentence = (
+            f"edges overshoot by {found.overshoot:.0%} of their step: the phone sharpened its pictures by an unsharp "
+            f"mask of {found.amount:.2g} with a radius of {found.radius_px:.2g} px"
+        )
+        verdict.findings.append(Finding("sharpening", changes, gain, (), found.p_value, sentence))
+        verdict.rungs.append(Rung("sharpening", {"sharpening": found.rms_after}, found.rms_before, EDGES))
+    return verdict
+
+
+def observe_profiles(
+    pictures: Stream, frames: Sequence[Frame], profile: CameraProfile, trajectory: Trajectory
+) -> EdgeProfiles:
+    """Profiles of a stream of (movie index, grey (h, w)), in grey levels, for sharpening follows the curve."""
+    found, stamps = [np.zeros((0, len(GRID_PX)))], [np.zeros(0)]
+    for index, picture in pictures:
+        frame = frames[index]
+        if picture is None or not frame.exposure_s:
+            continue
+        points, normals = find_edges(picture, EdgeSettings())
+        count = np.ones(len(points))
+        tensors = path_tensors(frame.time_s * count, frame.exposure_s * count, points, profile, trajectory)
+        still = np.sqrt(across(tensors, normals)) < STILL_PX
+        found.append(_isolated(_sampled(picture, points[still], normals[still])))
+        stamps.append(np.full(len(found[-1]), frame.time_s))
+    return _measured(np.concatenate(found), np.concatenate(stamps))
+
+
+def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
+    """Amount and radius; None where there are too few sharp edges to tell."""
+    if len(edges) < MIN_USED / SHARPEST:
+        return None
+    sharp = edges.width_px <= np.quantile(edges.width_px, SHARPEST)
+    profiles, block = edges.profile[sharp], time_blocks(edges.stamp_s[sharp])
+    numbers = np.unique(block)
+    if len(profiles) < MIN_USED or len(numbers) < 4:
+        return None
+    mean = np.median(profiles, axis=0)
+    theta, covariance = _fit(_evened(mean))
+    without = [np.median(profiles[block != b], axis=0) for b in numbers]
+    scatter = _jackknife([_fit(_evened(one))[0] for one in without])
+    sides = np.array(_overshoots(mean))
+    sides_std = np.sqrt(np.diag(_jackknife([np.array(_overshoots(one)) for one in without])) + BARE_STD**2)
+    std = np.sqrt(np.diag(covariance + scatter + _by_bare_overshoot(_evened(mean), theta)))
+    amount, radius_px = float(theta[1]), float(np.exp(theta[2]))
+    before, after = _held_out(profiles, block)
+    return Sharpening(
+        amount,
+        float(np.hypot(std[1], SIZE_ERROR * amount)),
+        radius_px,
+        radius_px * float(np.hypot(std[2], SIZE_ERROR)),
+        float(sides.mean()),
+        float(((sides - BARE_OVERSHOOT) / sides_std).min()),
+        before,
+        after,
+    )
+
+
+def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
+    """z(u) on GRID_PX."""
+    step = ndtr(GRID_PX / width_px)
+    return np.asarray(step + amount * (step - ndtr(GRID_PX / np.hypot(width_px, radius_px))))
+
+
+# ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+_ALONG_PX = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
+
+
+def _sampled(picture: NDArray[np.uint8], points: Array, normals: Array) -> Array:
+    """Mean of parallel profiles (n, m), grey levels.
+
+    Lanczos over 8 pixels: OpenCV's cubic sharpens by itself, and doubles the overshoot of a bare movie.
+    """
+    tangents = np.stack([-normals[:, 1], normals[:, 0]], -1)
+    total = np.zeros((len(points), len(_ALONG_PX)))
+    if not len(points):
+        return total
+    for beside in TANGENT_PX:
+        where = (points + beside * tangents)[:, None] + _ALONG_PX[:, None] * normals[:, None]
+        x, y = where[..., 0].astype(np.float32), where[..., 1].astype(np.float32)
+        total += cv2.remap(picture.astype(np.float32), x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)
+    return total / len(TANGENT_PX)
+
+
+def _isolated(levels: Array) -> Array:
+    """Steps between two flat plateaus, as part of their height, their middle at 0: (n, m) on GRID_PX."""
+    low, high = UNCLIPPED_LEVELS
+    levels = levels[(levels.min(axis=1) > low) & (levels.max(axis=1) < high)]
+    dark, bright = _ALONG_PX <= -PLATEAU_PX, _ALONG_PX >= PLATEAU_PX
+    ends = [np.median(levels[:, side], axis=1) for side in (dark, bright)]
+    step = ends[1] - ends[0]
+    part = (levels - ends[0][:, None]) / np.maximum(step, 1e-3)[:, None]
+    rms = [np.sqrt(np.mean((part[:, side] - end) ** 2, axis=1)) for side, end in ((dark, 0.0), (bright, 1.0))]
+    part = part[(step > MIN_STEP_LEVELS) & (np.maximum(*rms) < MAX_PLATEAU_RMS)]
+    above = part >= 0.5
+    once = (np.diff(above.astype(np.int8), axis=1) != 0).sum(axis=1) == 1
+    part, above = part[once], above[once]
+    middle = _crossing(part, 0.5, _ALONG_PX)
+    return _moved(part[np.abs(middle) < MAX_OFF_PX], middle[np.abs(middle) < MAX_OFF_PX])
+
+
+def _moved(part: Array, middle: Array) -> Array:
+    """Profiles with their middles at 0, on GRID_PX, linear between samples."""
+    at = (GRID_PX + middle[:, None] - _ALONG_PX[0]) / STEP_PX
+    index = np.clip(at.astype(np.intp), 0, len(_ALONG_PX) - 2)
+    share = at - index
+    rows = np.arange(len(part))[:, None]
+    return np.asarray(part[rows, index] * (1 - share) + part[rows, index + 1] * share)
+
+
+def _crossing(part: Array, level: float, along_px: Array) -> Array:
+    """(n,) where profiles first rise to a level, linear between samples."""
+    if not len(part):
+        return np.zeros(0)
+    after = np.maximum(np.argmax(part >= level, axis=1), 1)
+    rows = np.arange(len(part))
+    below, above = part[rows, after - 1], part[rows, after]
+    share = np.clip((level - below) / np.where(above > below, above - below, 1.0), 0.0, 1.0)
+    return np.asarray(along_px[after - 1] + share * (along_px[1] - along_px[0]))
+
+
+def _measured(profiles: Array, stamp_s: Array) -> EdgeProfiles:
+    near = np.abs(GRID_PX) <= 3.0
+    width = _crossing(profiles[:, near], 0.84, GRID_PX[near]) - _crossing(profiles[:, near], 0.16, GRID_PX[near])
+    return EdgeProfiles(profiles, 0.5 * width, stamp_s)
+
+
+def _evened(mean: Array) -> Array:
+    return np.asarray(0.5 * (mean + 1.0 - mean[::-1]))
+
+
+def _overshoots(mean: Array) -> tuple[float, float]:
+    """Below the dark plateau and above the bright one."""
+    return -float(mean[GRID_PX < 0].min()), float(mean[GRID_PX > 0].max()) - 1.0
+
+
+def _fit(mean: Array) -> tuple[Array, Array]:
+    """Width, amount, log radius, and their covariance; amount and radius have priors."""
+    share = np.sqrt(GRID_PX[1] - GRID_PX[0]) / PROFILE_STD
+
+    def off(theta: Array) -> Array:
+        model = sharpened_step(theta[0], theta[1], float(np.exp(theta[2])))
+        prior = [(theta[1] - AMOUNT) / AMOUNT_SPREAD, (theta[2] - np.log(RADIUS_PX)) / RADIUS_SPREAD]
+        return np.append(share * (model - mean), prior)
+
+    start = [0.7, 0.3, np.log(RADIUS_PX)]
+    found = least_squares(off, start, bounds=BOUNDS)
+    return found.x, np.linalg.pinv(found.jac.T @ found.jac)
+
+
+def _by_bare_overshoot(mean: Array, theta: Array) -> Array:
+    """What the values move by, squared, if part of the overshoot is not sharpening's, whether narrow or wide."""
+    moved = np.zeros((3, 3))
+    for radius_px in BARE_RADII_PX:
+        bare = sharpened_step(theta[0], 1.0, radius_px) - sharpened_step(theta[0], 0.0, radius_px)
+        away = _fit(mean - np.hypot(BARE_OVERSHOOT, BARE_STD) / bare.max() * bare)[0] - theta
+        moved += np.outer(away, away)
+    return moved
+
+
+def _jackknife(values: Sequence[Array]) -> Array:
+    """Covariance of an estimate from those that leave out one block each."""
+    away = np.stack(values) - np.mean(values, axis=0)
+    return np.asarray(away.T @ away * (len(values) - 1) / len(values))
+
+
+def _held_out(profiles: Array, block: NDArray[np.intp]) -> tuple[float, float]:
+    """Rms of the mean profile of every other block about the step fitted to the rest, without and with a mask."""
+    odd = block % 2 == 1
+    seen, judged = (_evened(np.median(profiles[use], axis=0)) for use in (~odd, odd))
+    width = least_squares(lambda s: sharpened_step(s[0], 0.0, 1.0) - seen, [0.7], bounds=(BOUNDS[0][0], BOUNDS[1][0]))
+    theta, _ = _fit(seen)
+    models = sharpened_step(width.x[0], 0.0, 1.0), sharpened_step(theta[0], theta[1], float(np.exp(theta[2])))
+    before, after = (float(np.sqrt(np.mean((model - judged) ** 2))) for model in models)
+    return before, after

@@ -1,0 +1,135 @@
+"""What a profile may be wrong in beyond its ordinary doubts: where a fit of it begins, and how it is said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.motion import profile_terms as terms_of
+from virest.motion.track_fit import Term
+from virest.motion.track_model import TrackTable
+
+Array = NDArray[np.float64]
+SOURCE = "tracked points against the gyroscope, which contradict the profile's value"
+SKEW_REACH, SKEW_ERROR_S, MOST_SKEWS = 0.015, 0.01, 61
+"""Skews tried; so close that one of them is off by no more than this time at the capture's ends."""
+FOCAL_REACH, FOCAL_STEPS = 0.95, 20
+"""Logarithms of the focal scales tried: factors of 0.39 to 2.6."""
+FRACTIONS, CUTOFF_STEPS = (0.25, 0.5, 0.8), (-1.2, 0.0, 1.2)
+"""Stabilisers tried; cutoffs as logarithms of factors on the profile's."""
+MOST_STABILISED = 0.95
+"""A lens that takes all of the shake is none: such pictures were cropped and turned by software."""
+CUTOFF_HZ = (0.03, 15.0)
+"""Cutoffs that an optical stabiliser may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One thing that may be wrong."""
+
+    name: str
+    term: Term
+    starts: Callable[[TrackTable], Array]
+    """(n, k) changes of the term's values from which a fit may begin."""
+    plausible: Callable[[CameraProfile, CameraProfile], bool]
+    """Whether a phone can be like that: the profile given, the one found."""
+    change: Callable[[CameraProfile, CameraProfile], float]
+    """From the profile given to the one found, in the units of the term's first value."""
+    adopted: Callable[[CameraProfile, CameraProfile, Array], CameraProfile]
+    """A profile with this cause's values of the one found, and their deviations (k,) in the term's units."""
+    said: Callable[[CameraProfile, CameraProfile, Array], str]
+    """What is taken, in words: the profile given, the one found, deviations."""
+
+
+def _skews(table: TrackTable) -> Array:
+    span_s = max(float(np.abs(table.second_stamp_s).max()), 0.1)
+    count = min(2 * int(np.ceil(SKEW_REACH * span_s / (2 * SKEW_ERROR_S))) + 1, MOST_SKEWS)
+    return np.linspace(-SKEW_REACH, SKEW_REACH, max(count, 5))[:, None]
+
+
+def _focal_scales(_: TrackTable) -> Array:
+    return np.linspace(-FOCAL_REACH, FOCAL_REACH, FOCAL_STEPS)[:, None]
+
+
+def _stabilisers(_: TrackTable) -> Array:
+    return np.array([(fraction, step, 0.0, 0.0) for fraction in FRACTIONS for step in CUTOFF_STEPS])
+
+
+def _focal_px(profile: CameraProfile) -> float:
+    assert profile.intrinsics is not None
+    return profile.intrinsics.fx_px
+
+
+def _with_focal(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+    focal_px = _focal_px(found)
+    spread_px = focal_px * float(std[0])
+    return profile.with_estimate("fx_px", focal_px, spread_px, SOURCE, intrinsics=found.intrinsics)
+
+
+def _with_skew(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+    skew = found.clock_skew
+    return profile.with_estimate("clock_skew", skew, float(std[0]), SOURCE, clock_skew=skew)
+
+
+def _with_stabiliser(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+    ext = found.extensions
+    fraction, cutoff_hz = ext.stabilisation_fraction, ext.stabilisation_cutoff_hz
+    extensions = replace(
+        profile.extensions,
+        stabilisation_fraction=fraction,
+        stabilisation_cutoff_hz=cutoff_hz,
+        stabilisation_lean_rad=ext.stabilisation_lean_rad,
+    )
+    taken = profile.with_estimate("stabilisation_fraction", fraction, float(std[0]), SOURCE, extensions=extensions)
+    return taken.with_estimate("stabilisation_cutoff_hz", cutoff_hz, cutoff_hz * float(std[1]), SOURCE)
+
+
+def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
+    ext = found.extensions
+    return (
+        0 < ext.stabilisation_fraction < MOST_STABILISED and CUTOFF_HZ[0] < ext.stabilisation_cutoff_hz < CUTOFF_HZ[1]
+    )
+
+
+CAUSES = (
+    Cause(
+        "focal length",
+        replace(terms_of.FOCAL, prior_std=(0.6,)),
+        _focal_scales,
+        lambda given, found: 0.35 < _focal_px(found) / _focal_px(given) < 2.9,
+        lambda given, found: float(np.log(_focal_px(found) / _focal_px(given))),
+        _with_focal,
+        lambda given, found, std: (
+            f"focal length of {_focal_px(found):.1f} ± {_focal_px(found) * std[0]:.1f} px taken, "
+            f"where the profile has {_focal_px(given):.1f} px"
+        ),
+    ),
+    Cause(
+        "clock skew",
+        terms_of.CLOCK_SKEW,
+        _skews,
+        lambda given, found: abs(found.clock_skew - given.clock_skew) < 2 * SKEW_REACH,
+        lambda given, found: found.clock_skew - given.clock_skew,
+        _with_skew,
+        lambda given, found, std: (
+            f"clock skew of {found.clock_skew:+.5f} ± {std[0]:.5f} taken, where the profile has {given.clock_skew:+g}"
+        ),
+    ),
+    Cause(
+        "stabilisation",
+        terms_of.STABILISATION,
+        _stabilisers,
+        _is_stabiliser,
+        lambda given, found: found.extensions.stabilisation_fraction - given.extensions.stabilisation_fraction,
+        _with_stabiliser,
+        lambda given, found, std: (
+            f"stabiliser that cancels {found.extensions.stabilisation_fraction:.3f} ± {std[0]:.3f} of the shake above "
+            f"{found.extensions.stabilisation_cutoff_hz:.2g} Hz taken, where the profile has "
+            f"{given.extensions.stabilisation_fraction:g}"
+        ),
+    ),
+)

@@ -1,0 +1,123 @@
+"""A plan whose profile tracked points contradict: what is taken in its place, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture
+from virest.motion.coarse_alignment import SKEWS
+from virest.motion.integration import integrate_gyro
+from virest.motion.observed_tracks import ObservedTracks, guessed_lens, observe_tracks
+from virest.motion.tracking import TrackPair
+from virest.motion.turns import scan_offsets
+from virest.motion.visual_inertial import VisualInertialAlignment
+from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan
+from virest.restoration.profile_conflict import CONTRADICTED, MIN_PAIRS, Settled, settle_conflict
+
+OFFSET_SOURCE = "tracked points against the gyroscope"
+MAX_OFFSET_STD_S = 0.003
+"""An estimated offset known no better than this restores nothing: at a hand's 30 rad/s² the rates, and so the blur
+paths, would be off by 0.1 rad/s."""
+MAX_FOCAL_SPREAD = 0.05
+"""An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
+SEARCH_S, STEP_S = 1.0, 0.004
+FOLLOWED = 0.95
+"""Part of the points' motion that must be explained for a residual to be a matter of the scene, not of the clocks."""
+LEAST_EXPLAINED = 0.3
+"""Part of the turns that must be explained for a fit to begin there; the points judge where it ends."""
+
+
+def explains_points(alignment: VisualInertialAlignment) -> bool:
+    """Whether turning and travelling, by the profile, put all points where they were tracked."""
+    scales = [stretch.fit.scale for stretch in alignment.stretches]
+    return bool(scales) and max(scales) < CONTRADICTED
+
+
+def settle(
+    plan: RestorationPlan, given: CameraProfile, capture: Capture, pairs: Sequence[TrackPair]
+) -> tuple[RestorationPlan, bool]:
+    """The plan with what tracked points put in the place of values that they contradict, and a warning for each.
+
+    The second: whether the points follow the gyroscope beyond doubt, however the turns of whole frames compare.
+    """
+    offset_known, focal_known = given.time_offset_s is not None, plan.profile.intrinsics is not None
+    profile = plan.profile if focal_known else replace(plan.profile, intrinsics=guessed_lens(plan.profile))
+    observed = observe_tracks(capture, pairs, profile)
+    found = settle_conflict(observed, capture.imu, profile, offset_known=offset_known, focal_known=focal_known)
+    if found.contradicted and not found.taken and not offset_known:
+        begun = _begun(observed, capture, profile)
+        if begun is not None:
+            again = settle_conflict(observed, capture.imu, begun, offset_known=False, focal_known=focal_known)
+            found = again if again.after_px < found.after_px else found
+    followed = found.explained > FOLLOWED
+    if offset_known and not found.taken:
+        return (_said(plan, _unexplained(found)) if found.contradicted else plan), followed
+    if offset_known:
+        plan = replace(plan, profile=found.profile, copy_reason=None)
+        return _said(plan, *found.taken, *_rest(found)), followed
+    open_yet = plan.copy_reason is not None and plan.copy_reason.startswith(("time offset", FOCAL_UNKNOWN))
+    if not found.taken and not (followed and (open_yet or found.contradicted)):
+        return (_said(plan, _unexplained(found)) if found.contradicted else plan), followed
+    return _with_open_values(plan, found), followed
+
+
+def _said(plan: RestorationPlan, *texts: str) -> RestorationPlan:
+    return replace(plan, warnings=(*plan.warnings, *texts))
+
+
+def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
+    """Take over the offset, and perhaps the focal length, that the profile leaves open, beside what was taken."""
+    assert found.offset is not None
+    offset_s, std_s = found.offset
+    profile = found.profile
+    if found.focal is not None:
+        if found.focal[1] > MAX_FOCAL_SPREAD * found.focal[0]:
+            return plan
+        profile = replace(profile, intrinsics=None).with_focal(*found.focal, OFFSET_SOURCE)
+    profile = profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
+    kept = tuple(text for text in plan.warnings if not text.startswith("time offset"))
+    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
+    copy = f"time offset only known to ± {std_s * 1e3:.1f} ms" if std_s > MAX_OFFSET_STD_S else None
+    plan = replace(plan, profile=profile, warnings=kept, copy_reason=copy)
+    return _said(plan, *found.taken, *_rest(found), said)
+
+
+def _unexplained(found: Settled) -> str:
+    return (
+        f"tracked points lie {found.before_px:.2f} px from where the profile puts them (tracking noise "
+        f"{found.noise_px:.2f} px), and no focal length, clock skew or stabiliser explains that: virest diagnose"
+    )
+
+
+def _rest(found: Settled) -> tuple[str, ...]:
+    if found.after_px < CONTRADICTED * found.noise_px:
+        return ()
+    left = f"{found.after_px:.2f} px off (tracking noise {found.noise_px:.2f} px)"
+    return (f"tracked points still lie {left}: virest diagnose may find why",)
+
+
+def _begun(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
+    """The profile at the offset at which the turns of pictures and gyroscope agree best, at any focal length.
+
+    Several clock rates are tried, each with its offset as it is in the middle of the pairs.  None where turns agree
+    nowhere, or only at the end of the search.
+    """
+    observed = observed.covered(capture.imu, profile)
+    if len(observed.pairs) < MIN_PAIRS:
+        return None
+    turns, trajectory = observed.turns(profile), integrate_gyro(capture.imu, profile)
+    steps = int(np.ceil(SEARCH_S / STEP_S))
+    offsets = STEP_S * np.arange(-steps, steps + 1, dtype=float)
+    least, begun = 1 - LEAST_EXPLAINED, None
+    for skew in (0.0, *SKEWS):
+        scan = scan_offsets(turns, trajectory, profile.clock_skew + skew, offsets, free_gain=True)
+        best = int(np.argmax(scan.explained))
+        left = 1 - float(scan.explained[best])
+        if left < least and 0 < best < len(offsets) - 1:
+            least = left
+            begun = float(offsets[best] + skew * turns.middle_s.mean())
+    return None if begun is None else replace(profile, time_offset_s=begun)

@@ -1,0 +1,51 @@
+"""A recorder's start-up lag that no profile states: found from repeated frames and turns, and followed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture
+from virest.motion.observed_tracks import observe_tracks
+from virest.motion.recorder_lag import StartUpLag, fit_start_up_lag
+from virest.motion.tracking import track_pairs
+from virest.restoration.capture import RestorationPlan, at_true_times
+
+GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
+MIN_PAIRS = 8
+MOST_FRAMES = 90
+SOURCE = "repeated frames, and turns of the frames against the gyroscope's"
+
+
+def find_lag(capture: Capture, profile: CameraProfile, read_gray: GrayReader) -> StartUpLag | None:
+    """The lag of the first frames; None where none is seen, or turns agree no better with it than without."""
+    lagging = [frame.index for frame in capture.frames if frame.only_startup][:MOST_FRAMES]
+    if profile.extensions.frame_lag_frames or not capture.repeats or len(lagging) <= MIN_PAIRS:
+        return None
+    observed = observe_tracks(capture, list(track_pairs(read_gray(lagging))), profile)
+    if len(observed.pairs) < MIN_PAIRS:
+        return None
+    found = fit_start_up_lag(capture, observed, profile)
+    return found if found.determined else None
+
+
+def at_lag(capture: Capture, profile: CameraProfile, lag: StartUpLag) -> Capture:
+    """The capture with the frames of the start-up at the times and exposures of what they show."""
+    return replace(capture, frames=at_true_times(capture.frames, _followed(profile, lag), capture.repeats))
+
+
+def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
+    """A plan made for true times, with the lag in its profile and in what is said."""
+    contradicted = None if plan.contradicted is None else _followed(plan.contradicted, lag)
+    said = f"frame lag of {lag.lag_s:.2f} s at the start: the first {lag.frames} frames are taken at their true times"
+    profile = _followed(plan.profile, lag)
+    return replace(plan, profile=profile, contradicted=contradicted, warnings=(*plan.warnings, said))
+
+
+def _followed(profile: CameraProfile, lag: StartUpLag) -> CameraProfile:
+    extensions = replace(profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
+    return profile.with_estimate("lag_s", lag.lag_s, None, SOURCE, extensions=extensions)

@@ -1,0 +1,281 @@
+"""Tracked points against a profile: a wrong focal length, drifting clocks or a stabiliser, found and put right.
+
+Where points lie further from the profile's prediction than tracking errs, each cause is fitted with what any profile
+may be a little off in (clock, bias, axes, readout) beside it.  The cause that best predicts the blocks of time that it
+was not fitted to enters, and the next is sought beside it.  Nothing is taken unless all of it together explains most
+of the contradiction.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.motion import profile_terms as terms_of
+from virest.motion.observed_tracks import ObservedTracks
+from virest.motion.profile_terms import CLOCK_SKEW, shift_offset
+from virest.motion.scene_motion import DirectedMotion, Motion
+from virest.motion.track_fit import RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
+from virest.motion.track_model import TrackTable, ground
+from virest.motion.tracking_bias import bias_std
+from virest.restoration.conflict_causes import CAUSES, Cause
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+CONTRADICTED = 1.3
+"""Robust residual, in units of tracking's own noise, above which a cause is sought.  Right profiles leave 0.9 to 1.15
+(simulated captures, hand-held and walking); a stabiliser of a tenth or a focal length 2 % off leave more than 2."""
+MOST_LEFT = 0.5
+"""Part of the contradiction, as a variance beyond tracking's, that may remain for what was found to be taken."""
+HELD_OUT_P = 0.05
+"""One-sided, of the held-out blocks' mean gain by Student's t: what was fitted must carry over to other blocks."""
+VALUE_P = 1e-5
+"""Of a value being nought, with tracking's own bias in its deviation: with nine trials at most, a false cause in fewer
+than one capture of ten thousand."""
+MAX_CAUSES = 3
+JUDGED = 2
+"""Causes judged on held-out blocks each time, those first that fit best."""
+MIN_PAIRS, BLOCKS = 8, 8
+POINTS, START_POINTS, STARTS = 1500, 400, 2
+"""Points of a fit, and of the search for where it may begin; fits begin at the best few starts."""
+CAUCHY = 2.4
+MAX_ITERATIONS = 10
+START_INVERSE_DEPTH_PER_M = 0.5
+TRANSLATION_GAIN = 0.9
+"""A travelling camera is fitted where it leaves less than this part of what turning alone leaves."""
+NUISANCES = (
+    replace(terms_of.TIME_OFFSET, prior_std=(0.03,)),
+    replace(terms_of.GYRO_BIAS, prior_std=(0.02,) * 3),
+    replace(terms_of.IMU_ROTATION, prior_std=(0.03,) * 3),
+    replace(terms_of.READOUT, prior_std=(0.003,)),
+)
+"""What a profile may be a little off in."""
+UNKNOWN_READOUT_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """What points say of a profile."""
+
+    profile: CameraProfile
+    """As given, or with what was taken."""
+    contradicted: bool = False
+    """Whether points lie further off than tracking errs, by the profile given."""
+    taken: tuple[str, ...] = ()
+    """One line each, for people."""
+    before_px: float = 0.0
+    """Robust residual per coordinate, by the profile given."""
+    after_px: float = 0.0
+    noise_px: float = 0.0
+    """Typical noise of a tracked step."""
+    offset: tuple[float, float] | None = None
+    """Clock offset at the profile's readout, and its standard deviation, s, as fitted beside all else."""
+    motion_px: float = 0.0
+    """Typical way of a point from frame to frame, on the scale of the residuals."""
+    focal: tuple[float, float] | None = None
+    """Focal length and its standard deviation, px, where that was unknown."""
+
+    @property
+    def explained(self) -> float:
+        """Part of the points' motion, as a variance, that the profile explains with what was taken."""
+        return 1 - (self.after_px / self.motion_px) ** 2 if self.motion_px else 0.0
+
+
+def settle_conflict(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, *, offset_known: bool, focal_known: bool = True
+) -> Settled:
+    """Test a profile by tracked points, and put right what they contradict.
+
+    offset_known, focal_known: these are stated; otherwise they are fitted freely beside each cause.
+    """
+    observed = observed.covered(imu, profile)
+    if profile.intrinsics is None or len(observed.pairs) < MIN_PAIRS:
+        return Settled(profile)
+    nuisances = _nuisances(profile, offset_known, focal_known)
+    search = _Search(imu, observed.table(POINTS), observed.table(START_POINTS), profile, nuisances)
+    base = search.base()
+    noise_px = float(np.median(observed.noise_px))
+    readout_s, left_px = profile.shutter.readout_time_s, base.scale * noise_px
+    motion_px = _motion_px(search.table)
+    found = Settled(profile, False, (), left_px, left_px, noise_px, _offset(base, readout_s, noise_px), motion_px)
+    found = found if focal_known else replace(found, focal=_focal(base, noise_px))
+    if base.scale < CONTRADICTED:
+        return found
+    fit, causes = search.climbed(base)
+    log.debug("points lie %.2f off; %s leave %.2f", base.scale, [cause.name for cause in causes], fit.scale)
+    if not causes or fit.scale**2 - 1 > MOST_LEFT * (base.scale**2 - 1):
+        return replace(found, contradicted=True)
+    resolved = profile
+    stds = [_std(fit, cause, noise_px) for cause in causes]
+    for cause, std in zip(causes, stds, strict=True):
+        resolved = cause.adopted(resolved, fit.profile, std)
+    said = tuple(cause.said(profile, fit.profile, std) for cause, std in zip(causes, stds, strict=True))
+    offset = _offset(fit, readout_s, noise_px)
+    focal = None if focal_known else _focal(fit, noise_px)
+    after_px = fit.scale * noise_px
+    return Settled(resolved, True, said, left_px, after_px, noise_px, offset, motion_px, focal)
+
+
+def _offset(fit: TrackFit, readout_s: float, noise_px: float) -> tuple[float, float]:
+    """Clock offset that goes with a readout, the middle row kept where it was, and its deviation."""
+    offset_s = (fit.profile.time_offset_s or 0.0) + 0.5 * (fit.profile.shutter.readout_time_s - readout_s)
+    return offset_s, float(np.hypot(fit.std("time_offset")[0], bias_std(fit, "time_offset", noise_px)[0]))
+
+
+def _motion_px(table: TrackTable) -> float:
+    moved = np.linalg.norm(table.second_px - table.first_px, axis=-1)
+    return float(np.median(moved)) / RAYLEIGH_MEDIAN
+
+
+def _focal(fit: TrackFit, noise_px: float) -> tuple[float, float]:
+    assert fit.profile.intrinsics is not None
+    focal_px = fit.profile.intrinsics.fx_px
+    std = np.hypot(fit.std("focal_length"), bias_std(fit, "focal_length", noise_px))
+    return focal_px, focal_px * float(std[0])
+
+
+def _nuisances(profile: CameraProfile, offset_known: bool, focal_known: bool) -> tuple[Term, ...]:
+    offset, bias, rotation, readout = NUISANCES
+    if not offset_known:
+        offset = terms_of.TIME_OFFSET
+    if not profile.readout_known:
+        readout = replace(readout, prior_std=(UNKNOWN_READOUT_S,))
+    return (offset, bias, rotation, readout) if focal_known else (offset, bias, rotation, readout, terms_of.FOCAL)
+
+
+def _std(fit: TrackFit, cause: Cause, noise_px: float) -> Array:
+    return np.asarray(np.hypot(fit.std(cause.term.name), bias_std(fit, cause.term.name, noise_px)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """A profile to begin from, the causes in it, and how the camera travels."""
+
+    profile: CameraProfile
+    causes: tuple[Cause, ...]
+    scene: Motion | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """What stays the same through a search."""
+
+    imu: ImuSamples
+    table: TrackTable
+    few: TrackTable
+    given: CameraProfile
+    nuisances: tuple[Term, ...]
+
+    def base(self) -> TrackFit:
+        """The profile as given, with its nuisances: turning alone, or travelling where that explains more."""
+        plain = self.fit(_Start(self.given, (), None))
+        depth_m = self.given.depth_m
+        if plain.scale < CONTRADICTED or (depth_m is not None and np.isinf(depth_m)):
+            return plain
+        travelling = self.fit(_Start(self.given, (), self._travel()))
+        return travelling if travelling.scale < TRANSLATION_GAIN * plain.scale else plain
+
+    def _travel(self) -> Motion:
+        known = ground(self.imu, self.given, translation=True)
+        if known.displacement is None:
+            return many_directions(self.table)
+        depth_m = self.given.depth_m
+        return start_scene(self.imu, known, self.table, 1 / depth_m if depth_m else START_INVERSE_DEPTH_PER_M)
+
+    def fit(self, start: _Start, use: NDArray[np.bool_] | None = None) -> TrackFit:
+        """Fit the nuisances and the causes, on some of the points."""
+        table = self.table if use is None else self.table.chosen(use)
+        terms = (*self.nuisances, *(cause.term for cause in start.causes))
+        return fit_tracks(self.imu, table, start.profile, terms, start.scene, max_iterations=MAX_ITERATIONS)
+
+    def climbed(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
+        """Causes that enter one after the other, and the fit with all of them."""
+        here, fit = _Start(self.given, (), None if base.scene is None else self._travel()), base
+        while len(here.causes) < MAX_CAUSES and fit.scale >= CONTRADICTED:
+            entered = self._next(here, fit)
+            if entered is None:
+                break
+            here, fit = entered
+        return fit, here.causes
+
+    def _next(self, here: _Start, fit: TrackFit) -> tuple[_Start, TrackFit] | None:
+        """The cause that best predicts held-out blocks, if it does so beyond chance and has a value of its own."""
+        fitted = {term.name for term in (*self.nuisances, *(cause.term for cause in here.causes))}
+        open_causes = [cause for cause in CAUSES if cause.term.name not in fitted]
+        tried = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
+        without = None
+        for start, found in sorted(tried, key=lambda one: one[1].cost)[:JUDGED]:
+            if found.cost >= fit.cost or found.scale >= fit.scale or not self._has_value(start, found):
+                continue
+            without = self._held_out(here, fit) if without is None else without
+            scale = min(fit.scale, found.scale)
+            gain = self._block_loss(without, scale) - self._block_loss(self._held_out(start, found), scale)
+            if _p_of_mean(gain) < HELD_OUT_P:
+                return start, found
+        return None
+
+    def _best(self, here: _Start, fit: TrackFit, cause: Cause) -> tuple[_Start, TrackFit] | None:
+        """The cause's best fit from the best of its starts, of both clocks: as given, and as fitted without it."""
+        starts = [
+            cause.term.change(profile, step)
+            for profile in (here.profile, fit.profile)
+            for step in cause.starts(self.table)
+        ]
+        if cause.term is CLOCK_SKEW:
+            middle_s = float(np.mean(self.table.second_stamp_s))
+            moved = [(profile.clock_skew - self.given.clock_skew) * middle_s for profile in starts]
+            starts += [shift_offset(p, np.array([-moved_s])) for p, moved_s in zip(starts, moved, strict=True)]
+        off = [self._off(profile, here.scene) for profile in starts]
+        found = []
+        for number in np.argsort(off)[:STARTS]:
+            start = _Start(starts[int(number)], (*here.causes, cause), here.scene)
+            found.append((start, self.fit(start)))
+        return min(found, key=lambda one: one[1].cost, default=None)
+
+    def _off(self, profile: CameraProfile, scene: Motion | None) -> float:
+        """Typical distance of a few points from where a profile puts them."""
+        fit = fit_tracks(self.imu, self.few, profile, (), scene, max_iterations=0)
+        return float(np.median(fit.distance))
+
+    def _has_value(self, start: _Start, fit: TrackFit) -> bool:
+        """Whether the cause that entered last has a value that a phone can have, and not by chance."""
+        cause, found = start.causes[-1], fit.profile
+        ratio = cause.change(self.given, found) / _std(fit, cause, float(np.median(self.table.noise_px)))[0]
+        return cause.plausible(self.given, found) and float(stats.chi2.sf(ratio**2, 1)) < VALUE_P
+
+    def _held_out(self, start: _Start, fit: TrackFit) -> Array:
+        """Whitened distances (n,) of all points from fits that did not see their block."""
+        block = self._block()
+        distance = np.empty(len(self.table))
+        for fold in (0, 1):
+            seen = block % 2 != fold
+            own = self.fit(start, seen)
+            scene = many_directions(self.table) if isinstance(own.scene, DirectedMotion) else own.scene
+            everywhere = fit_tracks(self.imu, self.table, own.profile, (), scene, max_iterations=0, known=own.ground)
+            distance[~seen] = everywhere.distance_at(fit.depth_spread_per_m)[~seen]
+        return distance
+
+    def _block(self) -> NDArray[np.intp]:
+        """(n,) number of each point's block of time."""
+        pairs = self.table.n_pairs
+        return np.asarray(self.table.pair * min(BLOCKS, pairs) // pairs)
+
+    def _block_loss(self, distance: Array, scale: float) -> Array:
+        """(blocks,) mean Cauchy loss."""
+        block = self._block()
+        loss = np.log1p((distance / (CAUCHY * scale)) ** 2)
+        return np.asarray(np.bincount(block, loss) / np.maximum(np.bincount(block), 1))
+
+
+def _p_of_mean(gain: Array) -> float:
+    """One-sided probability of so large a mean gain by chance."""
+    if len(gain) < 3 or gain.mean() <= 0:
+        return 1.0
+    return float(stats.t.sf(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-12), len(gain) - 1))
