@@ -27,7 +27,7 @@ from virest.errors import CalibrationError, OutputError
 from virest.motion.shared_out import Each
 
 CAUSE_KEYS = {"name", "parameters", "held_out", "rivals", "p_value", "sentence", "figures"}
-TOP_KEYS = {"schema", "verdict", "nominal", "causes", "unexplained", "restoration_gain", "extended_profile"}
+TOP_KEYS = {"schema", "verdict", "nominal", "causes", "fields", "unexplained", "restoration_gain", "extended_profile"}
 NOMINAL_KEYS = {"geometry_rms_px", "geometry_noise_px", "photometric_rms", "blur_rms_px", "tracks", "frames"}
 DRAW_FIGURES = diagnose.draw_figures
 Say = Callable[[str, float], None]

@@ -23,7 +23,7 @@ from virest.camera.profile import CameraProfile, format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames
-from virest.diagnosis.findings import CONSISTENT, Diagnosis, Finding, Remaining, Rung
+from virest.diagnosis.findings import CONSISTENT, Diagnosis, FieldFinding, Finding, Remaining, Rung
 from virest.diagnosis.restoration_gain import (
     RestorationGain,
     chosen_pairs,
@@ -32,6 +32,7 @@ from virest.diagnosis.restoration_gain import (
 )
 from virest.errors import OutputError, VirestError
 from virest.motion.shared_out import Each, one_by_one
+from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
 from virest.report.words import residual_words
 from virest.restoration.capture import RestorationPlan
@@ -48,7 +49,7 @@ Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
 SCHEMA = "virest/diagnosis/1"
 DIAGNOSIS, EXTENDED, FIGURES = "diagnosis.json", "extended.yaml", "figures"
-OWN_FIGURES = re.compile(r"(pictures|residuals|ladder|\d\d_[a-z_]+)\.png")
+OWN_FIGURES = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.png")
 NOT_CONSISTENT = 10
 LADDER_PART, GAIN_PART = 0.85, 0.95
 """Where the ladder and the restorations end on the way from 0 to 1."""
@@ -200,6 +201,7 @@ def as_json(found: Diagnosis, gain: RestorationGain, figures: Sequence[Sequence[
             "frames": nominal.frames,
         },
         "causes": [_cause(cause, paths) for cause, paths in zip(found.causes, figures, strict=True)],
+        "fields": [_field(field, number) for number, field in enumerate(found.fields, start=1)],
         "unexplained": {
             "p_value": found.unexplained.p_value,
             "strongest_along": found.unexplained.strongest_along,
@@ -232,6 +234,36 @@ def _cause(cause: Finding, figures: Sequence[str]) -> Json:
     }
 
 
+def _field(field: FieldFinding, number: int) -> Json:
+    held_out = field.held_out
+    return {
+        "covariates": list(field.covariates),
+        "kind": field.kind,
+        "shape": field.shape,
+        "sentence": field.sentence,
+        "size": field.size,
+        "unit": field.unit,
+        "std": field.std,
+        "held_out": {
+            "metric": held_out.quantity,
+            "before": held_out.before,
+            "after": held_out.after,
+            "gain": held_out.gain,
+        },
+        "p_value": field.p_value,
+        "confounded": list(field.confounded),
+        "stability": field.stability,
+        "reasons": field.reasons,
+        "next": field.next,
+        "imu_untrusted_s": [list(stretch) for stretch in field.stretches_s],
+        "figure": _field_path(number) if field.fields else None,
+    }
+
+
+def _field_path(number: int) -> str:
+    return f"{FIGURES}/field_{number:02d}.png"
+
+
 # ── extended.yaml ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -243,7 +275,8 @@ def extended_text(name: str, found: Diagnosis) -> str:
             if np.size(change.estimate) <= SHOWN_COMPONENTS:
                 estimate, std = plain(change.estimate), _plain_std(change.std)
                 profile = profile.with_estimate(parameter, estimate, std, f"virest diagnose, {cause.name}")
-    names = ", ".join(cause.name for cause in found.causes) or "nothing to add"
+    fields = [f"{field.kind} over {', '.join(field.covariates)}" for field in found.fields]
+    names = ", ".join([*(cause.name for cause in found.causes), *fields]) or "nothing to add"
     head = f"Camera profile by virest diagnose, from {name}: {found.verdict}: {names}"
     return f"# {' '.join(head.split())}\n{format_profile(profile)}"
 
@@ -278,6 +311,9 @@ def draw_figures(
         if rung is not None:
             drawings[own] = (ladder_figure, [_bars(rung)], f"{capture.name}: {cause.name}")
         drawn.append([own] if rung is not None else [])
+    for number, field in enumerate(found.fields, start=1):
+        if field.fields:
+            drawings[_field_path(number)] = (field_figure, field, f"{capture.name}: {field.kind}", before, after)
     shots = _shots(capture, found)
     calls = [(simulated_frame, *shot) for shot in shots.values()]
     done = each(_called, [*calls, *drawings.values()])
@@ -304,7 +340,7 @@ def _shots(capture: Capture, found: Diagnosis) -> dict[str, tuple[Capture, Camer
     if not firsts:
         return {}
     profiles = {"profile as given": found.nominal_profile}
-    if found.causes:
+    if found.causes or found.fields:
         profiles["causes built in"] = found.extended_profile
     return {label: (capture, profile, firsts[len(firsts) // 2]) for label, profile in profiles.items()}
 
@@ -381,6 +417,9 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
         header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
         lines.append(table(header, [row for cause in found.causes for row in _rows(cause)]))
         lines += [f"{cause.name}: {_one_line(cause.sentence)}" for cause in found.causes]
+    for field in found.fields:
+        lines.append(f"field: {_one_line(field.sentence)}")
+        lines.append(f"  likely: {field.reasons}; to tell: {field.next}")
     lines += [_gain_line(gain), _remaining_line(found.unexplained)]
     lines += [f"note: {_one_line(note)}" for note in found.notes]
     lines.append(f"wrote {folder / DIAGNOSIS}, {EXTENDED} and figures")

@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 REPORT = "report.html"
 RUN, DIAGNOSIS, EXTENDED, FIGURES = "run.json", "diagnosis.json", "extended.yaml", "figures"
-FIGURE = re.compile(r"(pictures|residuals|ladder|\d\d_[a-z_]+)\.png")
+FIGURE = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.png")
 """What `diagnose` calls its figures; nothing else is looked at, whatever a diagnosis.json names."""
 FRAMES_SHOWN, MOST_FRAMES = 6, 24
 """Of one capture, and of all captures of a page together, where no number is asked for."""
@@ -197,11 +197,18 @@ class _Cause(_Lenient):
     rivals: list[_Rival] = Field(default_factory=list)
 
 
+class _Field(_Lenient):
+    sentence: str = ""
+    reasons: str = ""
+    next: str = ""
+
+
 class _Diagnosis(_Lenient):
     schema_: str = Field(alias="schema", pattern="^virest/diagnosis/")
     verdict: str
     nominal: dict[str, float | str | None] = Field(default_factory=dict)
     causes: list[_Cause] = Field(default_factory=list)
+    fields: list[_Field] = Field(default_factory=list)
     unexplained: dict[str, float | str | None] = Field(default_factory=dict)
     restoration_gain: dict[str, Any] = Field(default_factory=dict)
 

@@ -13,6 +13,7 @@ from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure
 from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
+from virest.simulation.hidden import NOTHING, Hidden
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import Session, SessionSettings, nominal_camera, plan_session
@@ -51,6 +52,7 @@ def simulate_command(
     reference: str = "exposure-start",
     overwrite: bool = False,
     profile: CameraProfile | None = None,
+    hidden: Hidden = NOTHING,
     isp: PhoneIsp = OFF,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -63,6 +65,7 @@ def simulate_command(
     upright picture and top_to_bottom for one on its side, unless given.  depth_m: distance of the scene's plane, None
     for infinity.
     effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), hidden from everything but ``truth/``.
+    hidden: effects that have no name, for tests.
     reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  profile: use this camera as the nominal
     one; width, height, focal_px, distortion, readout_ms, direction and response are then taken from it.
     isp: the phone's own processing; truth/ shows its global curves, the capture's profile nothing of it.
@@ -99,7 +102,7 @@ def simulate_command(
         seed=seed,
         isp=isp,
     )
-    session = plan_session(nominal, isp.true_profile(true), settings)
+    session = plan_session(nominal, isp.true_profile(true), settings, hidden=hidden)
     bits_per_px = isp.bits_per_px or bitrate_bits_per_px
     options = RecordingOptions(layout, clock, bits_per_px, crf, middle_truth=reference == "frame-middle")
     folder = write_recording(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.field import Field
 from virest.errors import SettingsError
 
 COEFFICIENT_NAMES: dict[str, tuple[str, ...]] = {
@@ -39,6 +40,8 @@ class Intrinsics:
     """``none``, ``radtan`` or ``fisheye``."""
     coefficients: tuple[float, ...] = ()
     """In the order of COEFFICIENT_NAMES."""
+    displaced: Field | None = None
+    """How far points lie from where the model puts them; None: the model holds."""
 
     def __post_init__(self) -> None:
         if self.model not in COEFFICIENT_NAMES:
@@ -60,7 +63,7 @@ class Intrinsics:
     @property
     def is_distorted(self) -> bool:
         """Whether distortion changes any pixel: the equidistant fisheye does even with zero coefficients."""
-        return self.model == "fisheye" or any(self.coefficients)
+        return self.model == "fisheye" or any(self.coefficients) or self.displaced is not None
 
     def scaled_focal(self, scale: float) -> Intrinsics:
         """The same lens with both focal lengths multiplied by ``scale``."""
@@ -69,16 +72,19 @@ class Intrinsics:
     def project(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels (..., 2) of rays (..., 3) in camera axes; z > 0 is in front of the camera."""
         plane = rays[..., :2] / rays[..., 2:]
-        return self._distort(plane) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
+        points = self._distort(plane) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
+        return points if self.displaced is None else points + self.displaced.at(points[..., 0], points[..., 1])
 
     def rays(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rays (..., 3) with z = 1 through pixels (..., 2): the inverse of :meth:`project`."""
+        if self.displaced is not None:
+            points_px = self.displaced.undisplaced(points_px)
         distorted = (np.asarray(points_px, float) - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
         plane = self._undistort(distorted)
         return np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
 
     def _distort(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not self.is_distorted:
+        if self.model != "fisheye" and not any(self.coefficients):
             return plane
         if self.model == "fisheye":
             radius = np.linalg.norm(plane, axis=-1, keepdims=True)
@@ -96,7 +102,7 @@ class Intrinsics:
 
     def _undistort(self, distorted: NDArray[np.float64]) -> NDArray[np.float64]:
         """Newton's method on the distortion; the Jacobian is taken as the local radial scale."""
-        if not self.is_distorted:
+        if self.model != "fisheye" and not any(self.coefficients):
             return distorted
         if self.model == "fisheye":
             angle = np.linalg.norm(distorted, axis=-1, keepdims=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +19,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from virest.camera.field import Field as ModelField
 from virest.camera.intrinsics import COEFFICIENT_NAMES, Intrinsics
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
@@ -26,6 +28,8 @@ from virest.errors import SettingsError
 MAX_PROFILE_BYTES = 1_000_000
 MAX_SIDE_PX = 20_000
 MAX_DEPTH = 20
+BRIDGE_SLACK_S = 1e-3
+"""A bridge may end this far from its stretch, as either is rounded."""
 LARGEST = 1e12
 """No value of a profile is larger: between clocks of different epochs lie 2e9 s.  Far beyond, products overflow."""
 OPENCV_HEAD = re.compile(r"\A\ufeff?%YAML:1\.0[^\n]*")
@@ -63,6 +67,8 @@ class Extensions:
     defocus_sigma_px: float = 0.0
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
     """θ about x and y with which the inertial log begins; fitted on the way, and in no file: it is soon forgotten."""
+    field: tuple[ModelField, ...] = ()
+    """Fields of kind ``scale`` and ``rate``; the shutter and the lens hold theirs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +101,44 @@ class CameraProfile:
     """None: to be triangulated; inf: rotation only."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
     extensions: Extensions = field(default_factory=Extensions)
+    imu_untrusted_s: tuple[tuple[float, float], ...] = ()
+    """Stretches (from, to) of the inertial log, from stamp_0, that do not follow the camera."""
+    imu_untrusted_stamp_0_ns: int | None = None
+    """First stamp of the only capture that these stretches belong to; None: any."""
     lens_shape: Intrinsics | None = None
     """Principal point and distortion where these are known and the focal length is not: its focal length is nominal."""
+
+    @property
+    def fields(self) -> tuple[ModelField, ...]:
+        """All fields: the shutter's, the lens's and the extensions'."""
+        lens = self.intrinsics
+        own = (self.shutter.uneven, None if lens is None else lens.displaced)
+        return (*(f for f in own if f is not None), *self.extensions.field)
+
+    @property
+    def unbridged_s(self) -> tuple[tuple[float, float], ...]:
+        """Untrusted stretches of the inertial log that no field of the rate over their time bridges."""
+        knots = [f.knots[0] for f in self.extensions.field if f.kind == "rate" and f.covariates == ("time",)]
+        bridged = np.array([(k[0], k[-1]) for k in knots]).reshape(-1, 2)
+        return tuple(s for s in self.imu_untrusted_s if not np.any(np.abs(bridged - s).max(axis=1) < BRIDGE_SLACK_S))
+
+    def with_fields(self, fields: Sequence[ModelField]) -> CameraProfile:
+        """The profile with these fields and no others. Raises SettingsError for two of a kind of which one is held."""
+        held: dict[str, list[ModelField]] = {"delay": [], "displacement": [], "": []}
+        for entry in fields:
+            held.get(entry.kind, held[""]).append(entry)
+        if max(len(held["delay"]), len(held["displacement"])) > 1:
+            raise SettingsError("extensions.field: one delay and one displacement at most", hint="add their values up")
+        uneven, displaced = (next(iter(held[kind]), None) for kind in ("delay", "displacement"))
+        lens = self.intrinsics
+        if lens is None and displaced is not None:
+            raise SettingsError("extensions.field: a displacement needs a focal length", hint="set intrinsics.fx_px")
+        return replace(
+            self,
+            shutter=replace(self.shutter, uneven=uneven),
+            intrinsics=None if lens is None else replace(lens, displaced=displaced),
+            extensions=replace(self.extensions, field=tuple(held[""])),
+        )
 
     @property
     def rotation_cam_imu(self) -> NDArray[np.float64]:
@@ -274,6 +316,16 @@ class _Defocus(_Strict):
     sigma_px: Annotated[Number, Field(ge=0, le=100)] = 0.0
 
 
+class _Field(_Strict):
+    version: Literal[1] = 1
+    kind: Literal["delay", "displacement", "scale", "rate"]
+    covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
+    knots: Annotated[list[Annotated[list[Number], Field(max_length=200)]], Field(min_length=1, max_length=2)]
+    values: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)]
+    std: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)] = []
+    stamp_0_ns: int | None = None
+
+
 class _Extensions(_Strict):
     focal_drift: _FocalDrift = _FocalDrift()
     stabilisation: _Stabilisation = _Stabilisation()
@@ -284,6 +336,7 @@ class _Extensions(_Strict):
     flicker: _Flicker = _Flicker()
     gain: list[Positive] = []
     defocus: _Defocus = _Defocus()
+    field: Annotated[list[_Field], Field(max_length=500)] = []
 
 
 class _Estimate(_Strict):
@@ -304,6 +357,14 @@ class _Profile(_Strict):
     scene: _Scene = _Scene()
     estimates: dict[str, _Estimate] | None = None
     extensions: _Extensions | None = None
+    imu_untrusted_s: Annotated[list[Pair], Field(max_length=10_000)] = []
+    imu_untrusted_stamp_0_ns: int | None = None
+
+    @model_validator(mode="after")
+    def _stretches_end_later(self) -> _Profile:
+        if any(start >= end for start, end in self.imu_untrusted_s):
+            raise ValueError("imu_untrusted_s: each stretch must end after it starts")
+        return self
 
 
 def read_profile(path: Path) -> CameraProfile:
@@ -444,7 +505,7 @@ def _from_model(model: _Profile) -> CameraProfile:
     response = _response(model.response, extensions)
     if response is None and (extensions.response_gamma != 1.0 or extensions.black_level):
         response = ResponseCurve("srgb", extra_gamma=extensions.response_gamma, black_level=extensions.black_level)
-    return CameraProfile(
+    profile = CameraProfile(
         width=width,
         height=height,
         device=model.device,
@@ -482,7 +543,15 @@ def _from_model(model: _Profile) -> CameraProfile:
             gain=tuple(extensions.gain),
             defocus_sigma_px=extensions.defocus.sigma_px,
         ),
+        imu_untrusted_s=tuple(map(_pair, model.imu_untrusted_s)),
+        imu_untrusted_stamp_0_ns=model.imu_untrusted_stamp_0_ns,
     )
+    return profile.with_fields([_field(block) for block in extensions.field]) if extensions.field else profile
+
+
+def _field(block: _Field) -> ModelField:
+    knots, values, std = (tuple(map(tuple, rows)) for rows in (block.knots, block.values, block.std))
+    return ModelField(block.kind, tuple(block.covariates), knots, values, std, block.stamp_0_ns)
 
 
 def _triple(values: list[float]) -> tuple[float, float, float]:
@@ -602,6 +671,13 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         extensions["gain"] = list(ext.gain)
     if ext.defocus_sigma_px:
         extensions["defocus"] = {"sigma_px": ext.defocus_sigma_px}
+    if profile.fields:
+        extensions["field"] = [_field_block(entry) for entry in profile.fields]
+    stretches: dict[str, Any] = {}
+    if profile.imu_untrusted_s:
+        stretches["imu_untrusted_s"] = [list(stretch) for stretch in profile.imu_untrusted_s]
+        if profile.imu_untrusted_stamp_0_ns is not None:
+            stretches["imu_untrusted_stamp_0_ns"] = profile.imu_untrusted_stamp_0_ns
     return {
         "virest_profile": 1,
         "device": profile.device,
@@ -635,7 +711,16 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         "scene": {"depth_m": "inf" if depth == math.inf else depth},
         "estimates": {n: {"value": e.value, "std": e.std, "source": e.source} for n, e in profile.estimates.items()},
         "extensions": extensions,
+        **stretches,
     }
+
+
+def _field_block(entry: ModelField) -> dict[str, Any]:
+    block: dict[str, Any] = {"version": 1, "kind": entry.kind, "covariates": list(entry.covariates)}
+    for name in ("knots", "values", "std"):
+        if rows := getattr(entry, name):
+            block[name] = [list(row) for row in rows]
+    return block if entry.stamp_0_ns is None else {**block, "stamp_0_ns": entry.stamp_0_ns}
 
 
 def format_profile(profile: CameraProfile) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.field import Field
 from virest.errors import SettingsError
 
 READOUT_DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
@@ -27,6 +28,8 @@ class Shutter:
     """What a stamp means, of the first row read; a key of STAMP_FRACTION."""
     exposure_scale: float = 1.0
     """True exposure = logged exposure x this."""
+    uneven: Field | None = None
+    """By how much later than evenly the rows start; None: they are read evenly."""
 
     def __post_init__(self) -> None:
         if self.readout_direction not in READOUT_DIRECTIONS:
@@ -40,10 +43,17 @@ class Shutter:
         return self.readout_direction in ("left_to_right", "right_to_left")
 
     def readout_fraction(self, points_px: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
-        """Fraction s of the readout at which pixels (..., 2) start, 0 for the first row read.
+        """Fraction s of the readout time at which pixels (..., 2) start, 0 for the first row read.
 
-        Linear in the pixel's coordinate and not clipped, so it also holds a little outside the picture.
+        Not clipped, so it also holds a little outside the picture.
         """
+        even = self.row_fraction(points_px, width, height)
+        if self.uneven is None or not self.readout_time_s:
+            return even
+        return even + self.uneven.at(even)[..., 0] / self.readout_time_s
+
+    def row_fraction(self, points_px: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
+        """Place of pixels (..., 2) among the rows, linear, 0 for the first row read."""
         points = np.asarray(points_px, float)
         match self.readout_direction:
             case "top_to_bottom":

@@ -399,6 +399,7 @@ def _frames(
                 time_s=start_s,
                 exposure_s=exposure_s,
                 iso=_value(files.metadata.iso, row) if files.metadata else None,
+                focus_dioptres=_value(files.metadata.focus_dioptres, row) if files.metadata else None,
                 skip_reason="; ".join(text for _, text in reasons) or None,
                 skip_codes=tuple(code for code, _ in reasons),
             )

@@ -223,6 +223,7 @@ _METADATA_COLUMNS = {
     "readout_time_s": ("framereadouttime[nanosec]",),
     "iso": ("iso",),
     "focal_length_mm": ("focallength",),
+    "focus_dioptres": ("focusdistance",),
 }
 
 

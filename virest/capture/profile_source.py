@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
+from virest.camera.field import Field
 from virest.camera.kalibr import is_kalibr, parse_camchain
 from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, load_yaml_mapping, parse_profile
 from virest.camera.shutter import Shutter
@@ -12,6 +14,8 @@ from virest.capture.files import is_present
 from virest.capture.location import locate
 from virest.capture.records import Capture
 from virest.errors import SettingsError
+
+log = logging.getLogger(__name__)
 
 PROFILE_NAME = "camera.yaml"
 LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -61,6 +65,28 @@ def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfil
     return profile
 
 
+def for_capture(profile: CameraProfile, capture: Capture) -> CameraProfile:
+    """The profile with the fields and untrusted stretches that hold for this capture.
+
+    What belongs to another capture goes, a field over focus distance gets this capture's log of it, or goes.
+    """
+    focus = [(frame.time_s, frame.focus_dioptres) for frame in capture.frames if frame.focus_dioptres is not None]
+    fields: list[Field] = []
+    for field in profile.fields:
+        if field.stamp_0_ns not in (None, capture.stamp_0_ns):
+            log.info("%s: a field of %s over %s belongs to another capture", capture.name, field.kind, field.covariates)
+        elif field.covariates != ("focus",):
+            fields.append(field)
+        elif focus:
+            times, values = zip(*focus, strict=True)
+            fields.append(replace(field, log=(times, values)))
+        else:
+            log.warning("%s: no focus distance is logged: the field over it is left out", capture.name)
+    if profile.imu_untrusted_stamp_0_ns not in (None, capture.stamp_0_ns):
+        profile = replace(profile, imu_untrusted_s=(), imu_untrusted_stamp_0_ns=None)
+    return profile.with_fields(fields)
+
+
 def read_any_profile(path: Path) -> CameraProfile:
     """Read a profile file by its kind: our own, or a Kalibr camera chain."""
     content = load_yaml_mapping(path)
@@ -85,4 +111,4 @@ def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[Camer
             f"{capture.width}x{capture.height}",
             hint="a profile holds for one stored size; scale its intrinsics, or pass the one of this mode",
         )
-    return fill_from_metadata(profile, capture), str(path)
+    return for_capture(fill_from_metadata(profile, capture), capture), str(path)

@@ -33,6 +33,8 @@ class Frame:
     """Why the frame cannot be processed (start-up content lag, no IMU, IMU gap, no stamp); None: it can."""
     skip_codes: tuple[str, ...] = ()
     """The same as stable names: ``start-up``, ``no-imu``, ``imu-gap``, ``no-stamp``, ``stall``."""
+    focus_dioptres: float | None = None
+    """Focus distance as logged, 1/m; None: unknown."""
 
     @property
     def only_startup(self) -> bool:

@@ -64,6 +64,7 @@ class MetadataTable:
     readout_time_s: Float64
     iso: Float64
     focal_length_mm: Float64
+    focus_dioptres: Float64
     unix_ns: Int64 | None
     """(n,) when the capture result came, 0 where unreadable; None: no such column."""
     rows: int
@@ -333,6 +334,7 @@ PLAUSIBLE = {
     "readout_time_s": (1e-6, 0.5),  # 0 is written by phones that do not know it
     "iso": (1e-3, 1e7),
     "focal_length_mm": (0.1, 1000.0),
+    "focus_dioptres": (0.0, 100.0),
 }
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as default
 from typing import Any
 
+from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 
 CONSISTENT, EXPLAINED, UNEXPLAINED = "consistent", "explained", "unexplained"
@@ -74,6 +76,37 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
+class FieldFinding:
+    """An unknown effect, described by what it does along recorded covariates."""
+
+    covariates: tuple[str, ...]
+    kind: str
+    """``delay``, ``displacement``, ``scale`` or ``rate`` (see :mod:`virest.camera.field`), or ``inertial_rows``."""
+    shape: str
+    sentence: str
+    """What it does, for people."""
+    size: float | None
+    """Largest value, in ``unit``; None: it has none."""
+    unit: str
+    std: float | None
+    held_out: HeldOutGain
+    p_value: float | None
+    """For the whole set of forms that were asked; None: none can be given."""
+    confounded: tuple[str, ...]
+    """Forms over other covariates that this capture cannot tell from it."""
+    stability: float | None
+    """Part of the resampled captures in which it, or one of these, is chosen again."""
+    reasons: str
+    """What may be behind it."""
+    next: str
+    """The measurement that would tell the reasons apart."""
+    fields: tuple[Field, ...] = ()
+    """As the extended profile holds them."""
+    stretches_s: tuple[tuple[float, float], ...] = ()
+    """(from, to) on the inertial clock where the log is not trusted."""
+
+
+@dataclass(frozen=True, slots=True)
 class Nominal:
     """How well the profile as given predicts the capture."""
 
@@ -131,7 +164,9 @@ class Diagnosis:
     extended_profile: CameraProfile
     """With every cause built in."""
     ladder: tuple[Rung, ...] = ()
-    residuals: dict[str, Any] = field(default_factory=dict)
+    residuals: dict[str, Any] = default(default_factory=dict)
     """For figures: ``before`` and ``after``, each a mapping of covariate names, ``x_px`` and ``y_px`` to arrays."""
     notes: tuple[str, ...] = ()
     """What was left out or could not be judged, and why."""
+    fields: tuple[FieldFinding, ...] = ()
+    """Effects that no cause names, strongest first."""

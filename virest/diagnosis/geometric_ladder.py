@@ -129,6 +129,10 @@ class GeometricVerdict:
     astray: float = 0.0
     """Part of the points that lie in parts of the picture that move together on their own, and were left out."""
     notes: list[str] = field(default_factory=list)
+    fields: list[Any] = field(default_factory=list)
+    """Unknown effects that were found beyond the causes: :class:`virest.diagnosis.field.records.FittedField`."""
+    evidence: Evidence | None = None
+    """The pairs that the model was fitted to."""
 
 
 def climb(

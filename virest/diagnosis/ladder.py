@@ -15,6 +15,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
 from virest.diagnosis.edge_overshoot import judge_sharpening
+from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
 from virest.diagnosis.light_values import settle_light
@@ -161,6 +162,7 @@ class _Story:
                 self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
             )
             self.geometric = self.points.climbed(progress)
+        self.geometric = self.points.described(self.geometric, self.light.profile)
         self.findings = stamped(self.geometric, findings_of(self.geometric), self.points.observed.exposure_s)
 
     def judge_blur(self, gray: Reader, progress: Callable[[float], None]) -> None:
@@ -180,7 +182,8 @@ class _Story:
             )
         if is_exposure and scale is not None:
             exposure = as_exposure(self.findings, scale, float(np.median(exposure_s)))
-            self.geometric = replace(self.points, start=exposed(self.points.start, scale)).climbed(progress)
+            points = replace(self.points, start=exposed(self.points.start, scale))
+            self.geometric = points.described(points.climbed(progress), self.light.profile)
             self.findings = [exposure, *stamped(self.geometric, findings_of(self.geometric), exposure_s)]
         if any(finding.name == "exposure_time" for finding in self.findings):
             self.blur, is_exposure = one_exposure(self.blur), True
@@ -226,8 +229,12 @@ class _Story:
         findings = [*self.findings, *(finding for look in looks for finding in look.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         left = remaining_structure(self.geometric, self.light)
+        fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         first, observed = self.first, self.points.observed
         extended = self.curve.profile
+        stated = [entry for field in fields for entry in field.fields]
+        with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in extended.fields]
+        extended = extended.with_fields([held.rounded() for held in with_std])
         # a lens's lean belongs to the start of this log; a process that begins later must not have it
         unleaning = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
         stamps = sum(NO_STAMP not in frame.skip_codes for frame in self.capture.frames)
@@ -236,7 +243,7 @@ class _Story:
             observed.tracks, stamps,
         )  # fmt: skip
         return Diagnosis(
-            UNEXPLAINED if left.significant else EXPLAINED if findings else CONSISTENT,
+            UNEXPLAINED if left.significant else EXPLAINED if findings or fields else CONSISTENT,
             nominal,
             tuple(findings),
             left,
@@ -245,6 +252,7 @@ class _Story:
             (*self.geometric.rungs, *(rung for look in looks for rung in look.rungs)),
             {"before": residuals(first, True), "after": residuals(self.geometric, False)},
             (*self.notes, *self.geometric.notes, *(note for look in looks for note in look.notes)),
+            tuple(fields),
         )
 
 

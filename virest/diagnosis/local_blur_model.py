@@ -91,7 +91,7 @@ def node_tensors(
 
 def _rays(lens: MovingLens, points_px: Array, time_s: Array) -> Array:
     """Rays (f, n, k, 3) through points of frames; where the lens stands still, undistorted only once."""
-    if lens.focal_drift_per_s or lens.shift is not None:
+    if lens.focal_drift_per_s or lens.zoom or lens.shift is not None:
         return lens.rays(points_px, time_s)
     return np.broadcast_to(lens.rays(points_px[:1, :, :1], time_s[:1, :, :1]), (*time_s.shape, 3))
 

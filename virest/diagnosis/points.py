@@ -13,6 +13,8 @@ from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.degradation.light import flicker
 from virest.diagnosis.candidates import FarClock
+from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges, with_description
+from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
@@ -86,11 +88,31 @@ class TrackedPoints:
         again.notes.append(f"{astray:.0%} of the points lie in parts of the picture that go their own way: left out")
         return again
 
+    def described(self, found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
+        """A ladder's end with the fields that its points ask for, under the light that was found.
+
+        Pulsing light moves the mean time of each row's light, which looks like rows that are read unevenly.
+        """
+        if not self.rungs_allowed or found.evidence is None:
+            return found
+        model = replace(found.model, profile=pulsing(found.model.profile, lit))
+        return with_fields(replace(found, model=model), found.evidence, self.capture)
+
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
-        evidence = make_evidence(self.capture.imu, observed)
-        return climb(
+        doubtful = doubtful_pairs(observed, self.capture, self.start)
+        rest = observed.chosen(~doubtful.hit) if doubtful.sets_aside else observed
+        evidence = make_evidence(self.capture.imu, rest)
+        found = climb(
             evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each
         )
+        found.evidence = evidence
+        if not self.rungs_allowed:
+            return found
+        if doubtful.sets_aside:
+            with_bridges(found, observed, doubtful, self.capture)
+        elif doubtful.hit.any():
+            with_description(found, evidence, doubtful, self.capture)
+        return found
 
 
 def _together(difference_px: Array, group: NDArray[np.intp]) -> float:

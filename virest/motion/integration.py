@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from virest.camera.field import FORCES, RATES
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
@@ -24,6 +25,9 @@ def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: Array | No
     ImuError if fewer than two samples are given.
     """
     polynomials = _camera_rate(gyro_polynomials(imu) if measured is None else measured, profile)
+    if (missing := missing_rate_rad_s(imu, profile)) is not None:
+        polynomials[2] += profile.rotation_cam_imu @ (np.diff(missing, axis=0).T / np.diff(imu.time_s))
+        polynomials[3] += profile.rotation_cam_imu @ missing[:-1].T
     steps = rotation_from_vector(turned_angle(polynomials, np.diff(imu.time_s)).T)
     return Trajectory(imu.time_s, _running_product(steps), polynomials)
 
@@ -47,6 +51,21 @@ def gyro_polynomials(imu: ImuSamples) -> Array:
             spline = CubicSpline(time_s[run], rate[run], axis=0)
             pieces[:, :, run[0] : run[-1]] = np.swapaxes(spline.c, 1, 2)
     return pieces
+
+
+def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
+    """What the profile's fields of kind ``rate`` add to the true rate at the samples (n, 3), IMU axes; None: nothing.
+
+    Along rates the covariate is the gyroscope's own reading, less bias and over scale.
+    """
+    fields = [field for field in profile.extensions.field if field.kind == "rate"]
+    if not fields:
+        return None
+    rate = (imu.gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    known = {"time": imu.time_s}
+    known |= {name: rate[:, k] for k, name in enumerate(RATES)}
+    known |= {name: np.nan_to_num(imu.accel_m_s2[:, k]) for k, name in enumerate(FORCES)}
+    return np.asarray(sum(field.at(known[field.covariates[0]]) for field in fields))
 
 
 def _camera_rate(measured: Array, profile: CameraProfile) -> Array:

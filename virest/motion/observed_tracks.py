@@ -64,7 +64,7 @@ class ObservedTracks:
         return replace(self, pairs=kept, noise_px=self.noise_px[use])
 
     def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
-        """The pairs whose two pictures lie inside the inertial data, with no pause between them."""
+        """The pairs whose two pictures lie inside the inertial data, with no pause or untrusted stretch between."""
         shutter = profile.shutter
         start = np.asarray(profile.imu_time_s(shutter.first_row_start_s(self.stamp_s, self.exposure_s)))
         last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s) + MARGIN_S
@@ -74,6 +74,8 @@ class ObservedTracks:
         steps = np.diff(imu.time_s)
         for gap in np.flatnonzero(steps > max(MARGIN_S, IMU_PAUSE_PERIODS * float(np.median(steps)))):
             use &= (end < imu.time_s[gap]) | (begin > imu.time_s[gap + 1])
+        for from_s, to_s in profile.unbridged_s:
+            use &= (end < from_s) | (begin > to_s)
         return self.chosen(use)
 
     def without_astray(self, first_px: Array, distance: Array) -> tuple[ObservedTracks, float]:

@@ -1,9 +1,9 @@
 """The lens as it moves: focal length and stabiliser at every instant.
 
-``focal_drift``: f(t) = f (1 + drift t) at every instant, t on the IMU's clock from stamp_0.  ``stabilisation``: the
-picture is shifted by f(t) · fraction · θ, with θ the camera's integrated rates about x and y through a continuous
-first-order high-pass from rest, θ' = ω − 2π cutoff θ.  The shift comes before the distortion: x += fraction θ_y,
-y −= fraction θ_x in units of the focal length; roll stays.
+``focal_drift``: f(t) = f (1 + drift t) at every instant, t on the IMU's clock from stamp_0; fields of kind ``scale``
+add to the factor.  ``stabilisation``: the picture is shifted by f(t) · fraction · θ, with θ the camera's integrated
+rates about x and y through a continuous first-order high-pass from rest, θ' = ω − 2π cutoff θ.  The shift comes before
+the distortion: x += fraction θ_y, y −= fraction θ_x in units of the focal length; roll stays.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.field import Field
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.motion.trajectory import Trajectory
@@ -39,10 +40,12 @@ class MovingLens:
     """(m, 2) at those times, units of the focal length, added before distortion; straight lines between, ends held."""
     path: tuple[Array, Array] | None = None
     """All times (k,) of the motion and the camera's rates (k, 3) then, from which the shift was worked out."""
+    zoom: tuple[Field, ...] = ()
+    """Parts by which the focal length is longer, over time or over what is logged."""
 
     def rays(self, points_px: Array, time_s: Any) -> Array:
         """Rays (..., 3) with z = 1 through pixels (..., 2) seen at times (...): the inverse of :meth:`project`."""
-        if self.focal_drift_per_s:
+        if self.focal_drift_per_s or self.zoom:
             points_px = self._about_centre(points_px, 1.0 / self._focal_scale(time_s))
         rays = self.lens.rays(points_px)
         if self.shift is None:
@@ -56,7 +59,7 @@ class MovingLens:
             plane = rays[..., :2] / rays[..., 2:] + self.shift_at(time_s)
             rays = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         points_px = self.lens.project(rays)
-        if self.focal_drift_per_s:
+        if self.focal_drift_per_s or self.zoom:
             points_px = self._about_centre(points_px, self._focal_scale(time_s))
         return points_px
 
@@ -75,7 +78,8 @@ class MovingLens:
         return replace(self, shift_time_s=self.shift_time_s[first:last], shift=self.shift[first:last], path=None)
 
     def _focal_scale(self, time_s: Any) -> Array:
-        return 1.0 + self.focal_drift_per_s * np.asarray(time_s, float)[..., None]
+        drifted = 1.0 + self.focal_drift_per_s * np.asarray(time_s, float)[..., None]
+        return np.asarray(drifted + sum(field.at_time(time_s) for field in self.zoom))
 
     def _about_centre(self, points_px: Array, scale: Array) -> Array:
         centre = np.array([self.lens.cx_px, self.lens.cy_px])
@@ -95,8 +99,9 @@ def moving_lens(
     if profile.intrinsics is None:
         raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
     extensions = profile.extensions
+    zoom = tuple(field for field in extensions.field if field.kind == "scale")
     if not extensions.stabilisation_fraction:
-        return MovingLens(profile.intrinsics, extensions.focal_drift_per_s)
+        return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, zoom=zoom)
     path = None if like is None else like.path
     if path is None:
         grid_s = _shift_grid(*trajectory.span_s, step_s)
@@ -107,7 +112,7 @@ def moving_lens(
         about_x, about_y = extensions.stabilisation_lean_rad
         forgotten = np.exp(-2 * np.pi * cutoff_hz * (time_s - time_s[0]))
         shift = shift + fraction * forgotten[:, None] * np.array([about_y, -about_x])
-    return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path)
+    return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path, zoom)
 
 
 def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:

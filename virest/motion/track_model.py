@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
+from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.displacement import Displacement, force_at_samples, integrate_accelerometer
@@ -168,7 +169,7 @@ def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Grou
     """Return the ground for another profile; what does not depend on the change is kept."""
     before, kept = known.profile, known
     same = ("gyro_bias_rad_s", "gyro_scale", "p_cam_imu_m")
-    if any(getattr(before, name) != getattr(profile, name) for name in same):
+    if any(getattr(before, name) != getattr(profile, name) for name in same) or _rates(before) != _rates(profile):
         return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
     if before.r_cam_imu != profile.r_cam_imu:
         known = _turned_about(known, profile.rotation_cam_imu @ before.rotation_cam_imu.T)
@@ -179,9 +180,19 @@ def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Grou
     return replace(known, profile=profile)
 
 
+def _rates(profile: CameraProfile) -> list[Field]:
+    return [field for field in profile.extensions.field if field.kind == "rate"]
+
+
 def _moves(before: CameraProfile, after: CameraProfile) -> bool:
     """Whether two profiles' lenses move differently."""
-    names = ("focal_drift_per_s", "stabilisation_fraction", "stabilisation_cutoff_hz", "stabilisation_lean_rad")
+    names = (
+        "focal_drift_per_s",
+        "stabilisation_fraction",
+        "stabilisation_cutoff_hz",
+        "stabilisation_lean_rad",
+        "field",
+    )
     return any(getattr(before.extensions, name) != getattr(after.extensions, name) for name in names)
 
 

@@ -37,7 +37,7 @@ def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -
     return as_file(figure, image_format)
 
 
-def _literal(text: str) -> str:
+def literal(text: str) -> str:
     """Text that is drawn as it stands: no formula, one line."""
     return "".join(c if c.isprintable() else "?" for c in text).replace("$", r"\$")
 
@@ -59,7 +59,7 @@ def _draw_curve(axes: Any, fit: CurveFit, title: str) -> None:
     axes.set_ylim(-5, 260)
     axes.set_xlabel("exposure, the curve's own unit")
     axes.set_ylabel("grey level")
-    axes.set_title(f"{_literal(title)}  rms {fit.rms_grey_levels:.2f} levels".strip())
+    axes.set_title(f"{literal(title)}  rms {fit.rms_grey_levels:.2f} levels".strip())
     axes.legend(loc="upper left")
 
 
@@ -88,7 +88,7 @@ def _draw_pictures(axes: Any, fit: CurveFit) -> None:
     reach = max(0.05, 1.15 * max(abs(e) for e in errors))
     axes.set_ylim(-reach, reach)
     labels = [p.file if len(p.file) <= 18 else "…" + p.file[-17:] for p in fit.pictures]
-    axes.set_xticks(range(len(errors)), [_literal(text) for text in labels], rotation=60, ha="right",
+    axes.set_xticks(range(len(errors)), [literal(text) for text in labels], rotation=60, ha="right",
                     fontsize=8)  # fmt: skip
     axes.set_ylabel("listed / true exposure, EV")
     axes.set_title("exposure error of each picture")
@@ -111,7 +111,7 @@ def comparison_figure(
     for line, (label, measured, simulated), difference in zip(axes, rows, differences, strict=True):
         for place, picture, name in zip(line, (measured, simulated), ("measured", f"simulated, {label}"), strict=False):
             place.imshow(picture, cmap="gray", vmin=0, vmax=255)
-            place.set_title(_literal(name), fontsize=9)
+            place.set_title(literal(name), fontsize=9)
         shown = line[2].imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
         rms = float(np.sqrt(np.mean(difference**2)))
         line[2].set_title(f"measured − simulated, rms {rms:.1f} levels", fontsize=9)
@@ -119,7 +119,7 @@ def comparison_figure(
         for place in line:
             place.set_xticks([])
             place.set_yticks([])
-    figure.suptitle(_literal(title))
+    figure.suptitle(literal(title))
     return as_file(figure, image_format)
 
 
@@ -143,7 +143,7 @@ def residual_figure(
         line[0].set_ylabel(f"residual along {component[0]}, px")
     if axes[0][0].get_legend_handles_labels()[0]:
         axes[0][0].legend(loc="upper right", fontsize=8)
-    figure.suptitle(_literal(title))
+    figure.suptitle(literal(title))
     return as_file(figure, image_format)
 
 
@@ -156,7 +156,7 @@ def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str 
     axes = figure.subplots(1, max(len(rungs), 1), squeeze=False)[0]
     for number, (place, rung) in enumerate(zip(axes, rungs, strict=False), start=1):
         _draw_rung(place, number, rung)
-    figure.suptitle(_literal(title))
+    figure.suptitle(literal(title))
     return as_file(figure, image_format)
 
 
@@ -166,13 +166,13 @@ def _draw_rung(axes: Any, number: int, rung: RungBars) -> None:
     names = [name for _, name in known]
     colours = ["steelblue" if name == entered else "0.75" for name in names]
     axes.barh(range(len(names)), [after for after, _ in known], color=colours)
-    axes.set_yticks(range(len(names)), [_literal(name) for name in names], fontsize=8)
+    axes.set_yticks(range(len(names)), [literal(name) for name in names], fontsize=8)
     axes.invert_yaxis()
     if np.isfinite(before):
         axes.axvline(before, color="crimson", lw=1.2, label=f"before: {before:.3g}")
         axes.legend(loc="lower right", fontsize=8)
-    axes.set_xlabel(f"{_literal(quantity)}, held-out frames")
-    axes.set_title(_literal(f"{number}. {entered or 'nothing gains enough'}"), fontsize=10)
+    axes.set_xlabel(f"{literal(quantity)}, held-out frames")
+    axes.set_title(literal(f"{number}. {entered or 'nothing gains enough'}"), fontsize=10)
 
 
 def _draw_binned(axes: Any, along: Array, residual: Array, label: str, colour: str) -> None:

@@ -433,15 +433,20 @@ def ranges(numbers: Sequence[int]) -> str:
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 
+def _is_first(name: str) -> bool:
+    return name in FIRST_FIGURES or name.startswith("field_")
+
+
 def _diagnosis_view(diagnosis: DiagnosisRecord) -> dict[str, Any]:
     facts = diagnosis.facts
     causes = facts.get("causes") or []
     return {
         "verdict": diagnosis_verdict(str(facts["verdict"]), causes, facts.get("nominal") or {}),
         "causes": [cause_view(cause) for cause in causes],
+        "fields": facts.get("fields") or [],
         "remaining": remaining_words(facts.get("unexplained") or {}, str(facts["verdict"])),
         "gain": gain_words(facts.get("restoration_gain") or {}),
-        "figures": [(figure_words(name), picture) for name, picture in diagnosis.figures if name in FIRST_FIGURES],
-        "rungs": [(figure_words(name), picture) for name, picture in diagnosis.figures if name not in FIRST_FIGURES],
+        "figures": [(figure_words(name), picture) for name, picture in diagnosis.figures if _is_first(name)],
+        "rungs": [(figure_words(name), picture) for name, picture in diagnosis.figures if not _is_first(name)],
         "profile": diagnosis.profile.splitlines(),
     }

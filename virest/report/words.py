@@ -265,6 +265,8 @@ def gain_words(gain: Mapped) -> list[tuple[str, str]]:
 
 def figure_words(name: str) -> str:
     """What a figure of a diagnosis shows, by its file's name."""
+    if re.fullmatch(r"field_\d\d", name):
+        return f"Field {int(name[-2:])}: its value over what it depends on, and the residuals before and after"
     numbered = re.fullmatch(r"\d\d_([a-z_]+)", name)
     if numbered:
         return f"The rung on which {numbered[1].replace('_', ' ')} entered, and what else was tried there"

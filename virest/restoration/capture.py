@@ -29,6 +29,7 @@ from virest.restoration.neighbours.refinement import MissingTurn
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight, with_neighbours
 from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 
+UNTRUSTED = "the inertial log does not follow the camera"
 LAG_TO_THE_END = 0.8
 """Lags that repeats are still using up this far into the movie may outlast it."""
 ALMOST = 1e-6
@@ -122,9 +123,10 @@ def restore_frames(
         if here.outside:
             yield RestoredFrame(frame, "skipped", None, (here.outside,), parameters=unknown_parameters(profile))
             continue
-        if plan.copy_reason:
+        reason = plan.copy_reason or untrusted_reason(motion)
+        if reason:
             said = degradation_parameters(motion, trajectory, plan.settings)
-            yield copied_frame(frame, picture, profile, plan.copy_reason, said)
+            yield copied_frame(frame, picture, profile, reason, said)
             continue
         seen = None
         if plan.contradicted is not None:
@@ -135,6 +137,13 @@ def restore_frames(
             refined = neighbours.refined(before, here, after)
             pictures = partial(neighbours.pictures, plan.joined(before, after), here, refined)
         yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures)
+
+
+def untrusted_reason(motion: RowMotion) -> str | None:
+    """Why a frame whose rows reach into a stretch without a bridge is left alone; None: it does not."""
+    end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
+    parts = (part for part in motion.profile.unbridged_s if motion.start_s < part[1] and end_s > part[0])
+    return next((f"{UNTRUSTED} from {start:.3f} to {end:.3f} s" for start, end in parts), None)
 
 
 def moved_over_frame(

@@ -364,6 +364,9 @@ def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
         f"gain of {len(ext.gain)} frames: kept, it is common to a whole frame": len(ext.gain),
         f"defocus of {ext.defocus_sigma_px:g} px: undone with the blur": ext.defocus_sigma_px,
     }
+    lines |= {f"field of {field.kind} over {', '.join(field.covariates)}: followed": 1 for field in profile.fields}
+    bridged = len(profile.imu_untrusted_s) - len(profile.unbridged_s)
+    lines[f"{bridged} stretches of an inertial log that is not trusted: bridged from the pictures"] = bridged
     return tuple(line for line, size in lines.items() if size)
 
 
@@ -373,7 +376,7 @@ def _through_resting_lens(pairs: list[TrackPair], capture: Capture, profile: Cam
     Where clocks or focal length are not known yet, the lens's path is not either, and tracks stay as they are.
     """
     ext = profile.extensions
-    moves = ext.focal_drift_per_s or ext.stabilisation_fraction
+    moves = ext.focal_drift_per_s or ext.stabilisation_fraction or any(f.kind == "scale" for f in ext.field)
     if not moves or profile.intrinsics is None or profile.time_offset_s is None:
         return pairs
     lens = moving_lens(integrate_gyro(capture.imu, profile), profile)

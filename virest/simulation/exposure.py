@@ -19,6 +19,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.errors import SettingsError
 from virest.simulation.hand_motion import HandMotion
+from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale, late_rows_s
 from virest.simulation.scenes import Scene
 
 Array = NDArray[np.float64]
@@ -41,19 +42,19 @@ class View:
     y: Image
     """y/z of each pixel's ray: (h, w), or (h, 1) without distortion."""
     x_rate: Image | None
-    """Change of x per unit of s, where the focal length is f / (1 − s) (focal drift); None without."""
+    """Change of x per unit of s, where the focal length is f / (1 − s); None where it stays."""
     y_rate: Image | None
     filter_s: Array
     """Times at which the stabiliser's angles are known; empty without stabiliser."""
     filter_rad: Array
     """(n, 2) high-passed pitch and yaw, camera axes x and y."""
+    hidden: Hidden = NOTHING
 
     def rays(self, time_s: float, rows: slice, columns: slice) -> tuple[Image, Image]:
         """x/z and y/z of the rays of a part of the picture at one time; they broadcast against each other."""
         x, y = _part(self.x, rows, columns), _part(self.y, rows, columns)
         if self.x_rate is not None and self.y_rate is not None:
-            drift = self.profile.extensions.focal_drift_per_s * time_s
-            shrinking = np.float32(drift / (1 + drift))
+            shrinking = np.float32(1 - 1 / focal_scale(self.profile, self.hidden, time_s))
             x = x + shrinking * _part(self.x_rate, rows, columns)
             y = y + shrinking * _part(self.y_rate, rows, columns)
         if len(self.filter_s):
@@ -63,12 +64,14 @@ class View:
         return x, y
 
 
-def make_view(profile: CameraProfile, motion: HandMotion, *, rest_s: float | None = None) -> View:
+def make_view(
+    profile: CameraProfile, motion: HandMotion, *, rest_s: float | None = None, hidden: Hidden = NOTHING
+) -> View:
     """Work out the rays of a profile's pixels and the path of its stabiliser along a motion, at rest at ``rest_s``."""
     lens = _require_lens(profile)
     x, y = pixel_rays(lens)
     x_rate = y_rate = None
-    if profile.extensions.focal_drift_per_s:
+    if focal_changes(profile, hidden):
         x_rate, y_rate = _focal_rate(lens)
         x, y = (np.broadcast_to(a, (lens.height, lens.width)) for a in (x, y))
     filter_s, filter_rad = np.empty(0), np.empty((0, 2))
@@ -76,7 +79,7 @@ def make_view(profile: CameraProfile, motion: HandMotion, *, rest_s: float | Non
         filter_s, filter_rad = high_passed_angles(
             motion, profile.extensions.stabilisation_cutoff_hz, motion.start_s if rest_s is None else rest_s
         )
-    return View(profile, x, y, x_rate, y_rate, filter_s, filter_rad)
+    return View(profile, x, y, x_rate, y_rate, filter_s, filter_rad, hidden)
 
 
 def start_fractions(direction: str, width: int, height: int) -> Array:
@@ -96,7 +99,8 @@ def expose(scene: Scene, motion: HandMotion, view: View, first_row_start_s: floa
     shutter = view.profile.shutter
     by_column = shutter.readout_direction in ("left_to_right", "right_to_left")
     width, height = view.profile.width, view.profile.height
-    start_s = first_row_start_s + shutter.readout_time_s * start_fractions(shutter.readout_direction, width, height)
+    fraction = start_fractions(shutter.readout_direction, width, height)
+    start_s = first_row_start_s + shutter.readout_time_s * fraction + late_rows_s(view.profile, view.hidden, fraction)
     instants_s = _instants(scene, motion, view, start_s, exposure_s)
     weights = hat_weights(instants_s, start_s, exposure_s) * flicker(view.profile, instants_s)[:, None]
     homographies = _homographies(scene, motion, instants_s)
@@ -142,9 +146,16 @@ def pixel_rays(lens: Intrinsics) -> tuple[Image, Image]:
     """x/z and y/z of every pixel's ray; (1, w) and (h, 1) without distortion, else (h, w) each."""
     x = (np.arange(lens.width) - lens.cx_px) / lens.fx_px
     y = (np.arange(lens.height) - lens.cy_px) / lens.fy_px
-    if lens.model == "none" or (lens.model == "radtan" and not any(lens.coefficients)):
+    if lens.displaced is not None:
+        pixels = np.stack(np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float)), -1)
+        seen = lens.displaced.undisplaced(pixels)
+        x, y = (seen[..., 0] - lens.cx_px) / lens.fx_px, (seen[..., 1] - lens.cy_px) / lens.fy_px
+        if lens.model == "none":
+            return x.astype(np.float32), y.astype(np.float32)
+    elif lens.model == "none" or (lens.model == "radtan" and not any(lens.coefficients)):
         return x[None, :].astype(np.float32), y[:, None].astype(np.float32)
-    x, y = np.meshgrid(x, y)
+    else:
+        x, y = np.meshgrid(x, y)
     undistorted = _undo_fisheye(x, y, lens.coefficients) if lens.model == "fisheye" else _undo_radtan(x, y, lens)
     return undistorted[0].astype(np.float32), undistorted[1].astype(np.float32)
 

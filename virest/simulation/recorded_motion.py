@@ -17,6 +17,7 @@ from scipy.interpolate import Akima1DInterpolator
 from virest.camera.profile import CameraProfile
 from virest.errors import ImuError
 from virest.simulation.hand_motion import HandMotion, Waves, integrate_motion
+from virest.simulation.hidden import missing_rate_rad_s
 
 Array = NDArray[np.float64]
 
@@ -38,23 +39,28 @@ class RecordedRate:
         return np.where(outside[..., None], 0.0, value) if derivative else value
 
 
-def recorded_rate(sample_s: Array, gyro_rad_s: Array, profile: CameraProfile) -> RecordedRate:
-    """True rate of the camera, R_cam_imu (measured − bias) / scale, from samples (n,), (n, 3) at rising times.
+def recorded_rate(
+    sample_s: Array, gyro_rad_s: Array, profile: CameraProfile, accel_m_s2: Array | None = None
+) -> RecordedRate:
+    """True rate of the camera, R_cam_imu ((measured − bias) / scale + fields), from samples (n,), (n, 3), rising times.
 
     sample_s: seconds on the IMU's clock from stamp_0.  Raises ImuError for fewer than two samples.
     """
     if len(sample_s) < 2:
         raise ImuError(f"{len(sample_s)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
     true = (gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    true = true + missing_rate_rad_s(profile, sample_s, true, accel_m_s2)
     camera = true @ np.array(profile.r_cam_imu).T
     return RecordedRate(float(sample_s[0]), float(sample_s[-1]), Akima1DInterpolator(sample_s, camera, method="makima"))
 
 
-def recorded_motion(sample_s: Array, gyro_rad_s: Array, profile: CameraProfile, centre_s: float) -> HandMotion:
+def recorded_motion(
+    sample_s: Array, gyro_rad_s: Array, profile: CameraProfile, centre_s: float, accel_m_s2: Array | None = None
+) -> HandMotion:
     """A camera that turns as the gyroscope said and stays in its place; the world's axes are its own at ``centre_s``.
 
     Arguments as :func:`recorded_rate`.
     """
-    rate = recorded_rate(sample_s, gyro_rad_s, profile)
+    rate = recorded_rate(sample_s, gyro_rad_s, profile, accel_m_s2)
     still = Waves(np.zeros((3, 1)), np.zeros((3, 1)), np.zeros((3, 1)))
     return integrate_motion(rate, still, rate.start_s, rate.end_s, centre_on_s=(centre_s, centre_s))

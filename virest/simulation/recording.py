@@ -44,6 +44,8 @@ _SLEPT_NS = 22_319_432_485_000
 """Boot-time clock less monotonic clock: how long the phone has slept."""
 _EPOCH_JITTER_NS = 8_301
 _TRAJECTORY_STEP_S = 1e-3
+FOCUS_DIOPTRES = 0.16422288
+"""Logged where the focus rests."""
 _EDGE_HEADER = """\
 #Camera frame timestamp source according to CameraCharacteristics.SENSOR_INFO_TIMESTAMP_SOURCE is \
 SENSOR_INFO_TIMESTAMP_SOURCE_{source}.
@@ -284,7 +286,10 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
             round(exposure * 1e9),
             round(1e9 / session.settings.fps),
         ]
-        numbers += [readout, int(session.exposures.iso[k]), nominal.focal_length_mm or 3.95, 0.16422288, 3]
+        focus = FOCUS_DIOPTRES
+        if session.hidden.focus_dioptres is not None:
+            focus = float(session.hidden.focus_dioptres(np.array((stamp - session.stamp_ns[0]) * 1e-9)))
+        numbers += [readout, int(session.exposures.iso[k]), nominal.focal_length_mm or 3.95, focus, 3]
         rows.append([str(n) for n in [*numbers, _unix_ns(stamp, 50_000_000)]])
     columns = ["Timestamp[nanosec]", "fx[px]", "fy[px]", "Frame No.", "Exposure time[nanosec]"]
     columns += [

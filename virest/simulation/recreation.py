@@ -21,6 +21,7 @@ from virest.errors import CaptureError, SettingsError
 from virest.simulation.auto_exposure import NOMINAL_ISO, Exposures
 from virest.simulation.exposure import View, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion
+from virest.simulation.hidden import focal_scale
 from virest.simulation.recorded_motion import recorded_motion
 from virest.simulation.scenes import MAX_CHART_PX, Scene
 from virest.simulation.sensor import sensor_light
@@ -86,12 +87,13 @@ def recreate_session(
     exposures = _exposures(frames, len(capture_s), int(shows[slot]))
     imu, sample_s = _cut_imu(capture, begin_s, stamp_s[-1], true)
     session = Session(
-        nominal, true, settings, _NO_SCENE, recorded_motion(sample_s, imu.gyro_rad_s, true, 0.0), _NO_VIEW,
+        nominal, true, settings, _NO_SCENE,
+        recorded_motion(sample_s, imu.gyro_rad_s, true, 0.0, imu.accel_m_s2), _NO_VIEW,
         np.rint(stamp_s * TICKS_PER_S).astype(np.int64), np.array([f.timestamp_ns for f in frames], np.int64), shows,
         (float(sample_s[0]), float(sample_s[-1])), exposures, capture_s, imu,
     )  # fmt: skip
     seen_s = session.first_row_start_s(int(shows[slot]))
-    motion = recorded_motion(sample_s, imu.gyro_rad_s, true, seen_s)
+    motion = recorded_motion(sample_s, imu.gyro_rad_s, true, seen_s, imu.accel_m_s2)
     view = make_view(true, motion, rest_s=session.imu_span_s[0])
     _require_ahead(motion, true, session, shows)
     chart = _scene(scene, view, motion, seen_s, _slot_gain(true, shows, slot), settings.oversampling)
@@ -107,6 +109,7 @@ def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile
     later_s, extensions = frames[0].time_s, profile.extensions
     offset_s = (profile.time_offset_s or 0.0) + profile.clock_skew * later_s
     drift = extensions.focal_drift_per_s
+    fields = tuple(field.later(later_s) for field in extensions.field)
     lens = profile.intrinsics
     if lens is not None and drift:
         lens = lens.scaled_focal(1 + drift * later_s)
@@ -116,6 +119,7 @@ def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile
     changed = dataclasses.replace(
         extensions,
         focal_drift_per_s=drift / (1 + drift * later_s),
+        field=fields,
         flicker_phase_rad=extensions.flicker_phase_rad
         + 2 * np.pi * float(np.remainder(extensions.flicker_frequency_hz * later_s, 1.0)),
         gain=gain,
@@ -232,7 +236,7 @@ def _pixels(view: View, rays: Array, time_s: float) -> Array:
         plane = plane + profile.extensions.stabilisation_fraction * np.array([yaw, -pitch])
     pixels = lens.project(np.concatenate([plane, np.ones_like(plane[..., :1])], -1))
     centre = np.array([lens.cx_px, lens.cy_px])
-    return centre + (pixels - centre) * (1 + profile.extensions.focal_drift_per_s * time_s)
+    return centre + (pixels - centre) * focal_scale(profile, view.hidden, time_s)
 
 
 _NO_SCENE = Scene(np.zeros((2, 2, 3), np.float32), 1.0)

@@ -22,6 +22,7 @@ from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
+from virest.simulation.hidden import NOTHING, Hidden, gyro_reading
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
@@ -104,6 +105,8 @@ class Session:
     """(captures,) stamp of every capture from stamp_0, camera clock; None: even, at the settings' frame rate."""
     recorded_imu: ImuLog | None = None
     """Samples of a phone, to be written as they are; None: worked out from the motion."""
+    hidden: Hidden = NOTHING
+    """Effects that no profile names."""
 
     def logged_exposure_s(self, capture: int) -> float:
         """Exposure that the log gives for a capture."""
@@ -175,6 +178,7 @@ def plan_session(
     *,
     scene: Scene | None = None,
     motion: HandMotion | None = None,
+    hidden: Hidden = NOTHING,
 ) -> Session:
     """Draw scene and motion (unless given) and lay out the times. The same seed gives the same session."""
     _require_sizes(true, settings)
@@ -203,9 +207,12 @@ def plan_session(
     base_ns = 1_000 * int(np.random.default_rng([settings.seed, 2]).integers(40_000_000_000, 60_000_000_000))
     ticks = np.array([_stamp_tick(k, settings.fps) for k in range(settings.frames)])
     stamps = base_ns + np.array([round(_stamp_s(k, settings.fps) * 1e9) for k in range(settings.frames)])
-    view = make_view(true, motion, rest_s=span[0])
+    view = make_view(true, motion, rest_s=span[0], hidden=hidden)
     exposures = _plan_exposures(settings, shows)
-    return Session(nominal, true, settings, scene, motion, view, ticks, stamps.astype(np.int64), shows, span, exposures)
+    return Session(
+        nominal, true, settings, scene, motion, view, ticks, stamps.astype(np.int64), shows, span, exposures,
+        hidden=hidden,
+    )  # fmt: skip
 
 
 def render_picture(session: Session, slot: int, phone: PhonePictures | None = None) -> Picture:
@@ -256,9 +263,11 @@ def sample_imu(session: Session) -> ImuLog:
     rng = np.random.default_rng([settings.seed, 4])
     imu_from_cam = np.array(true.r_cam_imu).T
     rate = _gyro_rate(session, time_s) @ imu_from_cam.T
-    gyro = rate * true.gyro_scale + true.gyro_bias_rad_s + _gyro_noise(settings, rate.shape, rng)
-    force = session.motion.specific_force_m_s2(time_s, np.array(true.p_cam_imu_m), GRAVITY_WORLD_M_S2)
-    force = force @ imu_from_cam.T + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
+    force = session.motion.specific_force_m_s2(time_s, np.array(true.p_cam_imu_m), GRAVITY_WORLD_M_S2) @ imu_from_cam.T
+    gyro = gyro_reading(true, time_s, rate, force) + _gyro_noise(settings, rate.shape, rng)
+    if session.hidden.gyro is not None:
+        gyro = session.hidden.gyro(time_s, gyro, force)
+    force = force + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
     if settings.isp.gyro_jitter_s:
         time_ns = jittered_ns(time_ns, settings.isp.gyro_jitter_s, np.random.default_rng([settings.seed, 7]))
     return ImuLog(int(session.stamp_ns[0]) + time_ns, gyro, force)

@@ -13,6 +13,7 @@ import typer
 from virest.app import console
 from virest.app.cli.calibrate import calibrate
 from virest.app.cli.calibrate_curve import calibrate_curve
+from virest.app.cli.criticise import criticise
 from virest.app.cli.diagnose import diagnose
 from virest.app.cli.doctor import doctor
 from virest.app.cli.evaluate import evaluate
@@ -65,6 +66,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "calibrate": (calibrate, "Fit clock, readout, axes and bias to a capture."),
     "calibrate-curve": (calibrate_curve, "Fit the exposure curve."),
     "diagnose": (diagnose, "What the camera model gets wrong, and why."),
+    "criticise": (criticise, "What the residuals of any calibration depend on."),
     "simulate": (simulate, "Write a capture with known truth."),
     "import": (import_bag, "A ROS bag or MCAP file becomes a capture."),
     "export": (export, "Frames and IMU for SLAM, COLMAP, nerfstudio, Gyroflow."),

@@ -1,0 +1,101 @@
+"""``virest criticise``: residuals of any calibration, in files as others write them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from virest.app import cli
+from virest.diagnosis.field.residual_table import criticise
+
+Table = dict[str, np.ndarray[Any, Any]]
+
+
+def residuals(seed: int, **sizes: float) -> Table:
+    """40 frames of 60 points with noise of 0.15 px and one in fifty lost; sizes: what is hidden."""
+    rng, count = np.random.default_rng(seed), 40 * 60
+    x, y = rng.uniform(0, 640, count), rng.uniform(0, 480, count)
+    frame = np.repeat(np.arange(40.0), 60)
+    vx, vy = (np.repeat(rng.normal(0, 150, 40), 60) for _ in "xy")
+    dx, dy = rng.normal(0, 0.15, (2, count))
+    u, v, row = (x - 320) / 320, (y - 240) / 320, y / 480
+    lens = sizes.get("lens", 0.0)
+    late_s = sizes.get("late_s", 0.0) * 4 * row * (1 - row)
+    dx, dy = dx + lens * 2 * u * v + vx * late_s, dy + lens * (u * u + 3 * v * v) + vy * late_s
+    lost = rng.random(count) < 0.02
+    dx[lost] += rng.normal(0, 10, lost.sum())
+    return {"x": x, "y": y, "dx": dx, "dy": dy, "row": row, "frame": frame, "vx": vx, "vy": vy}
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Callable[[Table], Path]:
+    """Write a table."""
+
+    def write(table: Table) -> Path:
+        path = tmp_path / "residuals.csv"
+        np.savetxt(path, np.stack(list(table.values()), axis=1), delimiter=",", header=",".join(table), comments="")
+        return path
+
+    return write
+
+
+def test_what_is_hidden_in_residuals_is_described(
+    written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A lens off centre and uneven rows: covariates, shapes and sizes, as JSON."""
+    path = written(residuals(1, lens=0.3, late_s=2e-3))
+    assert cli.run(["criticise", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    by_kind = {field["kind"]: field for field in found["fields"]}
+    assert set(by_kind) == {"delay", "displacement"}
+    assert by_kind["displacement"]["shape"] == "growing with its square"
+    assert by_kind["delay"]["shape"] == "a parabola"
+    delay = np.ptp(np.array(by_kind["delay"]["values"]))
+    assert delay == pytest.approx(2e-3, rel=0.1)
+    assert found["left_px"] == pytest.approx(0.15, rel=0.05)
+    for field in found["fields"]:
+        assert field["held_out"]["after"] < field["held_out"]["before"]
+        assert field["p_value"] < found["false_alarm_rate"]
+
+
+def test_the_text_says_it_in_a_sentence(
+    written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    """With what may be behind it and what would tell."""
+    assert cli.run(["criticise", str(written(residuals(2, lens=0.3)))]) == 0
+    said = capsys.readouterr().out
+    assert "a lens that is not centred (tangential distortion)" in said
+    assert "likely: a lens element off centre" in said
+
+
+def test_a_lens_drawn_at_random_is_nothing() -> None:
+    """Eight tables of noise, none of which is described: at most 1e-3 each may be by chance."""
+    assert not any(criticise(residuals(seed)).findings for seed in range(10, 18))
+
+
+def test_a_missing_column_is_named_with_what_may_be_meant(
+    written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 4, one line."""
+    table = residuals(3)
+    table["dx_px"] = table.pop("dx")
+    assert cli.run(["criticise", str(written(table))]) == 4
+    said = capsys.readouterr().err
+    assert "no column dx" in said
+    assert "rename 'dx_px' for 'dx'?" in said
+
+
+@pytest.mark.parametrize("content", ["", "x,y,dx,dy\n1,2,3,4\n", "x,y,dx,dy\na,b,c,d\n", "x,x,dx,dy\n1,1,1,1\n"])
+def test_a_file_that_is_no_table_ends_in_one_line(
+    tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Empty, one row, words, a column twice."""
+    path = tmp_path / "residuals.csv"
+    path.write_text(content, encoding="utf-8")
+    assert cli.run(["criticise", str(path)]) == 4
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1

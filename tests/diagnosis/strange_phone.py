@@ -1,0 +1,79 @@
+"""Phones with effects that no catalogue has: tracks without pictures, by a physics of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from motion.synthetic_tracks import Recording, Setup
+from numpy.typing import NDArray
+
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Capture, CaptureMetadata, Frame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Strange:
+    """What is strange about a phone; times on its inertial clock."""
+
+    late_s: Callable[[Array], Array] | None = None
+    """Of the fraction of the readout: how much later than evenly a row starts."""
+    longer: Callable[[Array], Array] | None = None
+    """Of time: by which part the focal length is longer."""
+    tangential: tuple[float, float] = (0.0, 0.0)
+    """p1 and p2 of the lens."""
+    gyro: Callable[[Array, Array, Array], Array] | None = None
+    """Of time, reading and force: what is logged."""
+    focus_dioptres: Callable[[Array], Array] | None = None
+
+
+class StrangePhone(Recording):
+    """A recording by a strange phone, of a scene far away."""
+
+    def __init__(self, setup: Setup, strange: Strange) -> None:
+        super().__init__(setup)
+        self.strange = strange
+
+    @cached_property
+    def imu(self) -> ImuSamples:
+        """The log, with what is strange about the gyroscope."""
+        whole = Recording.imu.func(self)  # type: ignore[attr-defined]
+        if self.strange.gyro is None:
+            return whole
+        return replace(whole, gyro_rad_s=self.strange.gyro(whole.time_s, whole.gyro_rad_s, whole.accel_m_s2))
+
+    def seen_s(self, points_px: Array, frame: NDArray[np.intp]) -> Array:
+        """Rows that start late are seen late."""
+        even_s = super().seen_s(points_px, frame)
+        if self.strange.late_s is None:
+            return even_s
+        fraction = points_px[:, 1] / self.setup.height
+        return even_s + self.strange.late_s(fraction)
+
+    def _project(self, way: Array, start: Array, inverse: Array, time_s: Array) -> Array:
+        setup, (p1, p2) = self.setup, self.strange.tangential
+        points_px = super()._project(way, start, inverse, time_s)
+        x, y = ((points_px - setup.centre_px) / setup.focal_px).T
+        r2 = x * x + y * y
+        x, y = x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        longer = 0.0 if self.strange.longer is None else self.strange.longer(time_s)
+        return np.stack([x, y], axis=-1) * setup.focal_px * (1 + np.atleast_1d(longer)[:, None]) + setup.centre_px
+
+    @property
+    def capture(self) -> Capture:
+        """The log beside the pictures that were never taken."""
+        focus = self.strange.focus_dioptres
+        frames = tuple(
+            Frame(k, 0, float(t), float(e), focus_dioptres=None if focus is None else float(focus(np.array(t))))
+            for k, (t, e) in enumerate(zip(self.stamp_s, self.exposure_s, strict=True))
+        )
+        setup = self.setup
+        nowhere = Path("nowhere")
+        return Capture(
+            "strange", nowhere, nowhere, setup.width, setup.height, frames, self.imu, CaptureMetadata(), "REALTIME", 0
+        )  # fmt: skip

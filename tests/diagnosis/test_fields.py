@@ -1,0 +1,229 @@
+"""Effects that no catalogue has are described by the right covariate, shape and size, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis.strange_phone import Strange, StrangePhone
+from motion.synthetic_tracks import Setup
+
+from virest.camera.field import Field
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges
+from virest.diagnosis.field.records import Distrusted
+from virest.diagnosis.field.search import with_fields
+from virest.diagnosis.field.stretches import doubtful_stretches
+from virest.diagnosis.field.words import finding_of
+from virest.diagnosis.findings import FieldFinding
+from virest.diagnosis.geometric_evidence import make_evidence
+from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.motion.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
+from virest.motion.track_fit import Term
+
+HAND = Setup(
+    seed=71, frames=61, points=20, width=640, height=480, centre_px=(323.0, 236.0), readout_direction="top_to_bottom",
+    gyro_noise_rad_s=0.001, rate_rad_s=0.8, exposure_swing=0.0,
+)  # fmt: skip
+PER_FORCE = np.array([[0.006, -0.003, 0.0045], [0.0015, 0.0075, -0.003], [-0.0045, 0.003, 0.006]])
+
+
+def late_s(fraction):
+    """A parabola of the row, 2 ms in the middle."""
+    return 0.008 * fraction * (1 - fraction)
+
+
+def warming(time_s):
+    """A focal length that settles 2 % longer."""
+    return 0.02 * (1 - np.exp(-np.maximum(time_s, 0) / 0.7))
+
+
+def focus_dioptres(time_s):
+    """A refocus in the middle of the capture."""
+    return 0.5 + 2 / (1 + np.exp(-(time_s - 1.0) / 0.3))
+
+
+def filled(from_s, to_s):
+    """Readings lost and filled by a straight line."""
+
+    def log(time_s, reading, _force):
+        inside = np.flatnonzero((time_s >= from_s) & (time_s <= to_s))
+        reading = reading.copy()
+        reading[inside] = np.linspace(reading[inside[0]], reading[inside[-1]], len(inside))
+        return reading
+
+    return log
+
+
+def judged(
+    phone: StrangePhone, nominal: CameraProfile, rungs: int = 0, fitted: tuple[Term, ...] = ()
+) -> tuple[GeometricVerdict, list[FieldFinding]]:
+    """Fields after a ladder of so many rungs, as a diagnosis asks for them; fitted: terms in from the start."""
+    capture, observed = phone.capture, phone.observed
+    doubtful = doubtful_pairs(observed, capture, nominal)
+    rest = observed.chosen(~doubtful.hit) if doubtful.sets_aside else observed
+    evidence = make_evidence(capture.imu, rest)
+    found = with_fields(climb(evidence, nominal, fitted, (), max_rungs=rungs), evidence, capture)
+    if doubtful.sets_aside:
+        with_bridges(found, observed, doubtful, capture)
+    return found, [finding_of(entry, found.noise_px) for entry in found.fields]
+
+
+def gained(field: FieldFinding) -> float:
+    """Part of the held-out excess over the true noise that a field takes away."""
+    before, after = (rms**2 - HAND.noise_px**2 for rms in (field.held_out.before, field.held_out.after))
+    return 1 - after / before
+
+
+def error(found: FieldFinding, truth) -> float:
+    """Largest difference of a field from the truth over its range, as a part of the truth's range."""
+    along = np.linspace(found.fields[0].knots[0][0], found.fields[0].knots[0][-1], 50)
+    wanted = truth(along)
+    return float(np.abs(found.fields[0].at(along)[:, 0] - wanted).max() / np.ptp(wanted))
+
+
+def test_rows_read_unevenly_are_a_delay_over_the_row() -> None:
+    """The parabola comes back, all that it cost is gained, and it stands in words."""
+    phone = StrangePhone(HAND, Strange(late_s=late_s))
+    verdict, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates, field.shape) == ("delay", ("row",), "a parabola")
+    assert error(field, late_s) < 0.1
+    assert gained(field) > 0.8
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+    assert "late by up to 2" in field.sentence
+    assert "in the middle of the readout, a parabola of the row: lines are not read evenly" in field.sentence
+
+
+def test_a_named_cause_beside_an_unknown_one_keeps_its_name_and_size() -> None:
+    """An offset of 6 ms beside uneven rows: both are found, neither takes the other's part."""
+    phone = StrangePhone(replace(HAND, seed=72), Strange(late_s=late_s))
+    nominal = replace(phone.profile, time_offset_s=phone.setup.time_offset_s - 0.006)
+    verdict, (field,) = judged(phone, nominal, rungs=1)
+    assert [entry.name for entry in verdict.accepted] == ["time_offset"]
+    assert verdict.model.profile.time_offset_s == pytest.approx(phone.setup.time_offset_s, abs=1e-4)
+    assert error(field, late_s) < 0.1
+
+
+def test_a_lens_off_centre_is_a_map_of_second_order() -> None:
+    """Tangential distortion is neither taken for a principal point nor for k1."""
+    phone = StrangePhone(replace(HAND, seed=73), Strange(tangential=(0.012, -0.008)))
+    verdict, (field,) = judged(phone, phone.profile, fitted=(PRINCIPAL_POINT, K1))
+    lens = verdict.model.profile.intrinsics
+    assert lens is not None
+    assert (lens.cx_px, lens.cy_px) == pytest.approx(HAND.centre_px, abs=3)
+    assert abs(lens.coefficients[0]) < 0.01
+    assert (field.kind, field.shape) == ("displacement", "growing with its square")
+    assert gained(field) > 0.7
+    truth = 0.012 * 3 * (200 / HAND.focal_px) ** 2 * HAND.focal_px
+    seen = field.fields[0].at(HAND.centre_px[0], HAND.centre_px[1] + 200)
+    assert seen[1] == pytest.approx(truth, rel=0.15)
+
+
+def test_a_focal_length_that_settles_is_a_scale_over_time() -> None:
+    """It levels off, which a constant drift does not."""
+    phone = StrangePhone(replace(HAND, seed=74), Strange(longer=warming))
+    _, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates, field.shape) == ("scale", ("time",), "levelling off")
+    assert field.fields[0].stamp_0_ns is not None
+    assert error(field, warming) < 0.15
+
+
+def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival() -> None:
+    """What goes together in a capture is said to."""
+    breathing = Strange(
+        longer=lambda t: 0.02 * (focus_dioptres(t) - focus_dioptres(0.0)), focus_dioptres=focus_dioptres
+    )
+    phone = StrangePhone(replace(HAND, seed=75), breathing)
+    _, (field,) = judged(phone, phone.profile)
+    assert field.covariates == ("focus",)
+    assert field.confounded == ("scale over time",)
+    assert "scale over time would explain it as well" in field.sentence
+    assert field.size == pytest.approx(0.04, rel=0.1)
+    assert not field.fields[0].belongs_to_one_capture
+
+
+def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
+    """The nine numbers come back with their signs."""
+    wall = replace(
+        HAND, seed=76, sway_m=0.05, plane_per_m=(0.05, -0.1, 0.6), accel_bias_m_s2=(0.0, 0.0, 0.0)
+    )  # fmt: skip
+    phone = StrangePhone(wall, Strange(gyro=lambda t, reading, force: reading + force @ PER_FORCE.T))
+    nominal = replace(phone.profile, depth_m=None)
+    _, fields = judged(phone, nominal)
+    assert [field.covariates for field in fields] == [("acceleration",)]
+    found = np.array([field.at(1.0)[..., :] for field in fields[0].fields])
+    assert np.corrcoef(found.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
+
+
+def test_a_filled_gap_is_bridged_from_the_points() -> None:
+    """A straight line in the log is seen in the log, confirmed by the points, and replaced by what they tell."""
+    phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=filled(1.0, 1.15)))
+    verdict, (field,) = judged(phone, phone.profile)
+    assert isinstance(verdict.fields[0], Distrusted)
+    assert field.shape == "straight"
+    ((from_s, to_s),) = verdict.model.profile.imu_untrusted_s
+    assert (from_s, to_s) == pytest.approx((1.0, 1.15), abs=0.01)
+    assert field.held_out.before > 5 * HAND.noise_px
+    assert gained(field) > 0.95
+    assert "inertial rows there lie on a straight line" in field.sentence
+    assert verdict.final_rms_px < 1.3 * HAND.noise_px
+
+
+def test_a_gyroscope_that_clips_is_found_at_its_limit() -> None:
+    """The limit is told, and the peaks are bridged."""
+    phone = StrangePhone(replace(HAND, seed=78), Strange(gyro=lambda t, reading, _: np.clip(reading, -1.4, 1.4)))
+    stretches = doubtful_stretches(phone.imu)
+    assert {stretch.kind for stretch in stretches} == {"clipped"}
+    assert {stretch.limit_rad_s for stretch in stretches} == {1.4}
+    _, (field,) = judged(phone, phone.profile)
+    assert "beyond 1.4 rad/s the gyroscope reads too little: it clips" in field.sentence
+    assert field.held_out.after < field.held_out.before
+
+
+def test_two_unknown_effects_at_once_are_two_fields() -> None:
+    """Neither hides the other."""
+    phone = StrangePhone(replace(HAND, seed=79), Strange(late_s=late_s, tangential=(0.01, 0.008)))
+    _, fields = judged(phone, phone.profile)
+    assert {field.kind for field in fields} == {"delay", "displacement"}
+
+
+@pytest.mark.parametrize("seed", [81, 82])
+def test_nothing_hidden_has_no_field_and_no_stretch(seed: int) -> None:
+    """No false alarm."""
+    phone = StrangePhone(replace(HAND, seed=seed), Strange())
+    verdict, fields = judged(phone, phone.profile)
+    assert not fields
+    assert not verdict.model.profile.fields
+    assert not doubtful_stretches(phone.imu)
+
+
+def test_named_causes_alone_are_no_field() -> None:
+    """What the ladder explains leaves nothing to describe."""
+    phone = StrangePhone(replace(HAND, seed=84, k1=-0.08, focal_drift_per_s=0.02), Strange())
+    lens = phone.profile.intrinsics
+    assert lens is not None
+    plain = replace(lens, model="none", coefficients=())
+    nominal = replace(
+        phone.profile, intrinsics=plain, extensions=replace(phone.profile.extensions, focal_drift_per_s=0.0)
+    )
+    verdict, fields = judged(phone, nominal, fitted=(K1, FOCAL_DRIFT))
+    assert verdict.nominal_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+    assert not fields
+
+
+def test_a_found_field_holds_in_another_capture_of_the_phone() -> None:
+    """The extended profile predicts the points of a capture that took no part."""
+    strange = Strange(late_s=late_s)
+    phone = StrangePhone(HAND, strange)
+    found, _ = judged(phone, phone.profile)
+    other = StrangePhone(replace(HAND, seed=85), strange)
+    evidence = make_evidence(other.capture.imu, other.observed)
+    before, after = (
+        climb(evidence, replace(other.profile, shutter=shutter), (), (), max_rungs=0).final_rms_px
+        for shutter in (other.profile.shutter, found.model.profile.shutter)
+    )
+    excess = (after**2 - HAND.noise_px**2) / (before**2 - HAND.noise_px**2)
+    assert before > 3 * HAND.noise_px
+    assert excess < 0.2
+    assert isinstance(found.model.profile.shutter.uneven, Field)

@@ -1,0 +1,85 @@
+"""Fields of focal length and rate, as the trajectory, the moving lens and the simulator take them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from virest.camera.field import Field
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.camera.shutter import Shutter
+from virest.capture.imu import ImuSamples
+from virest.motion.integration import integrate_gyro, missing_rate_rad_s
+from virest.motion.optics import moving_lens
+from virest.simulation.exposure import make_view
+from virest.simulation.hand_motion import random_hand_motion
+from virest.simulation.hidden import NOTHING, focal_scale, gyro_reading, late_rows_s
+
+CAMERA = CameraProfile(
+    160, 120, intrinsics=Intrinsics(160, 120, 130.0, 130.0, 80.0, 58.0), shutter=Shutter(0.02, "top_to_bottom"),
+    time_offset_s=0.0, gyro_bias_rad_s=(0.01, -0.02, 0.03), gyro_scale=(1.02, 0.99, 1.01),
+)  # fmt: skip
+ZOOM = Field("scale", ("time",), ((0.0, 0.5, 1.5),), ((0.0,), (0.01,), (0.03,)))
+FIELDS = (
+    Field("rate", ("rate_x",), ((-2.0, 0.0, 2.0),), ((-0.2, 0.0, 0.0), (0.0,) * 3, (0.15, 0.0, 0.0))),
+    Field("rate", ("accel_z",), ((-20.0, 20.0),), ((-0.1, 0.05, 0.0), (0.1, -0.05, 0.0))),
+    Field("rate", ("time",), ((0.0, 0.5, 1.0),), ((0.0,) * 3, (0.0, 0.04, -0.03), (0.0,) * 3)),
+)  # fmt: skip
+
+
+def log() -> ImuSamples:
+    """A second of turns and forces."""
+    time_s = np.arange(0.0, 1.0, 0.005)
+    rate = np.stack([1.7 * np.sin(7 * time_s), 0.6 * np.cos(4 * time_s), 0.4 * np.sin(3 * time_s)], axis=-1)
+    force = np.stack([np.sin(5 * time_s), 9.0 + 0.0 * time_s, 3 * np.cos(2 * time_s)], axis=-1)
+    return ImuSamples(time_s, rate, force)
+
+
+def test_a_rate_field_turns_the_trajectory() -> None:
+    """The camera's rate is R (measured less bias over scale, plus the fields), sample by sample."""
+    imu, profile = log(), CAMERA.with_fields(FIELDS)
+    added = missing_rate_rad_s(imu, profile)
+    assert added is not None
+    before, after = (integrate_gyro(imu, p).rate_rad_s(imu.time_s[:-1]) for p in (CAMERA, profile))
+    assert after - before == pytest.approx(added[:-1] @ CAMERA.rotation_cam_imu.T, abs=1e-9)
+    assert float(np.abs(added).max()) > 0.1
+
+
+def test_the_simulated_gyroscope_reads_what_the_fields_take_back() -> None:
+    """Simulator and trajectory agree: true rate → reading → true rate."""
+    imu, profile = log(), CAMERA.with_fields(FIELDS)
+    reading = gyro_reading(profile, imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
+    known = replace(imu, gyro_rad_s=reading)
+    true = (reading - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    added = missing_rate_rad_s(known, profile)
+    assert added is not None
+    assert true + added == pytest.approx(imu.gyro_rad_s, abs=1e-6)
+
+
+def test_a_scale_field_lengthens_the_focal_length_in_lens_and_simulator_alike() -> None:
+    """Rays and projection are inverse at any time, and the simulator looks along the same rays."""
+    imu, profile = log(), CAMERA.with_fields([ZOOM])
+    lens = moving_lens(integrate_gyro(imu, profile), profile)
+    points = np.array([[10.0, 20.0], [150.0, 111.0]])
+    time_s = np.array([0.3, 0.9])
+    assert lens.project(lens.rays(points, time_s), time_s) == pytest.approx(points)
+    assert focal_scale(profile, NOTHING, 0.5) == pytest.approx(1.01)
+    motion = random_hand_motion(
+        np.random.default_rng(1), rate_rms_rad_s=0.5, duration_s=1.0, sway_rms_m=0.0, margin_s=1
+    )
+    x, y = make_view(profile, motion).rays(0.9, slice(None), slice(None))
+    seen = lens.rays(np.array([150.0, 111.0]), np.array(0.9))
+    assert (x[111, 150], y[111, 150]) == pytest.approx(tuple(seen[:2]), abs=1e-5)
+
+
+def test_rows_start_late_in_the_simulator_too() -> None:
+    """The same delay of the same row."""
+    late = Field("delay", ("row",), ((0.0, 0.5, 1.0),), ((0.0,), (0.003,), (0.001,)))
+    profile = CAMERA.with_fields([late])
+    fraction = np.arange(120) / 120
+    rows = np.stack([np.zeros(120), np.arange(120.0)], axis=-1)
+    seen_s = 0.02 * (profile.shutter.readout_fraction(rows, 160, 120) - fraction)
+    assert late_rows_s(profile, NOTHING, fraction) == pytest.approx(seen_s)

@@ -1,0 +1,37 @@
+"""`virest criticise`: what a calibration's residuals say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from virest.app import console
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
+
+
+def criticise(
+    residuals: Annotated[
+        Path, typer.Argument(metavar="RESIDUALS", help="CSV: x, y, dx, dy in pixels, one row for each point.")
+    ],
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> int:
+    """Find what the residuals of any calibration depend on, and say what may be behind it.
+
+    Columns x, y are the point, dx, dy measured minus predicted, in pixels. Optional: row (fraction of the readout),
+    time (s), frame, vx, vy (speed of the point, px/s), and any other covariate under its own name.
+
+    \b
+    $ virest criticise residuals.csv
+    $ virest criticise residuals.csv --json | jq '.fields[].sentence'
+    """  # noqa: D301
+    console.configure(quiet=quiet, verbose=verbose)
+    from virest.app.criticise import criticise_file
+
+    facts, text = criticise_file(residuals)
+    emit_facts(facts, text, as_json=json)
+    return 0

@@ -1,0 +1,121 @@
+"""``virest criticise residuals.csv``: what a calibration's residuals say that its model does not."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from virest.app.outputs import plain
+from virest.diagnosis.field.residual_table import NEEDED, QUANTITY, Criticism, TableFinding, criticise
+from virest.errors import CaptureError
+
+Json = dict[str, Any]
+SCHEMA = "virest/criticism/1"
+MAX_BYTES = 1 << 30
+
+
+def criticise_file(path: Path) -> tuple[Json, str]:
+    """Facts for ``--json`` and text for people. Raises CaptureError where the table cannot be used."""
+    columns = read_columns(path)
+    try:
+        found = criticise(columns)
+    except CaptureError as error:
+        raise CaptureError(f"{path.name}: {error.message}", hint=_nearest(columns) or error.hint) from None
+    return as_json(path, found), describe(path, found)
+
+
+def read_columns(path: Path) -> dict[str, Any]:
+    """The numeric columns of a CSV file by their names, in lower case; `#` begins a comment."""
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such file", hint="pass a CSV file with the columns x, y, dx, dy")
+    if path.stat().st_size > MAX_BYTES:
+        raise CaptureError(f"{path.name}: larger than {MAX_BYTES >> 20} MB", hint="thin the rows")
+    try:
+        table = pd.read_csv(path, skipinitialspace=True, comment="#", encoding="utf-8")
+    except (ValueError, UnicodeDecodeError, OSError) as error:
+        raise CaptureError(
+            f"{path.name}: is no CSV table: {str(error).splitlines()[0][:120]}", hint="first line: x,y,dx,dy"
+        ) from None
+    table.columns = [str(name).strip().lower() for name in table.columns]
+    if table.columns.has_duplicates:
+        raise CaptureError(f"{path.name}: a column stands twice", hint="name each column once")
+    numeric = {name: pd.to_numeric(table[name], errors="coerce").to_numpy(float) for name in table.columns}
+    return {name: values for name, values in numeric.items() if np.isfinite(values).any()}
+
+
+def _nearest(columns: dict[str, Any]) -> str:
+    """The column that may be meant by a missing one."""
+    missing = [name for name in NEEDED if name not in columns]
+    spare = [name for name in columns if name not in NEEDED]
+    near = [
+        [s for s in spare if s.startswith(name)][:1] or difflib.get_close_matches(name, spare, n=1, cutoff=0.4)
+        for name in missing
+    ]
+    pairs = [f"'{found[0]}' for '{name}'" for name, found in zip(missing, near, strict=True) if found]
+    return f"rename {', '.join(pairs)}?" if pairs else ""
+
+
+def as_json(path: Path, found: Criticism) -> Json:
+    """The findings as one object."""
+    content = {
+        "schema": SCHEMA,
+        "file": path.name,
+        "rows": found.rows,
+        "used": found.used,
+        "rms_px": found.rms_px,
+        "left_px": found.left_px,
+        "false_alarm_rate": found.false_alarm_rate,
+        "asked": list(found.forms),
+        "fields": [_field(field) for field in found.findings],
+    }
+    facts: Json = plain(content)
+    return facts
+
+
+def _field(field: TableFinding) -> Json:
+    excess = field.before**2 - field.noise**2
+    gain = 1 - (field.after**2 - field.noise**2) / excess if excess > 0 else 0.0
+    return {
+        "covariates": list(field.covariates),
+        "kind": field.kind,
+        "shape": field.shape,
+        "sentence": field.sentence,
+        "size": field.size,
+        "unit": field.unit,
+        "std": field.std,
+        "held_out": {
+            "metric": QUANTITY,
+            "before": field.before,
+            "after": field.after,
+            "gain": float(np.clip(gain, 0, 1)),
+        },
+        "p_value": field.p_value,
+        "confounded": list(field.confounded),
+        "reasons": field.reasons,
+        "next": field.next,
+        "knots": [list(k) for k in field.knots],
+        "values": [list(v) for v in field.values],
+        "figure": None,
+    }
+
+
+def describe(path: Path, found: Criticism) -> str:
+    """The findings for people."""
+    asked = ", ".join(dict.fromkeys(name for form in found.forms for name in form.split(" over ")[1].split(", ")))
+    lines = [
+        f"{path.name}: {found.rows} residuals ({found.used} used), {found.rms_px:.3g} px rms per coordinate",
+        f"asked along {asked}",
+    ]
+    for field in found.findings:
+        lines.append(f"field: {field.sentence}; largest value ± {field.std:.2g} {field.unit}")
+        lines.append(f"  likely: {field.reasons}; to tell: {field.next}")
+    left = f"{found.left_px:.3g} px"
+    if found.findings:
+        lines.append(f"left: {left} without structure")
+    else:
+        lines.append(f"nothing: no structure beyond chance ({found.false_alarm_rate:g} for all covariates together)")
+    return "\n".join(lines)

@@ -1,0 +1,135 @@
+"""Fields: smooth corrections of the model along recorded covariates, for effects that have no name of their own.
+
+A field is given by its values at knots; between them runs the interpolating cubic spline (of lower degree below four
+knots), and beyond the first and last knot the end values hold.  Two covariates make a tensor product.  Four kinds:
+
+- ``delay`` (s): a row starts this much later than an even readout has it.
+- ``displacement`` (px): a point is seen this far from where the lens puts it.
+- ``scale`` (1): the focal length is longer by this part.
+- ``rate`` (rad/s, IMU axes): the true rate is larger than the gyroscope's, less bias and over scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline
+
+from virest.errors import SettingsError
+
+Array = NDArray[np.float64]
+AXES = ("x", "y", "z")
+RATES, FORCES = tuple(f"rate_{a}" for a in AXES), tuple(f"accel_{a}" for a in AXES)
+KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
+    "delay": ("s", 1, (("row",),)),
+    "displacement": ("px", 2, (("x", "y"),)),
+    "scale": ("1", 1, (("time",), ("focus",))),
+    "rate": ("rad/s", 3, (("time",), *((name,) for name in (*RATES, *FORCES)))),
+}
+"""Unit, number of components and possible covariates of each kind."""
+UNITS = {"row": "1", "x": "px", "y": "px", "time": "s", "focus": "1/m"}
+"""Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout."""
+_FIXED_POINT_STEPS = 5
+"""A displacement's slope is a few per cent: each step of its inversion shrinks the error by that factor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field."""
+
+    kind: str
+    """A key of KINDS."""
+    covariates: tuple[str, ...]
+    knots: tuple[tuple[float, ...], ...]
+    """Rising, one list for each covariate, in its unit."""
+    values: tuple[tuple[float, ...], ...]
+    """(knots, components); of two covariates the second runs fastest."""
+    std: tuple[tuple[float, ...], ...] = ()
+    """Standard deviations of the values; empty: unknown."""
+    stamp_0_ns: int | None = None
+    """First stamp of the only capture that the field holds for; None: it belongs to the phone."""
+    log: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Times (IMU clock) and values of a logged covariate in the capture at hand; in no file."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise SettingsError(f"field kind '{self.kind}' is not known", hint=f"use one of {', '.join(KINDS)}")
+        _, parts, allowed = KINDS[self.kind]
+        if self.covariates not in allowed:
+            known = " or ".join("(" + ", ".join(names) + ")" for names in allowed)
+            raise SettingsError(f"field {self.kind}: covariates are {known}, not {', '.join(self.covariates)}")
+        if len(self.knots) != len(self.covariates) or any(len(k) < 2 or np.any(np.diff(k) <= 0) for k in self.knots):
+            raise SettingsError(f"field {self.kind}: needs two or more rising knots for each covariate")
+        for name, rows in (("values", self.values), ("std", self.std or self.values)):
+            if len(rows) != np.prod([len(k) for k in self.knots]) or any(len(row) != parts for row in rows):
+                raise SettingsError(f"field {self.kind}: {name} must have {parts} numbers for each knot")
+
+    @property
+    def unit(self) -> str:
+        """Of the values."""
+        return KINDS[self.kind][0]
+
+    @property
+    def belongs_to_one_capture(self) -> bool:
+        """Whether it holds for the capture alone that it was found in."""
+        return self.stamp_0_ns is not None
+
+    def at(self, *covariates: Any) -> Array:
+        """Values (..., components) where the covariates are (...) each."""
+        table = np.array(self.values)
+        if len(self.knots) == 1:
+            return cardinal_weights(self.knots[0], covariates[0]) @ table
+        first, second = (cardinal_weights(k, c) for k, c in zip(self.knots, covariates, strict=True))
+        across = (first @ table.reshape(len(self.knots[0]), -1)).reshape(*first.shape[:-1], len(self.knots[1]), -1)
+        return np.asarray((second[..., None] * across).sum(axis=-2))
+
+    def at_time(self, time_s: Any) -> Array:
+        """Values (..., components) of a field over time, or over what is logged, at times (...), IMU clock."""
+        time_s = np.asarray(time_s, float)
+        return self.at(time_s if self.log is None else np.interp(time_s, *self.log))
+
+    def undisplaced(self, points_px: Array) -> Array:
+        """Where points seen at pixels (..., 2) would be without a displacement: q + u(q) = p."""
+        points_px = np.asarray(points_px, float)
+        found = points_px
+        for _ in range(_FIXED_POINT_STEPS):
+            found = points_px - self.at(found[..., 0], found[..., 1])
+        return found
+
+    def with_values(self, values: Array, std: Array | None = None) -> Field:
+        """The field with other values (knots, components)."""
+        rows = tuple(map(tuple, np.asarray(values).tolist()))
+        return replace(self, values=rows, std=() if std is None else tuple(map(tuple, np.asarray(std).tolist())))
+
+    def rounded(self, digits: int = 5) -> Field:
+        """The field with so many significant digits, as it is written."""
+        rows = (tuple(tuple(float(f"{v:.{digits}g}") for v in row) for row in part) for part in (self.values, self.std))
+        values, std = rows
+        return replace(self, values=values, std=std)
+
+    def is_in_place_of(self, other: Field) -> bool:
+        """Whether two fields are the same but for their values."""
+        return (self.kind, self.covariates, self.knots) == (other.kind, other.covariates, other.knots)
+
+    def later(self, seconds: float) -> Field:
+        """The field with times counted from so much later."""
+        if self.covariates == ("time",):
+            return replace(self, knots=(tuple(k - seconds for k in self.knots[0]),))
+        if self.log is None:
+            return self
+        return replace(self, log=(tuple(t - seconds for t in self.log[0]), self.log[1]))
+
+
+def cardinal_weights(knots: tuple[float, ...], covariate: Any) -> Array:
+    """What each knot's value counts (..., knots) in the interpolating spline where a covariate is (...)."""
+    held = np.clip(np.asarray(covariate, float), knots[0], knots[-1])
+    return np.asarray(_cardinal(knots)(held))
+
+
+@lru_cache(maxsize=256)
+def _cardinal(knots: tuple[float, ...]) -> BSpline:
+    return make_interp_spline(knots, np.eye(len(knots)), k=min(3, len(knots) - 1))

@@ -1,0 +1,1 @@
+"""Unknown effects as fields: what tracked points do along recorded covariates, after every named cause."""

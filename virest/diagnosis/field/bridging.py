@@ -1,0 +1,176 @@
+"""What stretches of an untrusted log do to the points, and the rates there that the points tell instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture
+from virest.diagnosis.field.records import Distrusted
+from virest.diagnosis.field.stretches import Stretch, bridging_form, doubtful_stretches, touching
+from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, make_evidence
+from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
+from virest.motion.observed_tracks import ObservedTracks
+from virest.motion.scene_motion import InertialMotion
+from virest.motion.track_fit import start_scene
+from virest.motion.track_model import TrackTable, ground
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+LEAST_PAIRS_LEFT = 20
+"""So many pairs of frames without a doubtful stretch are enough for the ladder."""
+MAX_P = 1e-3
+"""One-sided, that points in doubtful stretches lie no further off than elsewhere."""
+LEFT_PART, LEFT_RATIO = 0.2, 1.5
+"""A bridge holds where at most this part of the excess is left, or points are off by so many times the noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Doubtful:
+    """Pairs of frames with and without doubtful stretches of the log."""
+
+    stretches: tuple[Stretch, ...]
+    hit: Mask
+    """(pairs,)."""
+
+    @property
+    def sets_aside(self) -> bool:
+        """Whether the ladder can do without the pairs that are hit."""
+        return bool(self.hit.any() and (~self.hit).sum() >= LEAST_PAIRS_LEFT)
+
+
+def doubtful_pairs(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> Doubtful:
+    """Which pairs reach into stretches of the log that do not look like a gyroscope's."""
+    to_imu = (1 + profile.clock_skew, profile.time_offset_s or 0.0)
+    found = doubtful_stretches(capture.imu)
+    seen = [stretch for stretch in found if touching(observed, [stretch], to_imu).any()]
+    return Doubtful(tuple(seen), touching(observed, seen, to_imu))
+
+
+def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Doubtful, capture: Capture) -> None:
+    """Judge the pairs that were set aside, and add to a verdict what their points tell of the doubtful stretches."""
+    evidence = make_evidence(capture.imu, observed)
+    model = replace(found.model, terms=())
+    table = evidence.table(model, FINAL_POINTS)
+    model = _with_scene(evidence, model, table)
+    spread = found.fit.depth_spread_per_m
+    before = distances(capture.imu, fit_model(capture.imu, model, (), table), table, spread)
+    hit = doubtful.hit[table.pair]
+    p_value = _further_off(before, table, doubtful.hit)
+    if p_value > MAX_P:
+        found.notes.append(
+            f"{len(doubtful.stretches)} stretches of the inertial log look {doubtful.stretches[0].kind}; "
+            "points there do not show it, their frames took no part in the ladder"
+        )
+        return
+    half = np.arange(len(table)) % 2 == 0
+    held_out = np.zeros(len(table))
+    for part in (half, ~half):
+        bridged = _bridged(evidence, model, table.chosen(part & hit), doubtful.stretches, capture)
+        held_out[~part] = distances(
+            capture.imu, fit_model(capture.imu, bridged, (), table.chosen(part)), table, spread
+        )[~part]
+    typical = evidence.typical_px
+    rest = capped_rms(before[~hit])
+    to_imu = (1 + model.profile.clock_skew, model.profile.time_offset_s or 0.0)
+    good = [
+        s for s in doubtful.stretches if _holds(before, held_out, rest, touching(observed, [s], to_imu)[table.pair])
+    ]
+    bad = [s for s in doubtful.stretches if s not in good]
+    trusted = ~touching(observed, bad, to_imu) if bad else np.ones(len(doubtful.hit), bool)
+    if good:
+        _take_over(found, evidence.observed.chosen(trusted), good, model, capture)
+    untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
+    profile = replace(found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
+    found.model = replace(found.model, profile=profile)
+    found.fields.append(
+        Distrusted(
+            doubtful.stretches,
+            tuple(s in good for s in doubtful.stretches),
+            p_value,
+            _rms(before[hit]) * typical,
+            _rms(held_out[hit]) * typical,
+            rest * typical,
+            profile,
+        )
+    )
+
+
+def with_description(found: GeometricVerdict, evidence: Evidence, doubtful: Doubtful, capture: Capture) -> None:
+    """Describe stretches that are too many to be set aside; their frames cannot be judged without them."""
+    hit = doubtful.hit[found.table.pair]
+    p_value = _further_off(found.fit.distance, found.table, doubtful.hit) if not hit.all() else None
+    if p_value is not None and p_value > MAX_P:
+        return
+    untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
+    profile = replace(found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
+    found.model = replace(found.model, profile=profile)
+    off_px, rest_px = (_rms(found.fit.distance[part]) * evidence.typical_px for part in (hit, ~hit))
+    found.fields.append(
+        Distrusted(doubtful.stretches, (False,) * len(doubtful.stretches), p_value, off_px, off_px, rest_px, profile)
+    )
+
+
+def _with_scene(evidence: Evidence, model: Model, table: TrackTable) -> Model:
+    """The model with a scene for this table's windows."""
+    scene = model.scene
+    if not isinstance(scene, InertialMotion) or scene.windows == table.n_windows:
+        return model
+    known = ground(evidence.imu, model.profile, translation=True)
+    depth = float(np.median(np.linalg.norm(scene.plane_per_m, axis=1)))
+    return replace(model, scene=start_scene(evidence.imu, known, table, depth))
+
+
+def _bridged(
+    evidence: Evidence, model: Model, table: TrackTable, stretches: Sequence[Stretch], capture: Capture
+) -> Model:
+    """The model with rates in the stretches that the points of a table ask for."""
+    form = bridging_form(stretches, capture.stamp_0_ns)
+    fitted = fit_model(evidence.imu, replace(model, scene=model.scene), (form.term,), table)
+    return replace(model, profile=fitted.profile)
+
+
+def _take_over(
+    found: GeometricVerdict, observed: ObservedTracks, stretches: Sequence[Stretch], model: Model, capture: Capture
+) -> None:
+    """Fit everything once more with the bridges in, to all pairs that can be trusted then."""
+    evidence = make_evidence(capture.imu, observed)
+    to_imu = (1 + model.profile.clock_skew, model.profile.time_offset_s or 0.0)
+    table = evidence.table(model, FINAL_POINTS)
+    bridged = _bridged(
+        evidence, model, table.chosen(touching(observed, stretches, to_imu)[table.pair]), stretches, capture
+    )
+    form = bridging_form(stretches, capture.stamp_0_ns)
+    whole = replace(_with_scene(evidence, bridged, table), terms=(*found.model.terms, form.term))
+    fitted = fit_model(capture.imu, whole, whole.terms, table)
+    part = fitted.slices[form.name]
+    deviations = form.filled(np.zeros(part.stop - part.start), fitted.covariance[part, part])
+    bridges = {field.knots: field.std for field in deviations}
+    held = [replace(field, std=bridges.get(field.knots, field.std)) for field in fitted.profile.fields]
+    found.model = replace(whole, profile=fitted.profile.with_fields(held), scene=fitted.scene)
+    found.fit, found.table, found.evidence = fitted, table, evidence
+    found.final_rms_px = capped_rms(fitted.distance) * evidence.typical_px
+    found.noise_px = evidence.noise_px(fitted)
+
+
+def _holds(before: Array, after: Array, rest: float, there: Mask) -> bool:
+    """Whether points in a stretch are nearly where they should be once it is bridged."""
+    was, now = _rms(before[there]), _rms(after[there])
+    return bool(now < LEFT_RATIO * rest or now**2 - rest**2 < LEFT_PART * (was**2 - rest**2))
+
+
+def _rms(distance: Array) -> float:
+    return float(np.sqrt(np.mean(distance**2) / 2)) if len(distance) else 0.0
+
+
+def _further_off(distance: Array, table: TrackTable, hit: Mask) -> float:
+    """Probability that pairs that are hit lie no further off than the others, by a rank test of their medians."""
+    numbers = np.unique(table.pair)
+    medians = np.array([np.median(distance[table.pair == number]) for number in numbers])
+    there = hit[numbers]
+    return float(stats.mannwhitneyu(medians[there], medians[~there], alternative="greater").pvalue)

@@ -1,0 +1,117 @@
+"""What forms of fields and named causes do to tracked points: difference quotients through the one model of points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.diagnosis.candidates import varies
+from virest.diagnosis.geometric_effects import PLAIN_READOUT
+from virest.motion import profile_terms as terms_of
+from virest.motion.scene_motion import DirectedMotion
+from virest.motion.track_fit import Term, TrackFit
+from virest.motion.track_model import Prediction, TrackTable, predict, with_profile
+
+Array = NDArray[np.float64]
+STABILISER_CUTOFFS_HZ = (0.3, 1.0, 4.0)
+NAMED = (
+    terms_of.TIME_OFFSET,
+    terms_of.CLOCK_SKEW,
+    PLAIN_READOUT,
+    terms_of.GYRO_BIAS,
+    terms_of.GYRO_SCALE,
+    terms_of.IMU_ROTATION,
+    terms_of.FOCAL,
+    terms_of.FOCAL_DRIFT,
+    terms_of.K1,
+    terms_of.PRINCIPAL_POINT,
+)
+"""Named causes that move points; an exposure's length and a stabiliser are added where they can be told."""
+
+
+@dataclass(frozen=True, slots=True)
+class Whitening:
+    """How differences of points in px become differences in standard deviations."""
+
+    noise_px: Array
+    """(n,)."""
+    way: Array | None
+    """(n, 2) unit vectors along the parallax; None: no relief is allowed for."""
+    shrink: Array | None
+    """(n,) part taken away along it."""
+
+    def of(self, px: Array) -> Array:
+        """Whitened (n, 2, k) of (n, 2, k)."""
+        rows = px / self.noise_px[:, None, None]
+        if self.way is None or self.shrink is None:
+            return rows
+        along = self.shrink[:, None] * np.einsum("ni,nik->nk", self.way, rows)
+        return np.asarray(rows - self.way[:, :, None] * along[:, None, :])
+
+
+@dataclass(frozen=True, slots=True)
+class PointResiduals:
+    """What a fit leaves of its points, ready for a regression."""
+
+    imu: ImuSamples
+    fit: TrackFit
+    table: TrackTable
+    prediction: Prediction
+    whitening: Whitening
+    left: Array
+    """(n, 2) in standard deviations."""
+    weight: Array
+    """(n,) robust weights over the squared scale."""
+
+    def effect(self, terms: Sequence[Term]) -> Array:
+        """Whitened change (n, 2, k) of the predicted points per free number of terms."""
+        columns = [self._moved(term, number) for term in terms for number in range(len(term))]
+        return self.whitening.of(np.stack(columns, axis=-1))
+
+    def _moved(self, term: Term, number: int) -> Array:
+        step = np.zeros(len(term))
+        step[number] = term.quotient[number]
+        return self.moved_by(term.change(self.fit.profile, step)) / term.quotient[number]
+
+    def moved_by(self, profile: CameraProfile) -> Array:
+        """By how much another profile moves the points (n, 2), px."""
+        moved = with_profile(self.fit.ground, self.imu, profile)
+        ahead = predict(moved, self.table, self.fit.scene, like=self.prediction)
+        return ahead.second_px - self.prediction.second_px
+
+    def tangent(self) -> Array:
+        """Whitened effect (n, 2, m) of all named causes and of the scene."""
+        parts = [self.effect(NAMED), *(self._stabiliser(hz) for hz in STABILISER_CUTOFFS_HZ)]
+        if varies(self.table.first_exposure_s):
+            parts.append(self.effect((terms_of.EXPOSURE_SCALE,)))
+        if self.prediction.slopes is not None:
+            parts.append(self.whitening.of(self.prediction.slopes))
+        return np.concatenate(parts, axis=-1)
+
+    def _stabiliser(self, cutoff_hz: float) -> Array:
+        """Of a stabiliser that would come on top; at its own cutoff where there is one already."""
+        profile = self.fit.profile
+        if profile.extensions.stabilisation_fraction:
+            return self.effect((terms_of.STABILISATION,))
+        extensions = replace(profile.extensions, stabilisation_fraction=0.02, stabilisation_cutoff_hz=cutoff_hz)
+        return self.whitening.of(self.moved_by(replace(profile, extensions=extensions))[..., None] / 0.02)
+
+
+def point_residuals(imu: ImuSamples, fit: TrackFit, table: TrackTable) -> PointResiduals:
+    """The residuals of a fit; what lies along the parallax counts as far as the spread of depths lets it."""
+    directed = isinstance(fit.scene, DirectedMotion)
+    at = predict(fit.ground, table, fit.scene, slopes=fit.scene is not None and not directed)
+    way = shrink = None
+    if at.along_px is not None:
+        length = np.linalg.norm(at.along_px, axis=-1)
+        way = at.along_px / np.maximum(length, 1e-12)[:, None]
+        shrink = 1 - 1 / np.sqrt(1 + (fit.depth_spread_per_m * length / fit.noise_px) ** 2)
+        shrink = np.ones_like(shrink) if directed else shrink
+    whitening = Whitening(fit.noise_px, way, shrink)
+    left = whitening.of((table.second_px - at.second_px)[..., None])[..., 0]
+    return PointResiduals(imu, fit, table, at, whitening, left, fit.weight / fit.scale**2)

@@ -1,0 +1,269 @@
+"""The residuals of any calibration, criticised: where they are no chance, and along what they run.
+
+Residuals are split into a sum of curves over the covariates that were recorded, form by form, as long as a form gains
+on blocks that it was not fitted to (group-sparse forward selection; Lozano, Swirszcz & Abe 2009).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.field import Field, cardinal_weights
+from virest.diagnosis.field.screening import MAX_P, score_forms, select
+from virest.diagnosis.field.words import PATTERNS, SAMPLES, curve_shape, lens_words, shape_of
+from virest.errors import CaptureError
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+NEEDED = ("x", "y", "dx", "dy")
+VELOCITY = ("vx", "vy")
+ORDER = ("frame", "time")
+MOST_ROWS, LEAST_ROWS = 20_000, 100
+KNOTS, PLACE_KNOTS = 6, 4
+BLOCKS, LEAST_BLOCKS = 40, 8
+MAX_FINDINGS = 6
+MIN_SIZE_PX = 0.01
+"""Smaller structure changes no calibration."""
+CAUCHY = 2.4
+MAD = 0.6745
+SHIFT = "points are shifted by up to {size} {shape} of {name}, the same everywhere in the frame"
+QUANTITY = "residual_rms_px"
+
+
+@dataclass(frozen=True, slots=True)
+class TableFinding:
+    """One effect in a table of residuals."""
+
+    kind: str
+    """``displacement``, ``shift``, ``scale`` or ``delay``."""
+    covariates: tuple[str, ...]
+    shape: str
+    sentence: str
+    size: float
+    """Largest value, in ``unit``."""
+    unit: str
+    std: float | None
+    before: float
+    """Held-out rms of the residuals, px per coordinate."""
+    after: float
+    noise: float
+    """The rms that is left in the end."""
+    p_value: float
+    confounded: tuple[str, ...]
+    knots: tuple[tuple[float, ...], ...]
+    values: tuple[tuple[float, ...], ...]
+    reasons: str
+    next: str
+
+
+@dataclass(frozen=True, slots=True)
+class Criticism:
+    """What was found in a table of residuals."""
+
+    rows: int
+    used: int
+    rms_px: float
+    """Robust rms per coordinate."""
+    left_px: float
+    """What remains after all findings."""
+    findings: tuple[TableFinding, ...]
+    forms: tuple[str, ...]
+    """Everything that was asked."""
+    false_alarm_rate: float = MAX_P
+    """Of the whole set of forms."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    kind: str
+    covariates: tuple[str, ...]
+    knots: tuple[tuple[float, ...], ...]
+    design: Array
+    """(n, 2, numbers): change of the residual per value at a knot."""
+    parts: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} over {', '.join(self.covariates)}"
+
+    @property
+    def over_time(self) -> bool:
+        return bool(set(self.covariates) & set(ORDER))
+
+
+def criticise(columns: Mapping[str, Array]) -> Criticism:
+    """Criticise residuals: x, y (px), dx, dy (px), and any further numeric columns, (n,) each.
+
+    vx, vy (px/s), where given, are the speed of the point in the frame: a delay over the row can then be told.  frame
+    and time order the rows: blocks are stretches of them; without both the rows are taken in the order they come in.
+    Raises CaptureError for too few rows.
+    """
+    columns, rows = _cleaned(columns)
+    left = np.stack([columns["dx"], columns["dy"]], axis=-1)
+    left = left - np.median(left, axis=0)
+    block = _blocks(columns, len(left))
+    forms = _forms(columns)
+    tangent = np.broadcast_to(np.eye(2), (len(left), 2, 2)).copy()
+    rms_px = _scale(left)
+    found: list[tuple[_Form, float, tuple[str, ...], float, float]] = []
+    current = left
+    for _ in range(MAX_FINDINGS):
+        scale = _scale(current)
+        weight = 1 / (1 + (current**2).sum(axis=-1) / (CAUCHY * scale) ** 2)
+        open_forms = [form for form in forms if form.name not in {known[0].name for known in found}]
+        designs = [(form.name, form.design / scale, form.over_time) for form in open_forms]
+        selection = select(score_forms(current / scale, weight, tangent, designs, block), float(weight.sum()))
+        if selection is None or selection.size * scale < MIN_SIZE_PX:
+            break
+        form = next(form for form in open_forms if form.name == selection.best.name)
+        tangent = np.concatenate([tangent, form.design], axis=-1)
+        after = float(np.sqrt(max(scale**2 - (selection.size * scale) ** 2, 0.0)))
+        found.append((form, selection.best.p_value, selection.rivals, scale, after))
+        current = left - tangent @ _solved(tangent, left, weight)
+    left_px = _scale(current)
+    weight = 1 / (1 + (current**2).sum(axis=-1) / (CAUCHY * left_px) ** 2)
+    numbers, covariance = _fitted(tangent, left, weight, block)
+    findings, place = [], 2
+    for form, p_value, rivals, before, after in found:
+        part = slice(place, place + form.design.shape[2])
+        place = part.stop
+        findings.append(_finding(form, numbers[part], covariance[part, part], p_value, rivals, before, after, left_px))
+    return Criticism(rows, len(left), rms_px, left_px, tuple(findings), tuple(form.name for form in forms))
+
+
+def _cleaned(columns: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
+    """Finite rows in order of frame and time, evenly thinned; and how many rows there were."""
+    missing = [name for name in NEEDED if name not in columns]
+    if missing:
+        raise CaptureError(f"no column {', '.join(missing)}", hint=f"needed are {', '.join(NEEDED)}, in pixels")
+    table = {name: np.asarray(values, float) for name, values in columns.items()}
+    table = {name: values for name, values in table.items() if name in NEEDED or np.isfinite(values).mean() > 0.5}
+    keep = np.all([np.isfinite(values) for values in table.values()], axis=0)
+    if keep.sum() < LEAST_ROWS:
+        raise CaptureError(f"{int(keep.sum())} complete rows, {LEAST_ROWS} are needed", hint="write more residuals")
+    rows = np.flatnonzero(keep)
+    keys = [table[name][rows] for name in ORDER if name in table]
+    rows = rows[np.lexsort(keys[::-1])] if keys else rows
+    rows = rows[:: max(-(-len(rows) // MOST_ROWS), 1)]
+    return {name: values[rows] for name, values in table.items()}, len(keep)
+
+
+def _blocks(columns: Mapping[str, Array], count: int) -> Index:
+    """Number of the block (n,) of each row: stretches of frames, of time, or of the file."""
+    key = next((columns[name] for name in ORDER if name in columns), np.arange(count, dtype=float))
+    rank = np.unique(key, return_inverse=True)[1]
+    total = int(rank.max()) + 1
+    if total < LEAST_BLOCKS:
+        rank, total = np.arange(count), count
+    return np.asarray(rank * min(BLOCKS, total) // total)
+
+
+def _forms(columns: Mapping[str, Array]) -> list[_Form]:
+    x, y = columns["x"], columns["y"]
+    middle = [0.5 * (a.min() + a.max()) for a in (x, y)]
+    arm = np.stack([x - middle[0], y - middle[1]], axis=-1)
+    forms = [_over_picture(x, y)]
+    names = [name for name in columns if name not in (*NEEDED, *VELOCITY)]
+    for name in names:
+        values = columns[name]
+        knots = np.unique(np.linspace(values.min(), values.max(), KNOTS))
+        if len(knots) < KNOTS:
+            continue
+        weights = cardinal_weights(tuple(knots.tolist()), values)
+        shared = tuple(float(k) for k in knots)
+        shift = np.einsum("nk,ij->nikj", weights, np.eye(2)).reshape(len(x), 2, -1)
+        forms.append(_Form("shift", (name,), (shared,), shift, 2))
+        if name != "row":
+            forms.append(_Form("scale", (name,), (shared,), arm[:, :, None] * weights[:, None, :], 1))
+        if name == "row" and all(v in columns for v in VELOCITY):
+            speed = np.stack([columns[v] for v in VELOCITY], axis=-1)
+            forms.append(_Form("delay", (name,), (shared,), speed[:, :, None] * weights[:, None, :], 1))
+    return forms
+
+
+def _over_picture(x: Array, y: Array) -> _Form:
+    knots = tuple(tuple(float(k) for k in np.linspace(a.min(), a.max(), PLACE_KNOTS)) for a in (x, y))
+    weights = np.einsum("ni,nj->nij", *(cardinal_weights(k, a) for k, a in zip(knots, (x, y), strict=True)))
+    design = np.einsum("nk,ij->nikj", weights.reshape(len(x), -1), np.eye(2)).reshape(len(x), 2, -1)
+    return _Form("displacement", ("x", "y"), knots, design, 2)
+
+
+def _scale(left: Array) -> float:
+    """Robust standard deviation per coordinate."""
+    return max(float(np.median(np.abs(left - np.median(left, axis=0)))) / MAD, 1e-9)
+
+
+def _solved(design: Array, left: Array, weight: Array) -> Array:
+    return _normal(design, weight)[1] @ np.einsum("nik,ni,n->k", design, left, weight)
+
+
+def _normal(design: Array, weight: Array) -> tuple[Array, Array]:
+    hessian = np.einsum("nik,nil,n->kl", design, design, weight, optimize=True)
+    size = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    inverse = np.linalg.pinv(hessian / np.outer(size, size), rcond=1e-9, hermitian=True) / np.outer(size, size)
+    return hessian, np.asarray(inverse)
+
+
+def _fitted(design: Array, left: Array, weight: Array, block: Index) -> tuple[Array, Array]:
+    """All numbers together, and their covariance from the scatter between blocks."""
+    _, inverse = _normal(design, weight)
+    numbers = inverse @ np.einsum("nik,ni,n->k", design, left, weight)
+    pull = np.einsum("nik,ni,n->nk", design, left - design @ numbers, weight)
+    sums = np.stack([np.bincount(block, column) for column in pull.T], axis=-1)
+    count = len(sums)
+    return numbers, inverse @ (sums.T @ sums) @ inverse * count / max(count - 1, 1)
+
+
+def _finding(
+    form: _Form, numbers: Array, covariance: Array, p_value: float, rivals: tuple[str, ...], before: float,
+    after: float, noise: float,
+) -> TableFinding:  # fmt: skip
+    values = numbers.reshape(-1, form.parts)
+    centre = np.eye(len(values)) - 1 / len(values) if form.kind != "displacement" else np.eye(len(values))
+    values = centre @ values
+    turn = np.kron(centre, np.eye(form.parts))
+    std = np.sqrt(np.maximum(np.diag(turn @ covariance @ turn.T), 0.0)).reshape(-1, form.parts)
+    length = np.linalg.norm(values, axis=1)
+    row = int(np.argmax(length))
+    size, unit = float(length[row]), {"scale": "1", "delay": "s"}.get(form.kind, "px")
+    if form.kind == "displacement":
+        shape = shape_of(Field("displacement", ("x", "y"), form.knots, tuple(map(tuple, values.tolist()))))
+    else:
+        along = np.linspace(form.knots[0][0], form.knots[0][-1], SAMPLES)
+        curve = cardinal_weights(form.knots[0], along) @ values
+        shape = curve_shape(curve[:, int(np.argmax(np.ptp(curve, axis=0)))], form.over_time)
+    sentence, reasons, following = _said(form, shape, size)
+    beside = f"; {' and '.join(rivals)} would explain it as well" if rivals else ""
+    return TableFinding(
+        form.kind, form.covariates, shape, f"{sentence} (residuals {before:.3g} px → {after:.3g} px, held out){beside}",
+        size, unit, float(np.linalg.norm(std[row])), before, after, min(noise, after), p_value, rivals, form.knots,
+        tuple(map(tuple, np.round(values, 8).tolist())), reasons, following,
+    )  # fmt: skip
+
+
+def _said(form: _Form, shape: str, size: float) -> tuple[str, str, str]:
+    """Sentence, likely reasons and the next measurement."""
+    name = form.covariates[0]
+    match form.kind:
+        case "displacement":
+            pattern = PATTERNS["displacement", ("x", "y")]
+            said = pattern.sentence.format(size=f"{size:.3g} px", shape=shape, lens=lens_words(shape))
+            return said, pattern.reasons, pattern.next
+        case "delay":
+            pattern = PATTERNS["delay", ("row",)]
+            said = (
+                f"points are early or late by up to {size * 1e3:.3g} ms, {shape} of the row: lines are not read evenly"
+            )
+            return said, pattern.reasons, pattern.next
+        case "scale":
+            said = f"the focal length changes by up to {size * 100:.3g} % about its mean, {shape} of {name}"
+            known = PATTERNS["scale", ("time",)]
+            return said, known.reasons, known.next
+        case _:
+            said = SHIFT.format(size=f"{size:.3g} px", shape=f"({shape})" + " as a function", name=name)
+            reasons = "a pose or a clock that changes with it, or rows that are seen at other times than assumed"
+            return said, reasons, f"record again with {name} moving independently of everything else"

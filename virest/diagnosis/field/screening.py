@@ -1,0 +1,205 @@
+"""Which form do the residuals ask for?  Scores of all forms at once, beside everything that the named causes can do.
+
+Whitened residuals are regressed on each form's effect on the points, after the tangent space of all named causes and
+of the scene has been projected out of both ("orthogonal discrepancy": Plumlee 2017, doi:10.1080/01621459.2016.1211016;
+Kennedy & O'Hagan 2001, doi:10.1111/1467-9868.00294).  A form's score is tested by flipping the signs of whole blocks of
+time (Hemerik, Goeman & Finos 2020, doi:10.1111/rssb.12369), times the number of forms, so that the false-alarm rate is
+that of the whole set.  What a form gains is measured on blocks of time and on parts of the capture that it was not
+fitted to, and whether it is chosen again when blocks are drawn anew is counted (Meinshausen & Bühlmann 2010,
+doi:10.1111/j.1467-9868.2010.00740.x).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+FLIPS, DRAWS = 500, 60
+FOLDS, PARTS = 5, 4
+OWN_PART = 1e-3
+"""A direction of which less than this part is not in the named causes' tangent space is theirs."""
+RIDGE = 1e-3
+"""Of the largest curvature: holds directions that nothing tells."""
+MAX_P = 1e-3
+"""False-alarm rate of the whole set of forms."""
+MIN_T = 3.0
+"""Least ratio of the held-out gain to its standard error."""
+RIVAL_T = 2.0
+"""Forms whose gains differ by less than this many standard errors cannot be told apart."""
+ALIKE_PART = 0.9
+"""Nor can one that gains this part of the best's gain be ruled out: its covariate goes together with the best's."""
+MIN_STABLE = 0.7
+"""Least part of the draws in which the form, or one that cannot be told from it, is the best."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """One form's scores."""
+
+    name: str
+    numbers: int
+    p_value: float
+    """For the whole set of forms."""
+    gain: Array
+    """(blocks,) squared whitened residual taken away in blocks that were not fitted."""
+    parts_gain: Array | None
+    """(blocks,) the same, with whole parts of the capture left out; None where that cannot be asked."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance is ruled out and the gain holds wherever it was asked for."""
+        held = [self.gain] if self.parts_gain is None else [self.gain, self.parts_gain]
+        return self.p_value < MAX_P and all(t_ratio(gain) > MIN_T for gain in held)
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The best form, if any, and what cannot be told from it."""
+
+    best: Scored
+    rivals: tuple[str, ...]
+    stability: float
+    size: float
+    """Rms of what it explains, in units of the residuals."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """Sums of one form over blocks."""
+
+    name: str
+    pull: Array
+    """(blocks, k) X'e."""
+    curvature: Array
+    """(blocks, k, k) X'X."""
+    over_time: bool
+
+
+def score_forms(
+    left: Array,
+    weight: Array,
+    tangent: Array,
+    designs: Sequence[tuple[str, Array, bool]],
+    block: Index,
+    moment: Index | None = None,
+    seed: int = 0,
+) -> list[Scored]:
+    """Score forms, best gain first.
+
+    left: (n, 2) residuals in standard deviations; weight (n,); tangent (n, 2, m); designs: name, effect (n, 2, k) per
+    free number, and whether the form runs over time; block (n,) number of the block of time, rising; moment (n,)
+    the same of shorter stretches within blocks, by which forms over time are tested: a few blocks hold each knot.
+    """
+    root = np.repeat(np.sqrt(weight), 2)[:, None]
+    frame = _orthonormal(tangent.reshape(len(root), -1) * root)
+    error = left.reshape(-1, 1) * root
+    error = (error - frame @ (frame.T @ error))[:, 0]
+    moments, fine = np.unique(block if moment is None else moment, return_inverse=True)
+    coarse = np.zeros(len(moments), np.intp)
+    coarse[fine] = np.unique(block, return_inverse=True)[1]
+    of_row = np.repeat(fine, 2)
+    blocks = [
+        _summed(name, design.reshape(len(root), -1) * root, frame, error, of_row, over)
+        for name, design, over in designs
+    ]
+    signs = np.random.default_rng(seed).choice((-1.0, 1.0), (FLIPS, len(moments)))
+    scored = [_scored(entry, coarse, signs, len(blocks)) for entry in blocks]
+    return sorted(scored, key=lambda s: -float(s.gain.sum()))
+
+
+def select(scored: Sequence[Scored], total_weight: float, seed: int = 1) -> Selection | None:
+    """The simplest of the forms that cannot be told from the best; None where none is significant or stable."""
+    good = [entry for entry in scored if entry.significant]
+    if not good:
+        return None
+    least = ALIKE_PART * float(good[0].gain.sum())
+    alike = [e for e in good if t_ratio(good[0].gain - e.gain) < RIVAL_T or float(e.gain.sum()) > least]
+    best = min(alike, key=lambda s: (s.numbers, -float(s.gain.sum())))
+    draws = np.random.default_rng(seed).integers(0, len(best.gain), (DRAWS, len(best.gain)))
+    totals = np.stack([entry.gain[draws].sum(axis=1) for entry in scored])
+    family = [k for k, entry in enumerate(scored) if entry in alike]
+    stability = float(np.mean(np.isin(np.argmax(totals, axis=0), family)))
+    if stability < MIN_STABLE:
+        return None
+    size = float(np.sqrt(max(best.gain.sum(), 0.0) / (2 * total_weight)))
+    return Selection(best, tuple(entry.name for entry in alike if entry is not best), stability, size)
+
+
+def t_ratio(values: Array) -> float:
+    """Mean over its standard error."""
+    if len(values) < 3:
+        return 0.0
+    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))
+
+
+def _orthonormal(columns: Array) -> Array:
+    """Orthonormal columns that span the given ones."""
+    if not columns.shape[1]:
+        return columns
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+    u, singular, _ = np.linalg.svd(columns / size, full_matrices=False)
+    return np.asarray(u[:, singular > 1e-6 * singular[0]])
+
+
+def _summed(name: str, design: Array, frame: Array, error: Array, of_row: Index, over_time: bool) -> _Block:
+    """Sums over blocks, in the directions of the form that are its own."""
+    own = design - frame @ (frame.T @ design)
+    full, kept = design.T @ design, own.T @ own
+    # directions by the part of them that the tangent space does not hold
+    values, vectors = np.linalg.eigh(full)
+    rank = values > 1e-10 * values.max()
+    whiten = vectors[:, rank] / np.sqrt(values[rank])
+    share, turn = np.linalg.eigh(whiten.T @ kept @ whiten)
+    basis = (whiten @ turn)[:, share > OWN_PART]
+    own = own @ basis
+    count = int(of_row.max()) + 1
+    pull: Array = np.stack([np.bincount(of_row, column * error, count) for column in own.T], axis=-1).astype(float)
+    order = np.argsort(of_row, kind="stable")
+    edges = np.searchsorted(of_row[order], np.arange(count + 1))
+    curvature: Array = np.stack([own[order[a:b]].T @ own[order[a:b]] for a, b in pairwise(edges)])
+    return _Block(name, pull, curvature, over_time)
+
+
+def _scored(entry: _Block, coarse: Index, signs: Array, forms: int) -> Scored:
+    whole = _Block(entry.name, _added(entry.pull, coarse), _added(entry.curvature, coarse), entry.over_time)
+    entry = entry if entry.over_time else whole
+    count, numbers = entry.pull.shape
+    total, inverse = entry.pull.sum(axis=0), _solver(entry.curvature.sum(axis=0))
+    flipped = signs[:, :count] @ entry.pull
+    drawn = np.einsum("fk,kl,fl->f", flipped, inverse, flipped)
+    seen = float(total @ inverse @ total)
+    scale = max(float(drawn.var() / max(drawn.mean(), 1e-300)), 1e-300)
+    p_value = float(stats.gamma.sf(seen, max(float(drawn.mean()) / scale, 1e-3), scale=scale))
+    block = np.arange(len(whole.pull))
+    gain = _held_out(whole, block % FOLDS)
+    parts = None if entry.over_time else _held_out(whole, block * PARTS // len(block))
+    return Scored(entry.name, numbers, min(p_value * forms, 1.0), gain, parts)
+
+
+def _added(sums: Array, group: Index) -> Array:
+    """Sums (groups, ...) of entries (n, ...)."""
+    total = np.zeros((int(group.max()) + 1, *sums.shape[1:]))
+    np.add.at(total, group, sums)
+    return total
+
+
+def _held_out(entry: _Block, fold: Index) -> Array:
+    """Squared residual (blocks,) taken away in blocks by a fit to the other folds."""
+    gain = np.zeros(len(entry.pull))
+    for number in np.unique(fold):
+        out = fold == number
+        value = _solver(entry.curvature[~out].sum(axis=0)) @ entry.pull[~out].sum(axis=0)
+        gain[out] = 2 * entry.pull[out] @ value - np.einsum("k,bkl,l->b", value, entry.curvature[out], value)
+    return gain
+
+
+def _solver(curvature: Array) -> Array:
+    ridge = RIDGE * max(float(np.diag(curvature).max(initial=0.0)), 1e-12)
+    return np.asarray(np.linalg.inv(curvature + ridge * np.eye(len(curvature))))

@@ -1,0 +1,297 @@
+"""Fields in words: what the values do along their covariate, what may be behind it, and what would tell.
+
+A pattern is kind × covariates × shape.  Shapes come from least-squares fits to the field itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.field import FORCES, Field
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.field.forms import FORCE_REACH_M_S2
+from virest.diagnosis.field.records import Distrusted, FittedField
+from virest.diagnosis.field.stretches import CLIPPED, axis_names
+from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
+
+Array = NDArray[np.float64]
+ALIKE = 0.95
+"""Part of a field's variance that a shape must explain to name it."""
+STEP_SPAN, STEP_PART = 0.25, 0.8
+"""A step: this part of the change within this part of the range."""
+SHAPE_PART = 0.9
+"""The same for a displacement over the picture."""
+OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
+SAMPLES = 101
+INERTIAL = "inertial_rows"
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """What is said of one pattern."""
+
+    sentence: str
+    reasons: str
+    next: str
+    """Which measurement would tell the reasons apart."""
+
+
+PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
+    ("delay", ("row",)): Pattern(
+        "points are {lateness} by up to {size} {where} of the readout, {shape} of the row: lines are not read evenly",
+        "the sensor reads its lines in blocks or pauses between them, or the picture was cropped and scaled by lines",
+        "film a lamp that flickers at a known rate, without other light: its bands show each line's time",
+    ),
+    ("displacement", ("x", "y")): Pattern(
+        "shifts of up to {size} depend on the position in the picture, {shape}, the same in all frames: {lens}",
+        "a lens element off centre or tilted, a window or waterproof case in front, or a correction by the phone that "
+        "the profile does not hold",
+        "calibrate the lens with a board in all corners, once with the phone upside down: what turns along is the lens",
+    ),
+    ("scale", ("time",)): Pattern(
+        "the focal length changes by {size} over the capture, {shape} of time",
+        "the lens warms up, refocuses without logging it, or the phone switches its zoom or lens",
+        "film a still board for a minute from a cold start with the focus locked, and once more warm",
+    ),
+    ("scale", ("focus",)): Pattern(
+        "the focal length changes by {size} with the logged focus distance, {shape}: the lens breathes as it focuses",
+        "focusing moves lens elements, which changes the picture's scale; a drift in time is the rival",
+        "film a still board while focusing to and fro: a breathing lens comes back, a warm one does not",
+    ),
+    ("rate", ("rate",)): Pattern(
+        "the gyroscope's error depends on its rate, {shape}: up to {size} are missing at high rates",
+        "a sensor that saturates softly, or a filter in the phone that bounds fast turns",
+        "turn the phone on a table at several speeds and compare the log with the angle turned",
+    ),
+    ("rate", ("acceleration",)): Pattern(
+        "the gyroscope reads a rate in proportion to the acceleration, {size} per m/s²: it is sensitive to g",
+        "a micromechanical gyroscope's mass moves under gravity and shocks",
+        "log the phone at rest on each of its six sides: the rates differ by 2 g times the sensitivity",
+    ),
+    ("rate", ("time",)): Pattern(
+        "the gyroscope's bias changes by up to {size} over the capture",
+        "the sensor warms up, or the phone corrects its bias while it logs",
+        "log the phone at rest for ten minutes from a cold start",
+    ),
+}
+UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.0, "%"), "rate": (1.0, "rad/s")}
+
+
+def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding:
+    """A field as a finding of the diagnosis."""
+    if isinstance(entry, Distrusted):
+        return _distrusted(entry, noise_px)
+    fields, form = entry.fields, entry.form
+    shape = shape_of(fields[0]) if len(fields) == 1 else _common_shape(fields)
+    size, std = _size(fields)
+    pattern = PATTERNS[form.kind, form.covariates]
+    factor, unit = UNIT_SCALES[form.kind]
+    said = f"{size * factor:.3g} {unit}"
+    sentence = pattern.sentence.format(
+        size=said, shape=shape, where=_where(fields[0]), lateness=_lateness(fields[0]), lens=lens_words(shape)
+    )
+    rms = f" (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out)"
+    beside = f"; in this capture {' and '.join(entry.rivals)} would explain it as well" if entry.rivals else ""
+    return FieldFinding(
+        form.covariates,
+        form.kind,
+        shape,
+        sentence + rms + beside,
+        size,
+        _unit(form.kind, form.covariates),
+        std,
+        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, noise_px),
+        entry.p_value,
+        entry.rivals,
+        entry.stability,
+        pattern.reasons,
+        pattern.next,
+        fields,
+    )
+
+
+def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
+    """Stretches of the log: what they look like, how far points are off there, and whether they are bridged."""
+    first = entry.stretches[0]
+    total_s = sum(stretch.to_s - stretch.from_s for stretch in entry.stretches)
+    several = len(entry.stretches) > 1
+    if first.kind == CLIPPED:
+        sentence = (
+            f"beyond {first.limit_rad_s:.3g} rad/s the gyroscope reads too little: it clips, "
+            f"{len(entry.stretches)} times for {total_s * 1e3:.0f} ms in all, on axis {axis_names(entry.stretches)}"
+        )
+        reasons = "the turn was faster than the sensor's range"
+        following = "set the sensor to a wider range, or turn more slowly"
+    else:
+        where = (
+            f"in {len(entry.stretches)} stretches, {total_s * 1e3:.0f} ms in all, the first from {first.from_s:.2f} s"
+            if several
+            else f"for {total_s * 1e3:.0f} ms from {first.from_s:.2f} s"
+        )
+        sentence = f"{where} the log does not follow the frames: inertial rows there lie on a straight line"
+        reasons = "rows were lost and a program filled the gap in, or the sensor's queue stalled"
+        following = "look at the raw log for rows with equal steps, and record with less load on the phone"
+    bridged = "bridged from the points" if all(entry.bridged) else "left alone by process"
+    said = f"{sentence} (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out; {bridged})"
+    if not any(entry.bridged):
+        said = f"{sentence} (points {entry.before_px:.3g} px off there; {bridged})"
+    bridges = tuple(
+        f for f in entry.profile.fields if f.kind == "rate" and f.covariates == ("time",) and f.belongs_to_one_capture
+    )
+    size = max((float(np.abs(f.values).max()) for f in bridges), default=None)
+    return FieldFinding(
+        ("rate",) if first.kind == CLIPPED else ("time",),
+        INERTIAL,
+        first.kind,
+        said,
+        size,
+        "rad/s",
+        None,
+        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, noise_px),
+        entry.p_value,
+        (),
+        None,
+        reasons,
+        following,
+        bridges,
+        tuple((s.from_s, s.to_s) for s in entry.stretches),
+    )
+
+
+def shape_of(field: Field) -> str:
+    """What the values do along one covariate, or over the picture."""
+    if field.covariates == ("x", "y"):
+        return _shape_over_picture(field)
+    along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+    values = field.at(along)
+    return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates == ("time",))
+
+
+def curve_shape(curve: Array, over_time: bool = False) -> str:
+    """What a curve (SAMPLES,) at even steps of its covariate does."""
+    u = np.linspace(-1, 1, SAMPLES)
+    if not float(np.var(curve)):
+        return "nothing"
+    if _unexplained(curve, [u]) < 1 - ALIKE:
+        return "a straight line"
+    if _is_step(curve):
+        return "a step"
+    if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
+        monotone = np.all(np.diff(curve) >= 0) or np.all(np.diff(curve) <= 0)
+        return "levelling off" if monotone and over_time else "a parabola"
+    slope = np.abs(np.diff(curve))
+    if over_time and slope[: SAMPLES // 4].sum() > 2 * slope[-SAMPLES // 4 :].sum():
+        return "levelling off"
+    if _unexplained(curve, [u, u**3]) < 1 - ALIKE:
+        return "an S"
+    return "a curve"
+
+
+def _common_shape(fields: tuple[Field, ...]) -> str:
+    if fields[0].covariates[0] in FORCES:
+        return "a straight line"
+    shapes = [shape_of(f) for f in fields if np.abs(f.values).max() > 0.5 * max(np.abs(g.values).max() for g in fields)]
+    return max(shapes, key=shapes.count)
+
+
+def _unexplained(curve: Array, columns: list[Array]) -> float:
+    design = np.stack([np.ones_like(curve), *columns], axis=-1)
+    left = curve - design @ np.linalg.lstsq(design, curve, rcond=None)[0]
+    return float(np.var(left) / max(float(np.var(curve)), 1e-300))
+
+
+def _is_step(curve: Array) -> bool:
+    width = int(STEP_SPAN * SAMPLES)
+    total = float(np.ptp(curve))
+    jump = float(np.max(np.abs(curve[width:] - curve[:-width])))
+    ends = abs(float(curve[-1] - curve[0]))
+    return jump > STEP_PART * total and ends > STEP_PART * total
+
+
+def _shape_over_picture(field: Field) -> str:
+    """Which of a lens's simple faults explains a displacement: off centre, other scales along x and y, or neither."""
+    x, y = np.meshgrid(*(np.linspace(k[0], k[-1], 21) for k in field.knots), indexing="ij")
+    middle = [0.5 * (k[0] + k[-1]) for k in field.knots]
+    half = 0.5 * (field.knots[0][-1] - field.knots[0][0])
+    u, v = (x - middle[0]) / half, (y - middle[1]) / half
+    values = field.at(x, y)
+    values = (values - values.mean(axis=(0, 1))).ravel()
+
+    def explained(columns: list[tuple[Array, Array]]) -> bool:
+        one, nothing = np.ones_like(u), np.zeros_like(u)
+        columns = [(one, nothing), (nothing, one), *columns]
+        design = np.stack([np.stack(pair, -1).ravel() for pair in columns], axis=-1)
+        left = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+        return bool((left**2).sum() < (1 - SHAPE_PART) * (values**2).sum())
+
+    r2, nothing = u * u + v * v, np.zeros_like(u)
+    off_centre = [(2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v)]
+    linear = [(u, nothing), (v, nothing), (nothing, u), (nothing, v)]
+    radial = [(r2 * u, r2 * v), (r2**2 * u, r2**2 * v), (u, v)]
+    if explained(linear):
+        return LINEAR
+    if explained(off_centre) or explained([*off_centre, *linear]):
+        return OFF_CENTRE
+    return RADIAL if explained(radial) else "a smooth map"
+
+
+def lens_words(shape: str) -> str:
+    """What a displacement of this shape says of the lens."""
+    return {
+        OFF_CENTRE: "a lens that is not centred (tangential distortion)",
+        LINEAR: "the picture is scaled, turned, stretched or sheared",
+        RADIAL: "the radial distortion is another",
+    }.get(shape, "a lens that the model's distortion does not describe")
+
+
+def _size(fields: tuple[Field, ...]) -> tuple[float, float | None]:
+    """Largest value and the deviation at the knot next to it.
+
+    Of a displacement or rates the length, of a focal length the range, of proportions to a force the value per m/s².
+    """
+    best, std = 0.0, None
+    for field in fields:
+        values = np.array(field.values)
+        length = np.linalg.norm(values, axis=1)
+        row, largest = int(np.argmax(length)), float(length.max())
+        if field.kind == "scale":
+            largest = float(np.ptp(values))
+        elif len(field.knots) == 1:
+            along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+            largest = float(np.linalg.norm(field.at(along), axis=1).max())
+        if largest > best:
+            best = largest
+            std = float(np.linalg.norm(field.std[row])) if field.std else None
+    if fields[0].covariates[0] in FORCES:
+        return best / FORCE_REACH_M_S2, None if std is None else std / FORCE_REACH_M_S2
+    return best, std
+
+
+def _unit(kind: str, covariates: tuple[str, ...]) -> str:
+    if covariates == ("acceleration",):
+        return "rad/s per m/s²"
+    return {"delay": "s", "displacement": "px", "scale": "1", "rate": "rad/s"}[kind]
+
+
+def _where(field: Field) -> str:
+    """Where along the covariate the largest value lies."""
+    along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+    if len(field.knots) > 1:
+        return ""
+    place = float(np.argmax(np.abs(field.at(along)).max(axis=-1))) / (SAMPLES - 1)
+    return (
+        "in the middle" if 1 / 3 <= place <= 2 / 3 else "in the first third" if place < 1 / 3 else "in the last third"
+    )
+
+
+def _lateness(field: Field) -> str:
+    values = np.array(field.values)[:, 0]
+    return "late" if values[np.argmax(np.abs(values))] > 0 else "early"
+
+
+def found_in(profile: CameraProfile) -> str:
+    """Names of a profile's fields, for a headline."""
+    return ", ".join(dict.fromkeys(f"field of {f.kind} over {', '.join(f.covariates)}" for f in profile.fields))

@@ -1,0 +1,109 @@
+"""Pictures of fields: values with their deviations, or arrows over the picture, and residuals before and after.
+
+Residuals are root mean squares of the points in equal shares of the covariate, nominal model and extended one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.field import UNITS, Field
+from virest.diagnosis.findings import FieldFinding
+from virest.report.figures import as_file, canvas, literal
+
+Array = NDArray[np.float64]
+SAMPLES, ARROWS, BINS, MIN_IN_BIN = 200, 13, 20, 8
+UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.0, "%"), "rate": (1.0, "rad/s")}
+NAMES = {"row": "fraction of the readout", "time": "time", "focus": "focus distance", "x": "x", "y": "y"}
+RESIDUALS_OVER = {"row": "row", "time": "time", "rate": "rate", "x": "radius", "focus": "time", "acceleration": "time"}
+RESIDUAL_AXES = {"row": "fraction of the readout", "time": "time, s", "rate": "rate, rad/s", "radius": "radius, px"}
+COMPONENTS = ("x", "y", "z")
+
+
+def field_figure(
+    finding: FieldFinding,
+    title: str = "",
+    before: Mapping[str, Any] | None = None,
+    after: Mapping[str, Any] | None = None,
+    image_format: str = "png",
+) -> bytes:
+    """A field, and the residuals with and without it; before, after: as `residual_figure` takes them."""
+    figure = canvas(11.0, 4.6)
+    left, right = figure.subplots(1, 2)
+    if finding.covariates == ("x", "y"):
+        _draw_arrows(figure, left, finding.fields[0])
+    else:
+        _draw_values(left, finding.fields)
+    _draw_residuals(right, RESIDUALS_OVER[finding.covariates[0]], {"before": before, "after": after})
+    figure.suptitle(literal(title))
+    return as_file(figure, image_format)
+
+
+def _draw_values(axes: Any, fields: tuple[Field, ...]) -> None:
+    """Values of each component that is not nought, with one standard deviation."""
+    for field in fields:
+        factor, unit = UNIT_SCALES[field.kind]
+        along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+        values = factor * field.at(along)
+        spread = (
+            factor * np.abs(field.with_values(np.array(field.std)).at(along)) if field.std else np.zeros_like(values)
+        )
+        for part in np.flatnonzero(np.abs(values).max(axis=0) > 0):
+            name = field.covariates[0] + (f" → {COMPONENTS[part]}" if values.shape[1] > 1 else "")
+            line = axes.plot(along, values[:, part], lw=1.6, label=name if len(fields) <= 3 else None)[0]
+            low, high = values[:, part] - spread[:, part], values[:, part] + spread[:, part]
+            axes.fill_between(along, low, high, color=line.get_color(), alpha=0.25, lw=0)
+            knots = np.array(field.knots[0])
+            axes.plot(knots, factor * np.array(field.values)[:, part], "o", ms=3, color=line.get_color())
+        axes.set_ylabel(f"{field.kind}, {unit}")
+        name = field.covariates[0]
+        unit_along = UNITS.get(name, "rad/s" if name.startswith("rate") else "m/s²")
+        axes.set_xlabel(NAMES.get(name, name) + (f", {unit_along}" if unit_along != "1" else ""))
+    axes.axhline(0, color="0.7", lw=0.8, zorder=0)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="best", fontsize=8)
+    axes.set_title("value ± standard deviation", fontsize=10)
+
+
+def _draw_arrows(figure: Any, axes: Any, field: Field) -> None:
+    """Arrows over the picture, and the length of the displacement beneath them."""
+    fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
+    length = np.linalg.norm(field.at(*np.meshgrid(*fine)), axis=-1)
+    shown = axes.pcolormesh(*fine, length, cmap="viridis", shading="auto", rasterized=True)
+    figure.colorbar(shown, ax=axes, label="displacement, px", shrink=0.8)
+    x, y = np.meshgrid(*(np.linspace(k[0], k[-1], ARROWS) for k in field.knots))
+    values = field.at(x, y)
+    axes.quiver(x, y, values[..., 0], values[..., 1], color="white", angles="xy")
+    axes.invert_yaxis()
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, px")
+    axes.set_ylabel("y, px")
+    if field.std:
+        typical = float(np.sqrt(np.mean(np.square(field.std)) * 2))
+        axes.set_title(f"vector map; standard deviation {typical:.2g} px", fontsize=10)
+
+
+def _draw_residuals(axes: Any, along: str, sets: Mapping[str, Mapping[str, Any] | None]) -> None:
+    colours = {"before": "0.45", "after": "steelblue"}
+    for label, data in sets.items():
+        if not data or along not in data:
+            continue
+        x, y, covariate = (np.asarray(data[name], float) for name in ("x_px", "y_px", along))
+        known = np.isfinite(x) & np.isfinite(y) & np.isfinite(covariate)
+        x, y, covariate = x[known], y[known], covariate[known]
+        if len(x) < MIN_IN_BIN:
+            continue
+        shares = np.array_split(np.argsort(covariate, kind="stable"), min(BINS, len(x) // MIN_IN_BIN))
+        middle = [float(np.median(covariate[share])) for share in shares]
+        rms = [float(np.sqrt(np.mean(x[share] ** 2 + y[share] ** 2) / 2)) for share in shares]
+        axes.plot(middle, rms, marker=".", lw=1.6, color=colours[label], label=label)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="best", fontsize=8)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(RESIDUAL_AXES[along])
+    axes.set_ylabel("rms of tracked − predicted points, px")
+    axes.set_title("residuals of the whole model, before and after", fontsize=10)

@@ -1,0 +1,84 @@
+"""What no catalogue names: rows that are not read evenly, focal lengths that wander, gyroscopes that read wrong.
+
+Tests hide such effects by :class:`Hidden`; a profile's fields say the same where a diagnosis has found them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.field import FORCES, RATES
+from virest.camera.profile import CameraProfile
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Hidden:
+    """Effects beside those of a profile; times in seconds on the IMU's clock from stamp_0."""
+
+    row_delay_s: Callable[[Array], Array] | None = None
+    """Of the fraction of the readout (rows,): how much later than evenly each row starts."""
+    focal_scale: Callable[[Array], Array] | None = None
+    """Of time: factor on the focal length."""
+    gyro: Callable[[Array, Array, Array], Array] | None = None
+    """Of time (n,), reading (n, 3) and specific force (n, 3): what is logged instead of the reading."""
+    focus_dioptres: Callable[[Array], Array] | None = None
+    """Of a frame's time: the focus distance that is logged."""
+
+
+NOTHING = Hidden()
+
+
+def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array) -> Array:
+    """How much later than evenly rows start (rows,), by their fraction of the readout."""
+    late = np.zeros(len(fraction))
+    if profile.shutter.uneven is not None:
+        late = late + profile.shutter.uneven.at(fraction)[:, 0]
+    return late if hidden.row_delay_s is None else late + hidden.row_delay_s(fraction)
+
+
+def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any) -> Any:
+    """Factor on the profile's focal length at times (...)."""
+    time_s = np.asarray(time_s, float)
+    scale = 1 + profile.extensions.focal_drift_per_s * time_s
+    for field in profile.extensions.field:
+        if field.kind == "scale":
+            scale = scale + field.at_time(time_s)[..., 0]
+    return scale if hidden.focal_scale is None else scale * hidden.focal_scale(time_s)
+
+
+def focal_changes(profile: CameraProfile, hidden: Hidden) -> bool:
+    """Whether the focal length is another at another time."""
+    extensions = profile.extensions
+    own = any(field.kind == "scale" for field in extensions.field)
+    return bool(extensions.focal_drift_per_s or own or hidden.focal_scale is not None)
+
+
+def missing_rate_rad_s(profile: CameraProfile, time_s: Array, reading: Array, force_m_s2: Array | None) -> Array:
+    """What a profile's fields add (n, 3), rad/s, IMU axes, to readings less bias and over scale."""
+    total = np.zeros(reading.shape)
+    for field in profile.extensions.field:
+        name = field.covariates[0]
+        if field.kind != "rate" or (name in FORCES and force_m_s2 is None):
+            continue
+        known = {"time": time_s, **dict(zip(RATES, reading.T, strict=True))}
+        known |= {} if force_m_s2 is None else dict(zip(FORCES, np.nan_to_num(force_m_s2).T, strict=True))
+        total = total + field.at(known[name])
+    return total
+
+
+def gyro_reading(profile: CameraProfile, time_s: Array, rate_rad_s: Array, force_m_s2: Array) -> Array:
+    """What the gyroscope reads (n, 3) of true rates and forces (n, 3), IMU axes: scale (ω − fields) + bias.
+
+    Along rates a field runs over the reading itself, less bias and over scale: found in a few steps.
+    """
+    reading = rate_rad_s
+    for _ in range(10 if any(field.kind == "rate" for field in profile.extensions.field) else 0):
+        reading = rate_rad_s - missing_rate_rad_s(profile, time_s, reading, force_m_s2)
+    return np.asarray(reading * profile.gyro_scale + profile.gyro_bias_rad_s)
