@@ -62,7 +62,8 @@ def test_a_turn_that_the_profile_lacks_is_measured_between_two_frames(simulated)
     wrong = replace(plan.profile, gyro_bias_rad_s=tuple(-plan.profile.rotation_cam_imu.T @ rate))
     wrongly = integrate_gyro(capture.capture.imu, wrong)
     told = turn_between(*sights, *map(light_of, sights), wrongly, moving_lens(wrongly, wrong))
-    assert true is not None and told is not None
+    assert true is not None
+    assert told is not None
     deviations = np.sqrt(np.diag(told.covariance))
     assert np.all(np.abs(true.rate_rad_s) < 4 * np.sqrt(np.diag(true.covariance)))
     assert np.all(np.abs(told.rate_rad_s + rate) < 4 * deviations)
@@ -135,7 +136,8 @@ def test_a_promise_that_no_neighbour_confirms_is_null(simulated):
     confirmed = [r.parameters["deblur"] for r in capture.restored(plan)]
     alone = [r.parameters["deblur"] for r in capture.restored(replace(plan, confirmed=None))]
     deblurred = [d for d in confirmed if d["method"] != "none"]
-    assert deblurred and all(d["expected_gain_db"] > 0 and d["expected_gain_std_db"] >= 0 for d in deblurred)
+    assert deblurred
+    assert all(d["expected_gain_db"] > 0 and d["expected_gain_std_db"] >= 0 for d in deblurred)
     assert all(d["expected_gain_db"] is None for d in alone if d["method"] != "none")
 
 
