@@ -98,7 +98,7 @@ def restore_frame(
     seen: RowMotion | None = None,
     refined: RefinedMotion | None = None,
     confirmed: ConfirmedGain | None = None,
-    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
+    neighbours: Callable[[PictureStatistics], tuple[NeighbourPicture, ...]] | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
@@ -320,7 +320,7 @@ def _deblurred(
     light: FrameLight | None,
     covariance_px2: NDArray[np.float64],
     confirmed: ConfirmedGain | None,
-    neighbours: Callable[[], tuple[NeighbourPicture, ...]] | None = None,
+    neighbours: Callable[[PictureStatistics], tuple[NeighbourPicture, ...]] | None = None,
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
@@ -338,7 +338,7 @@ def _deblurred(
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    joined = neighbours() if neighbours is not None and light is None and anchor == 0.5 else ()
+    joined = neighbours(luma) if neighbours is not None and light is None and anchor == 0.5 else ()
     longest_px = max((longest_px, *(one.longest_px for one in joined)))
     blurred = replace(blurred, spread=spread, neighbours=joined, longest_px=longest_px)
     if light is not None:

@@ -35,7 +35,6 @@ FEW_SCALE = 0.6
 """Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
 """Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
-SHARED_NOISE = 0.5
 RESIDUAL_SHARE = 0.05
 """Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
 LINEAR_SHARE = 0.5
@@ -79,15 +78,15 @@ def _projected_luma(
     """
     luma, holes = luma_of(blurred.light), blurred.holes
     alone = deconvolution.touched(holes) if holes is not None and blurred.neighbours else []
-    sums = np.zeros(len(deconvolution.kernels))
+    shared = np.zeros(len(deconvolution.kernels))
     for one in blurred.neighbours:
         weights = one.weight_at(deconvolution.grid.centres_px, deconvolution.grid.side / 2)
         weights[alone] = 0.0
         kernels = one.field(deconvolution.grid.centres_px).arrays()
         deconvolution.join(one.light, kernels, weights, _kept_sharpness(one.shift_std_px, deconvolution.size))
-        sums += weights
+        shared += one.shared_noise * weights
     if blurred.neighbours:
-        deconvolution.share_noise(SHARED_NOISE, sums)
+        deconvolution.share_noise(shared)
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)

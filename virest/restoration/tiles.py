@@ -125,15 +125,15 @@ class TileDeconvolution:
             _power_at_ends(kernel[None], one[None])
             cv2.scaleAdd(one, weight, self.powers[number], self.powers[number])
 
-    def share_noise(self, shared: float, weights: NDArray[np.float64]) -> None:
+    def share_noise(self, shared: NDArray[np.float64]) -> None:
         """Count that part of the noise once that further pictures have in common with the first.
 
-        weights: (tiles,) sums of those that :meth:`join` was given.  Of n equal pictures whose noise is wholly shared
-        the sum tells no more than one, so their sums are divided by n.
+        shared: (tiles,) sum over the further pictures of their weight times that part.  Of n equal pictures whose noise
+        is wholly shared the sum tells no more than one, so their sums are divided by n.
         """
         if self._joined is None:
             return
-        self._once = (1.0 / (1.0 + shared * weights)).astype(np.float32)[:, None, None]
+        self._once = (1.0 / (1.0 + shared)).astype(np.float32)[:, None, None]
         self.powers *= self._once
 
     def touched(self, mask: Image) -> list[int]:

@@ -113,6 +113,22 @@ class TileAgreement:
     """(n,) mean square of what both show."""
     gain: float
     """The neighbour's light over the frame's."""
+    light: float
+    """The frame's light, median of the tiles."""
+    passed: Array
+    """(TILE, TILE / 2 + 1) mean of both kernels' |K|²: independent noise N makes the error Σ passed N."""
+    times: float
+    """How many times smaller the compared pictures are."""
+
+    def expected_error(self, frequency: Array, noise: Array, slope: float) -> float:
+        """The mean square difference that independent noise makes.
+
+        noise: (rings,) power in grey levels at frequencies in cycles per recorded pixel.  slope: grey levels per light.
+        """
+        wx, wy = _frequencies()
+        recorded = np.hypot(wx, wy) / (2 * np.pi * self.times)
+        power = np.interp(recorded, frequency, noise) / (self.times * slope * max(self.light, 1e-6)) ** 2
+        return float(np.mean(self.passed * power) * (_window() ** 2).sum())
 
 
 def tile_agreement(view: NeighbourView, first: Image, second: Image) -> TileAgreement | None:
@@ -130,7 +146,9 @@ def tile_agreement(view: NeighbourView, first: Image, second: Image) -> TileAgre
     error = (np.abs(a * np.exp(1j * ahead) - b) ** 2).mean(axis=(1, 2))
     gain = float(np.median(there.mean(axis=(1, 2)) / np.maximum(here.mean(axis=(1, 2)), 1e-6)))
     centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)
-    return TileAgreement(centres_px, shift * times, precision, error, (np.abs(b) ** 2).mean(axis=(1, 2)), gain)
+    passed = sum((np.abs(kernel) ** 2).mean(axis=0) for kernel in kernels)
+    signal, light = (np.abs(b) ** 2).mean(axis=(1, 2)), float(np.median(here.mean(axis=(1, 2))))
+    return TileAgreement(centres_px, shift * times, precision, error, signal, gain, light, np.asarray(passed), times)
 
 
 def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Image) -> tuple[float, float] | None:

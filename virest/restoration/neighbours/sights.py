@@ -21,7 +21,7 @@ from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.joint import NeighbourPicture, neighbour_picture
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import PairTurn, pair_turn, reduced_light, tile_agreement
-from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED
+from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +87,11 @@ class FrameNeighbours:
         return self._missing.refined(here.motion, *turns)
 
     def pictures(
-        self, around: Sequence[Sight], here: Sight, refined: RefinedMotion | None
+        self, around: Sequence[Sight], here: Sight, refined: RefinedMotion | None, luma: PictureStatistics
     ) -> tuple[NeighbourPicture, ...]:
-        """The usable ones of a frame's neighbours, brought to its pixels."""
+        """The usable ones of a frame's neighbours, brought to its pixels; luma: what was measured on the frame's."""
         assert here.motion is not None
+        curve = here.motion.profile.response or ResponseCurve("srgb")
         found = []
         for other in around:
             if not other.usable or other.motion is None or other.frame.index == here.frame.index:
@@ -98,8 +99,12 @@ class FrameNeighbours:
             turn = None if refined is None else refined.turn
             view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, turn=turn)
             agreement = tile_agreement(view, self._light_of(here), self._light_of(other))
-            if agreement is not None:
-                found.append(neighbour_picture(view, other.frame.index, _luma_light(other), agreement))
+            if agreement is None:
+                continue
+            level = 255 * float(curve.encode(np.array(agreement.light)))
+            slope = float(np.interp(level, np.arange(256), curve.slope_table()))
+            error = agreement.expected_error(luma.frequency, luma.noise, slope)
+            found.append(neighbour_picture(view, other.frame.index, _luma_light(other), agreement, error))
         return tuple(one for one in found if one is not None and one.weights.any())
 
     def _turn(self, first: Sight, second: Sight) -> PairTurn | None:
