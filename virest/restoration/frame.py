@@ -45,6 +45,8 @@ SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
 MIN_SAMPLES = 6
 """So many tiles, the most blurred ones, are measured in any case."""
+LARGEST_RADIUS = SIDE // 4
+"""Kernels of a larger radius leave too little of a measured tile that is not bent by its window."""
 MIN_GAIN_DB = 0.1
 """A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
@@ -389,11 +391,21 @@ def _measured(
     """Statistics of luma and chroma. Noise shows where the paths cancel; a Gaussian, the same all round, hides it.
 
     So the paths alone are fitted, which measures the noise and the defocused picture, and that is focused afterwards.
+    Paths too long for a tile are measured on a picture that is smaller; the finer frequencies take the finest one's.
     """
-    luma, chroma = measure_picture(
-        picture, replace(field, defocus_sigma_px=0.0), curve, clipped_anywhere(picture, curve), most_tiles
+    sigma_px, times = field.defocus_sigma_px, 1
+    field = replace(field, defocus_sigma_px=0.0)
+    while field.scaled(1 / times).radius_px > LARGEST_RADIUS and min(picture.shape[:2]) >= 2 * times * SIDE:
+        times *= 2
+    if times > 1:
+        height, width = picture.shape[:2]
+        picture = cv2.resize(picture, (width // times, height // times), interpolation=cv2.INTER_AREA)
+        field = replace(field.scaled(1 / times), centres_px=(field.centres_px + 0.5) / times - 0.5)
+    luma, chroma = (
+        found.scaled(times) if times > 1 and found.measured else found
+        for found in measure_picture(picture, field, curve, clipped_anywhere(picture, curve), most_tiles)
     )
-    focused = (_focused(luma, field.defocus_sigma_px), _focused(chroma, field.defocus_sigma_px))
+    focused = (_focused(luma, sigma_px), _focused(chroma, sigma_px))
     return focused[0].with_error_share(CURVE_SLOPE_STD**2), focused[1].with_error_share(CURVE_SLOPE_STD**2)
 
 
