@@ -36,15 +36,14 @@ def test_an_exposure_stated_twice_too_long_deblurs_nothing(virest, work: Path):
 
 
 def test_an_offset_stated_wrong_makes_no_frame_worse(virest, work: Path):
-    """Where the camera turns back within the error, frames are left as they are; elsewhere they still gain."""
+    """Neighbouring frames show where the camera really moved, whatever the stated clock says: frames gain."""
     capture = simulate(virest, work / "stated-late", *OPTIONS.split(), 24, "--effect", "time_offset=-0.02")
     result = process(virest, capture, work / "stated-late-run", "--preset", "fast")
     assert said(result, "time offset")
     recorded = process(virest, capture, work / "stated-late-raw", "--deblur", "none", "--shutter", "none")
     gain = psnrs_db(result, result, capture) - psnrs_db(recorded, result, capture)
     assert gain.min() > -0.2
-    assert gain.mean() > 0.5
-    assert any("rows elsewhere" in reason for reason in reasons(result))
+    assert gain.mean() > 2.0
 
 
 @pytest.mark.parametrize(("scene", "seed"), [("text", 25), ("bright", 26), ("photographs", 27)])

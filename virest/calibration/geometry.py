@@ -61,8 +61,8 @@ MANY_OUTLIERS = 0.1
 LARGE_CORRELATION = 0.9
 CONSTANT_EXPOSURE_S = 1e-4
 """Exposures that differ by no more tell no offset from a scale of theirs, nor from the stamp's meaning."""
-DRIFT_SIGMA, LEAST_DRIFT_S = 6.0, 1e-3
-"""Clocks are said to drift apart from so many deviations on, and from so much over the capture."""
+DRIFT_SIGMA, LEAST_DRIFT_S = 4.5, 1e-3
+"""Clocks are said to drift apart above this many deviations (false alarms: 7e-6) and this much over the capture."""
 FRAME_LAG = "frame-lag"
 """The start-up's lag, which ``--with`` adds too."""
 MAX_STD = {

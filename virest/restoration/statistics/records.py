@@ -116,8 +116,12 @@ class PictureStatistics:
         )
 
     def with_error_share(self, share: float) -> PictureStatistics:
-        """With an error of so much of S beside the noise: what the model of light is known to be wrong by."""
-        if not self.measured:
+        """With an error of so much of S beside the noise: what the model of light is known to be wrong by.
+
+        It comes from edges, whose power lies everywhere; a grating's, which lies at few places, is as it is.
+        """
+        share *= 1 - self.unevenness
+        if not self.measured or not share:
             return self
         noise = self.noise + share * self.signal
         through = self.frequency * self.passed * self.signal
