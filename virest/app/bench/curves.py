@@ -115,9 +115,12 @@ def _psnrs_db(capture: Path, curve: ResponseCurve, deblur: str | None = None) ->
 
 
 def restored(capture: Path, curve: ResponseCurve, deblur: str | None = None) -> list[RestoredFrame]:
-    """All frames of a capture with preset balanced, by somebody who takes ``curve`` for the camera's."""
+    """All frames of a capture with preset balanced, by somebody who takes ``curve`` for the camera's.
+
+    Each frame by itself: beside clipped light frames do without their neighbours, and the masks alone are compared.
+    """
     recorded = read_capture(capture)
-    settings: RestorationSettings = PRESETS["balanced"]
+    settings: RestorationSettings = replace(PRESETS["balanced"], neighbours=0)
     profile = replace(resolve_profile(recorded)[0], response=curve)
     plan = RestorationPlan(profile, replace(settings, deblur=deblur or settings.deblur))
     frames = ((recorded.frames[number], picture) for number, picture in recorded_frames(capture))
