@@ -157,8 +157,8 @@ def test_each_frame_of_a_segment_has_its_line(segment: Segment) -> None:
     assert lines[2]["warnings"] == ["inside an IMU gap"]
     for line in lines:
         assert list(line) == [
-            "capture", "frame", "timestamp_ns", "exposure_s", "status", "done", "output", "warnings", "valid_px", "motion",
-            "depth_m", "depth_source", "blur", "shutter", "response", "deblur", "seconds",
+            "capture", "frame", "timestamp_ns", "exposure_s", "status", "done", "output", "warnings", "valid_px",
+            "motion", "depth_m", "depth_source", "blur", "shutter", "response", "deblur", "seconds",
         ]  # fmt: skip
         assert set(line["seconds"]) == {"decode", "estimate", "deblur", "shutter", "write"}
     assert pictures(segment) == {"000004.png", "000005.png", "000007.png"}

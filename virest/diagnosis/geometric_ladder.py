@@ -396,12 +396,16 @@ def _best_pair(
     """
     evidence = course.evidence
     firsts = [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]
-    found: list[tuple[Candidate, Screened]] = []
+    best: dict[frozenset[str], tuple[Candidate, Screened]] = {}
     for first in firsts:
         with_it = replace(first.model, terms=(*first.model.terms, *first.added))
         begun = course.candidates(with_it, {*tried, first.name})
         seconds = [candidate for candidate in begun if candidate.added]
-        found += [(first, second) for second in best_of_each(screen(evidence, seconds, course.each))]
+        for second in best_of_each(screen(evidence, seconds, course.each)):
+            both = frozenset((first.name, second.candidate.name))  # A beside B is B beside A
+            if both not in best or second.loss < best[both][1].loss:
+                best[both] = first, second
+    found = list(best.values())
     if not found:
         return None, None
     members_of = {_pair_name(first, entry): (first, entry.candidate) for first, entry in found}
