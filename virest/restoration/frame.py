@@ -342,6 +342,10 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     joined = neighbours(luma) if neighbours is not None and light is None and anchor == 0.5 else ()
     longest_px = max((longest_px, *(one.longest_px for one in joined)))
+    if joined:
+        shared = sum(float(one.weights.mean()) * one.shared_noise for one in joined)
+        promised_db = luma_model.joint_gain_db(np.sum([one.passed() for one in joined], axis=0), shared)
+        expected_db = promised_db if confirmed is None else confirmed.expected_db(promised_db)
     blurred = replace(blurred, spread=spread, neighbours=joined, longest_px=longest_px)
     if light is not None:
         blurred = _evened(blurred, light)

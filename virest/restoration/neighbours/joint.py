@@ -20,6 +20,8 @@ from virest.degradation.blur import Image
 from virest.degradation.kernels import KernelField
 from virest.degradation.neighbour import NeighbourView
 from virest.restoration.neighbours.registration import TileAgreement
+from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
+from virest.restoration.statistics.tile_power import passed_power
 
 Array = NDArray[np.float64]
 OWN_ERROR = 0.01
@@ -29,6 +31,8 @@ LEAST_WEIGHT = 0.25
 seen to differ by 0.05 to 0.9 times that (3 at 0.08 bits a pixel), pictures of other places by 5 to 1500."""
 LEAST_SHIFTS = 6
 """An affine field of shifts has six unknowns; as many tiles again must bear it out."""
+LOOKED_AT = 6
+"""Places at which a neighbour's kernels are looked at for what it may bring."""
 HUBER, ROBUST_STEPS = 1.5, 6
 
 
@@ -55,6 +59,16 @@ class NeighbourPicture:
     def longest_px(self) -> float:
         """Longest of its blur paths where its weights hold."""
         return float(self.field(self.places_px).length_px.max())
+
+    def passed(self) -> Array:
+        """(RINGS,) mean |K|² over some of the places, times the mean weight."""
+        some = np.linspace(0, len(self.places_px) - 1, min(len(self.places_px), LOOKED_AT)).round().astype(int)
+        kernels = self.field(self.places_px[some]).arrays()
+        if kernels.shape[1] > SIDE:
+            return np.zeros(RINGS)
+        power = np.mean([passed_power(kernel) for kernel in kernels], axis=0)
+        counts = np.maximum(np.bincount(place_ring().ravel(), minlength=RINGS), 1)
+        return np.asarray(self.weights.mean() * np.bincount(place_ring().ravel(), power.ravel(), RINGS) / counts)
 
     def weight_at(self, centres_px: Array, half_side_px: float) -> Array:
         """(m,) least weight near each centre: within half a tile's side, and at the nearest place."""

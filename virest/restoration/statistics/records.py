@@ -141,10 +141,15 @@ class PictureStatistics:
 
     @property
     def expected_gain_db(self) -> float:
+        """:meth:`joint_gain_db` of the picture by itself."""
+        return self.joint_gain_db(np.zeros(RINGS), 0.0)
+
+    def joint_gain_db(self, further: Array, shared: float) -> float:
         """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured.
 
         Left as it is, a picture misses (1 − K) F, |1 − K|² = 1 − 2 Re K + |K|²; where a path reverses a frequency
-        that is more than all of it.
+        that is more than all of it.  further: (RINGS,) weighted |K|² of further pictures restored with it.  shared: sum
+        of their weights times the part of the noise that they have in common with it.
         """
         if not self.measured:
             return 0.0
@@ -153,7 +158,7 @@ class PictureStatistics:
         real = np.sqrt(self.passed) if self.real is None else self.real
         left = np.sum(self.frequency * ((1 - 2 * real + self.passed) * self.signal + self.noise))
         count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
-        signal, noise = self.signal[:, None], self.noise[:, None]
+        signal, noise, passed = self.signal[:, None], (1 + shared) * self.noise[:, None], passed + further[:, None]
         wrong = (count * signal * noise / (passed * signal + noise)).sum(axis=1) / np.maximum(count.sum(axis=1), 1)
         return max(float(10 * np.log10(left / np.sum(self.frequency * wrong))), 0.0)
 
