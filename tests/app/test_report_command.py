@@ -361,7 +361,7 @@ def test_the_slider_works_by_keyboard_and_the_chooser_by_click(report, made, ope
     picture, slider = page.locator("[data-compare]:visible"), page.locator("[data-cut]:visible")
     page.locator("[data-arrows]").uncheck()
     reached = []
-    while not reached or "data-cut" not in reached[-1] and len(reached) < 10:
+    while not reached or ("data-cut" not in reached[-1] and len(reached) < 10):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.getAttributeNames()"))
     assert "data-cut" in reached[-1], reached
