@@ -36,7 +36,7 @@ def relief(rng: np.random.Generator) -> tuple[ReliefScene, float, float]:
     cover = np.zeros((80, 120, 1), np.float32)
     cover[:, :60] = 1
     before = Scene(np.concatenate([near * cover, cover], axis=2), FOCAL, NEAR_M)
-    return ReliefScene(far, FOCAL, FAR_M, (0.0, 0.0, 1.0), before), float(far[0, 0, 2]), float(near[0, 0, 2])
+    return ReliefScene(far, FOCAL, FAR_M, (0.0, 0.0, 1.0), nearer=(before,)), float(far[0, 0, 2]), float(near[0, 0, 2])
 
 
 def test_a_point_of_each_plane_is_seen_where_its_ray_goes(rng: np.random.Generator):
@@ -65,9 +65,9 @@ def test_things_hung_before_a_scene_hide_some_of_it_and_not_all(rng: np.random.G
     """The farther plane stays as it was; covered light never exceeds the cover."""
     plane = Scene(chart(rng), FOCAL, FAR_M)
     scene = hang_before(plane, rng, depth_m=NEAR_M, focal_px=FOCAL)
-    assert scene.near is not None
-    assert (scene.depth_m, scene.near.depth_m) == (FAR_M, NEAR_M)
+    (near,) = scene.nearer
+    assert (scene.depth_m, near.depth_m) == (FAR_M, NEAR_M)
     np.testing.assert_array_equal(scene.chart, plane.chart)
-    cover = scene.near.chart[..., 3]
+    cover = near.chart[..., 3]
     assert 0.02 < cover.mean() < 0.9
-    assert (scene.near.chart[..., :3].max(axis=2) <= cover + 1e-6).all()
+    assert (near.chart[..., :3].max(axis=2) <= cover + 1e-6).all()

@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from virest.camera.response import ResponseCurve
 from virest.degradation.row_motion import RowMotion
 from virest.errors import CaptureError
 from virest.evaluation.baselines import BASELINES, baseline_pictures
+from virest.evaluation.burst import BURSTS, REACHES, align_frames
 from virest.evaluation.fidelity import (
     MARGIN_PX,
     difference_map,
@@ -33,11 +34,14 @@ from virest.evaluation.fidelity import (
     shift_px,
 )
 from virest.evaluation.matching import METHOD, count_matches
+from virest.motion.optics import moving_lens
 from virest.restoration.settings import PRESETS, RestorationSettings
 
 Picture = NDArray[np.uint8]
 Progress = Callable[[str, float], Any]
 BLURRED = "blurred"
+CASE = "B: motion blur"
+CASE_OVER_TIME = "B over time: motion blur, frames with their neighbours"
 OURS = tuple(f"virest {preset}" for preset in PRESETS)
 SIZE: dict[str, Any] = {"width": 640, "height": 480}
 STANDARD: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -47,6 +51,18 @@ STANDARD: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 QUICK = ("leaves", "text")
 FRAMES, FRAMES_QUICK = 4, 2
+MERGED: dict[str, Any] = SIZE | {"exposure_ms": 18.0, "frames": 11}
+OVER_TIME: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("shake", MERGED | {"scene": "leaves", "rate_rad_s": 1.6, "noise_levels": 3.0, "seed": 61}),
+    ("pan", MERGED | {"scene": "photographs", "rate_rad_s": 0.4, "pan_rad_s": 1.2, "seed": 62}),
+    ("walk", MERGED | {"rate_rad_s": 1.2, "depth_m": 1.8, "near_m": 1.1, "sway_m": 0.03, "seed": 63}),
+    ("moving", MERGED | {"rate_rad_s": 1.4, "moving_px_s": 240.0, "seed": 64}),
+)
+"""Captures on which frames are restored together with their neighbours."""
+OVER_TIME_QUICK = ("shake", "moving")
+JUDGED_OVER_TIME = slice(4, 7)
+"""Of the eleven frames: those with neighbours on both sides for every method."""
+SINGLE = "virest best, single"
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MAP_GAIN = 2
 """Difference maps are shown so many times as bright."""
@@ -66,6 +82,8 @@ class DeblurOptions:
     out: Path | None = None
     """Difference maps go here."""
     quick: bool = False
+    over_time: bool = False
+    """Judge restoration together with neighbours, against methods that merge aligned frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,14 +106,15 @@ def run_deblur(options: DeblurOptions, progress: Progress | None = None) -> tupl
     results: list[FrameResult] = []
     with _chosen_captures(options) as (captures, simulated):
         total, done = sum(len(capture.frames) for capture in captures), 0
+        methods = _methods_over_time if options.over_time else _all_methods
         for capture in captures:
-            for number, pictures, truth, valid_px in _all_methods(capture):
+            for number, pictures, truth, valid_px in methods(capture):
                 results += list(_measure(capture.name, f"{number:06d}", pictures, truth, valid_px))
                 _draw(options.out, f"{capture.name}-{number:06d}", pictures, truth, valid_px)
                 done += 1
                 if progress:
                     progress(capture.name, done / total)
-    facts = _facts(results, {"simulated": simulated})
+    facts = _facts(results, {"simulated": simulated}, CASE_OVER_TIME if options.over_time else CASE)
     return facts, _text(facts)
 
 
@@ -107,10 +126,13 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
         return
     work = Path(tempfile.mkdtemp(prefix="virest-evaluate-"))
     try:
-        names = [(name, wishes) for name, wishes in STANDARD if not options.quick or name in QUICK]
-        count = FRAMES_QUICK if options.quick else FRAMES
-        told = [{**simulate_command(work / name, frames=count, **wishes), "capture": name} for name, wishes in names]
-        yield [open_true_capture(work / name) for name, _ in names], told
+        standard, quick = (OVER_TIME, OVER_TIME_QUICK) if options.over_time else (STANDARD, QUICK)
+        count, judged = {"frames": FRAMES_QUICK if options.quick else FRAMES}, slice(None)
+        if options.over_time:
+            count, judged = {}, JUDGED_OVER_TIME
+        names = [(name, wishes | count) for name, wishes in standard if not options.quick or name in quick]
+        told = [{**simulate_command(work / name, **wishes), "capture": name} for name, wishes in names]
+        yield [open_true_capture(work / name, None, judged) for name, _ in names], told
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -134,17 +156,43 @@ def _all_methods(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture]
         yield frame.index, {BLURRED: ours.pop(BLURRED), **peers, **ours}, truth, valid_px
 
 
+def _methods_over_time(
+    capture: TrueCapture,
+) -> Iterator[tuple[int, dict[str, Picture], Picture, tuple[int, int, int, int]]]:
+    """As :func:`_all_methods`: methods that merge aligned frames, and ours alone and with neighbours."""
+    plan = capture.plan(RestorationSettings(deblur="none"))
+    settings = {SINGLE: replace(PRESETS["best"], neighbours=0)} | {
+        f"virest {name}": PRESETS[name] for name in ("balanced", "best")
+    }
+    plans = {BLURRED: plan} | {name: capture.plan(chosen) for name, chosen in settings.items()}
+    motions, trajectory = capture.motions(plan), capture.trajectory(plan)
+    lens = moving_lens(trajectory, plan.profile)
+    pictures = {frame.index: picture for frame, picture in capture.recorded(max(REACHES))}
+    for restored in zip(*(capture.restored(p) for p in plans.values()), strict=True):
+        number = restored[0].frame.index
+        if any(r.picture is None for r in restored):
+            continue
+        truth, valid_px = capture.truth(number), restored[-1].valid_px
+        inside = inner_part(valid_px)
+        near = [(n, p) for n, p in pictures.items() if abs(n - number) <= max(REACHES)]
+        aligned = align_frames(near, number, motions, trajectory, lens)
+        merged = {name: _closest(merge(aligned), truth, inside) for name, merge in BURSTS.items()}
+        ours = {name: r.picture for name, r in zip(plans, restored, strict=True) if r.picture is not None}
+        yield number, {BLURRED: ours.pop(BLURRED), **merged, **ours}, truth, valid_px
+
+
+def _closest(pictures: Iterable[Picture], truth: Picture, inside: tuple[slice, slice]) -> Picture:
+    """The picture with the least squared error against truth."""
+    return min(pictures, key=lambda picture: mean_squared_error(picture[inside], truth[inside]))
+
+
 def _baselines(
     recorded: Picture, motion: RowMotion, curve: ResponseCurve, truth: Picture, valid_px: Sequence[int]
 ) -> dict[str, Picture]:
     """Each baseline's best picture by squared error against truth; those whose library is missing are left out."""
     inside = inner_part(valid_px)
-
-    def error(picture: Picture) -> float:
-        return mean_squared_error(picture[inside], truth[inside])
-
     return {
-        name: min(baseline_pictures(baseline, recorded, motion, curve), key=error)
+        name: _closest(baseline_pictures(baseline, recorded, motion, curve), truth, inside)
         for name, baseline in BASELINES.items()
         if baseline.available
     }
@@ -277,12 +325,12 @@ def _moved(picture: Picture, shift: NDArray[np.float64]) -> Picture:
 # ── what is said ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _facts(results: list[FrameResult], about: dict[str, Any]) -> dict[str, Any]:
+def _facts(results: list[FrameResult], about: dict[str, Any], case: str = CASE) -> dict[str, Any]:
     methods = list(dict.fromkeys(result.method for result in results))
     captures = list(dict.fromkeys(result.capture for result in results))
     missing = [name for name, baseline in BASELINES.items() if not baseline.available]
     return {
-        "case": "B: motion blur",
+        "case": case,
         "versions": peer_versions(),
         "matching": METHOD,
         "margin_px": MARGIN_PX,
@@ -346,7 +394,7 @@ def _leads(own: FrameResult, other: FrameResult) -> bool:
 def _text(facts: Mapping[str, Any]) -> str:
     header = ["method", "MSE", "PSNR dB", "SSIM", "matches", "in place"]
     parts = [
-        f"CASE B, motion blur: {facts['frames']} frames, {facts['versions']}",
+        f"CASE {facts['case'].replace(':', ',')}: {facts['frames']} frames, {facts['versions']}",
         "means over the frames; PSNR of the mean MSE",
         _table(header, _rows(facts["methods"])),
     ]

@@ -20,6 +20,7 @@ from virest.capture.video import MovieIndex, probe_movie, read_frames, read_gray
 from virest.degradation.row_motion import RowMotion, row_motion
 from virest.errors import CaptureError, OutputError
 from virest.motion.integration import integrate_gyro
+from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.planning import plan_restoration
@@ -38,10 +39,14 @@ class TrueCapture:
     index: MovieIndex
     frames: tuple[Frame, ...]
     """Those that are judged, in order: usable ones that have a truth."""
+    usable: tuple[Frame, ...]
+    """All frames of the movie that are not skipped, in order."""
 
-    def recorded(self) -> Iterator[tuple[Frame, Picture]]:
-        """The judged frames with their decoded pictures, RGB."""
-        wanted = {frame.index: frame for frame in self.frames}
+    def recorded(self, reach: int = 0) -> Iterator[tuple[Frame, Picture]]:
+        """The judged frames and up to ``reach`` of the movie before and after each, with their pictures, RGB."""
+        judged = {frame.index for frame in self.frames}
+        near = {number + step for number in judged for step in range(-reach, reach + 1)}
+        wanted = {frame.index: frame for frame in self.usable if frame.index in near}
         for number, picture in read_frames(self.capture.movie, self.index, min(wanted), max(wanted)):
             if number in wanted and picture is not None:
                 yield wanted[number], picture
@@ -56,16 +61,21 @@ class TrueCapture:
 
     def restored(self, plan: RestorationPlan) -> Iterator[RestoredFrame]:
         """What ``virest process`` makes of the judged frames."""
-        return restore_frames(self.recorded(), self.capture.imu, plan)
+        judged = {frame.index for frame in self.frames}
+        return restore_frames(self.recorded(plan.reach), self.capture.imu, plan, judged)
 
     def motions(self, plan: RestorationPlan) -> dict[int, RowMotion]:
-        """The motion over each judged frame, as the plan has it."""
-        trajectory = integrate_gyro(self.capture.imu, plan.profile)
+        """The motion over each usable frame, as the plan has it."""
+        trajectory = self.trajectory(plan)
         reference, known = plan.settings.reference, plan.translations or {}
         return {
             f.index: row_motion(trajectory, plan.profile, f.time_s, f.exposure_s, reference, known.get(f.index))
-            for f in self.frames
+            for f in self.usable
         }
+
+    def trajectory(self, plan: RestorationPlan) -> Trajectory:
+        """The orientations that the plan's profile makes of the inertial log."""
+        return integrate_gyro(self.capture.imu, plan.profile)
 
     def luma(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
         """Luma of some frames, those that can be decoded."""
@@ -80,15 +90,15 @@ def open_true_capture(folder: Path, config: Path | None = None, chosen: slice = 
     profile, _ = resolve_profile(capture, config)
     frames = at_true_times(capture.frames, profile, capture.repeats)
     numbers = sorted(range(len(frames))[chosen])
-    usable = tuple(
-        frames[k] for k in numbers if frames[k].skip_reason is None and _truth_path(folder, frames[k].index).is_file()
-    )
-    if not usable:
+    usable = tuple(frame for frame in frames if frame.skip_reason is None)
+    chosen_ones = {frames[k].index for k in numbers}
+    judged = tuple(f for f in usable if f.index in chosen_ones and _truth_path(folder, f.index).is_file())
+    if not judged:
         raise CaptureError(
             f"{folder}: none of {len(numbers)} chosen frames has a truth in {folder.name}/truth/frames",
             hint="captures with truth are written by virest simulate",
         )
-    return TrueCapture(capture.folder.resolve().name, capture, profile, probe_movie(capture.movie), usable)
+    return TrueCapture(capture.folder.resolve().name, capture, profile, probe_movie(capture.movie), judged, usable)
 
 
 def read_picture(path: Path) -> Picture:

@@ -35,6 +35,9 @@ def simulate_command(
     focal_px: float | None = None,
     distortion: tuple[str, tuple[float, ...]] = ("none", ()),
     rate_rad_s: float = 1.0,
+    pan_rad_s: float = 0.0,
+    near_m: float | None = None,
+    moving_px_s: float = 0.0,
     noise_levels: float = 1.5,
     response: str | ResponseCurve = "srgb",
     depth_m: float | None = None,
@@ -62,7 +65,9 @@ def simulate_command(
     auto_exposure_ev: exposure × ISO, and the brightness with them, walk smoothly over so many EV about exposure_ms;
     with auto_exposure_steps they climb a staircase of so many exposures.  rate_rad_s: 0 is a camera that does not turn;
     where it does not sway either (no depth_m, or sway_m 0), the pictures are still.  direction: right_to_left for an
-    upright picture and top_to_bottom for one on its side, unless given.  depth_m: distance of the scene's plane, None
+    upright picture and top_to_bottom for one on its side, unless given.  pan_rad_s: a steady turn about the camera's
+    vertical axis.  near_m: distance of things that hang before the scene.  moving_px_s: speed of things that move
+    across it.  depth_m: distance of the scene's plane, None
     for infinity.
     effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), hidden from everything but ``truth/``.
     hidden: effects that have no name, for tests.
@@ -94,7 +99,10 @@ def simulate_command(
         auto_exposure=_auto_exposure(auto_exposure_ev, auto_exposure_steps),
         rate_rad_s=rate_rad_s,
         sway_m=sway_m,
+        pan_rad_s=pan_rad_s,
         tilt_rad=(float(np.deg2rad(tilt_deg[0])), float(np.deg2rad(tilt_deg[1]))),
+        near_m=near_m,
+        moving_px_s=moving_px_s,
         noise_levels=noise_levels,
         imu_rate_hz=imu_rate_hz,
         gyro_noise_rad_s=gyro_noise_rad_s,

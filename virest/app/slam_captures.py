@@ -15,7 +15,6 @@ import numpy as np
 from virest.app.simulate import parse_response
 from virest.simulation.hand_motion import random_hand_motion
 from virest.simulation.recording import RecordingOptions, write_recording
-from virest.simulation.scenes import hang_before
 from virest.simulation.session import SessionSettings, nominal_camera, plan_session
 
 DEVICE_FRAMES = 24
@@ -165,6 +164,7 @@ def make_capture(plan: SlamCapture, folder: Path) -> Path:
         exposure_s=(plan.exposure_ms / 1000,),
         rate_rad_s=plan.rate_rad_s,
         sway_m=plan.sway_m,
+        near_m=plan.near_m,
         tilt_rad=(float(np.deg2rad(plan.tilt_deg[0])), float(np.deg2rad(plan.tilt_deg[1]))),
         imu_rate_hz=plan.imu_rate_hz,
         seed=plan.seed,
@@ -178,8 +178,4 @@ def make_capture(plan: SlamCapture, folder: Path) -> Path:
         margin_s=_MARGIN_S,
     )
     session = plan_session(nominal, true, settings, motion=motion)
-    if plan.near_m is not None:
-        rng = np.random.default_rng([plan.seed, 7])
-        relief = hang_before(session.scene, rng, depth_m=plan.near_m, focal_px=plan.focal_px)
-        session = dataclasses.replace(session, scene=relief)
     return write_recording(session, folder, options=RecordingOptions(bits_per_px=_BITS_PER_PX))

@@ -74,7 +74,7 @@ class RestorationPlan:
     def joined(self, before: Sequence[Sight], after: Sequence[Sight]) -> tuple[Sight, ...]:
         """Those of a frame's neighbours that are restored with it, in order."""
         count = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
-        return (*before[len(before) - count :], *after[:count]) if count else ()
+        return (*before[max(len(before) - count, 0) :], *after[:count]) if count else ()
 
     def of(self, frames: Iterable[Frame]) -> RestorationPlan:
         """The plan as a worker needs it who has these frames only."""

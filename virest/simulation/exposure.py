@@ -212,11 +212,11 @@ def _picture_speed(scene: Scene, motion: HandMotion, view: View, begin: float, e
     )
     if np.isfinite(scene.depth_m):
         speed = speed + lens.fx_px * np.linalg.norm(motion.sway.at(times, 1), axis=1) / scene.depth_m
-    return float(speed.max())
+    return float(speed.max()) + lens.fx_px * scene.fastest_per_s
 
 
 def _homographies(scene: Scene, motion: HandMotion, times_s: Array) -> Array:
-    return scene.chart_from_ray(motion.rotation(times_s).as_matrix(), motion.position_m(times_s))
+    return scene.chart_from_ray(motion.rotation(times_s).as_matrix(), motion.position_m(times_s), times_s)
 
 
 def _hat_integral(u: Array) -> Array:

@@ -118,6 +118,7 @@ def random_hand_motion(
     duration_s: float,
     sway_rms_m: float = 0.0,
     walk_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    pan_rad_s: float = 0.0,
     margin_s: float = 1.0,
     band_hz: tuple[float, float] = (0.5, 12.0),
 ) -> HandMotion:
@@ -125,10 +126,13 @@ def random_hand_motion(
 
     The rate's spectrum rises to about 2 Hz, is flat, and falls above 8 Hz.  Orientations cover ``margin_s`` more on
     both sides.  ``sway_rms_m`` adds a translation between 0.3 and 2.5 Hz of that RMS length, ``walk_m`` a step along an
-    arc: so far from side to side, and so far out and back along y and z.
+    arc: so far from side to side, and so far out and back along y and z.  ``pan_rad_s`` adds a steady turn about the
+    camera's y axis.
     """
     rate = _random_waves(rng, band_hz, lambda f: (f / 2) / (1 + f / 2) / (1 + (f / 8) ** 2))
     rate = _with_rms(rate, np.array(SHARE_PER_AXIS) * rate_rms_rad_s, duration_s)
+    if pan_rad_s:
+        rate = _with_constant(rate, (0.0, pan_rad_s, 0.0))
     sway = _random_waves(rng, (0.3, 2.5), lambda f: 1 / (1 + f))
     sway = _with_rms(sway, np.array([0.65, 0.65, 0.4]) * sway_rms_m, duration_s)
     if any(walk_m):
@@ -203,6 +207,13 @@ def _with_arc(waves: Waves, walk_m: tuple[float, float, float], duration_s: floa
     amplitude = np.array([[0.5 * walk_m[0]], [walk_m[1]], [walk_m[2]]])
     phase = np.array([[0.0], [-np.pi / 2], [-np.pi / 2]])
     parts = ((waves.frequency_hz, frequency), (waves.amplitude, amplitude), (waves.phase_rad, phase))
+    return Waves(*(np.concatenate(pair, axis=1) for pair in parts))
+
+
+def _with_constant(waves: Waves, value: tuple[float, float, float]) -> Waves:
+    """The waves and a constant, as a wave of frequency 0."""
+    zero = np.zeros((3, 1))
+    parts = ((waves.frequency_hz, zero), (waves.amplitude, np.array(value)[:, None]), (waves.phase_rad, zero))
     return Waves(*(np.concatenate(pair, axis=1) for pair in parts))
 
 

@@ -54,11 +54,23 @@ class Scene:
     """Distance of the plane along the world's z axis."""
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit normal of the plane, world axes."""
+    drift_per_s: tuple[float, float] = (0.0, 0.0)
+    """How fast the chart slides along its x and y axes, in units of x/z a second."""
+
+    @property
+    def fastest_per_s(self) -> float:
+        """Greatest speed of anything in the scene by itself, in units of x/z a second."""
+        return float(np.hypot(*self.drift_per_s))
 
     def chart_from_ray(
-        self, rotation_world_cam: NDArray[np.float64], position_m: NDArray[np.float64]
+        self,
+        rotation_world_cam: NDArray[np.float64],
+        position_m: NDArray[np.float64],
+        time_s: NDArray[np.float64] | float = 0.0,
     ) -> NDArray[np.float64]:
         """Homography from rays (x, y, 1) in camera axes to homogeneous chart pixels, for poses (..., 3, 3), (..., 3).
+
+        time_s: (...,) when each pose is taken; it only counts where the chart slides.
 
         A ray d from p meets the plane n·X = n·X0 at ``X = p + d n·(X0 − p)/(n·d)``, linear in d up
         to the division.
@@ -75,17 +87,21 @@ class Scene:
             distance = -(offset @ n)
             rows = [distance[..., None] * e + (offset @ e)[..., None] * n for e in (e1, e2)]
             plane = np.stack([rows[0], rows[1], np.broadcast_to(n * self.depth_m, rows[0].shape)], axis=-2)
-        return self._chart_matrix @ plane @ rotation
+        return self._chart_matrix(np.asarray(time_s, float)) @ plane @ rotation
 
-    @property
-    def _chart_matrix(self) -> NDArray[np.float64]:
+    def _chart_matrix(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         height, width = self.chart.shape[:2]
         focal = self.chart_focal_px
-        return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+        if not any(self.drift_per_s):
+            return matrix
+        matrices = np.broadcast_to(matrix, (*time_s.shape, 3, 3)).copy()
+        matrices[..., :2, 2] -= focal * time_s[..., None] * np.array(self.drift_per_s)
+        return matrices
 
     def at_plane(self, depth_m: float, normal: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Scene:
         """Put the same chart on a plane at another depth; it looks as large as before from the origin."""
-        return Scene(self.chart, self.chart_focal_px, depth_m, normal)
+        return Scene(self.chart, self.chart_focal_px, depth_m, normal, self.drift_per_s)
 
     def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
         """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside the chart: (h, w, 3)."""
@@ -100,36 +116,53 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class ReliefScene(Scene):
-    """A chart with things hanging before it: two planes, the nearer one painted over the farther.
+    """A chart with things before it: several planes, each nearer one painted over those behind it.
 
-    Homographies come in pairs, (..., 2, 3, 3): the farther plane's, then the nearer one's.
+    Homographies come in stacks, (..., planes, 3, 3): the farthest plane's first.
     """
 
-    near: Scene | None = None
-    """The nearer plane; its chart holds light × cover in three channels and cover, 0 to 1, in a fourth."""
+    nearer: tuple[Scene, ...] = ()
+    """The other planes; their charts hold light × cover in three channels and cover, 0 to 1, in a fourth."""
+
+    @property
+    def fastest_per_s(self) -> float:
+        """Greatest speed of anything in the scene by itself, in units of x/z a second."""
+        return max(float(np.hypot(*plane.drift_per_s)) for plane in (self, *self.nearer))
 
     def chart_from_ray(
-        self, rotation_world_cam: NDArray[np.float64], position_m: NDArray[np.float64]
+        self,
+        rotation_world_cam: NDArray[np.float64],
+        position_m: NDArray[np.float64],
+        time_s: NDArray[np.float64] | float = 0.0,
     ) -> NDArray[np.float64]:
-        """Both planes' homographies, as :meth:`Scene.chart_from_ray`: (..., 2, 3, 3)."""
-        planes = [Scene(self.chart, self.chart_focal_px, self.depth_m, self.normal), self.near or self]
-        return np.stack([Scene.chart_from_ray(plane, rotation_world_cam, position_m) for plane in planes], axis=-3)
+        """All planes' homographies, as :meth:`Scene.chart_from_ray`: (..., planes, 3, 3)."""
+        farthest = Scene(self.chart, self.chart_focal_px, self.depth_m, self.normal, self.drift_per_s)
+        planes = (farthest, *self.nearer)
+        return np.stack([p.chart_from_ray(rotation_world_cam, position_m, time_s) for p in planes], axis=-3)
 
     def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
-        """Light along rays: the nearer chart's where it covers, else the farther one's: (h, w, 3)."""
+        """Light along rays: that of the nearest plane that covers it: (h, w, 3)."""
         light = Scene.sample(self, homography[0], x, y)
-        if self.near is None:
-            return light
-        before = self.near.sample(homography[1], x, y)
-        return light * (1 - before[..., 3:]) + before[..., :3]
+        for plane, seen in zip(self.nearer, homography[1:], strict=True):
+            before = plane.sample(seen, x, y)
+            light = light * (1 - before[..., 3:]) + before[..., :3]
+        return light
 
 
 def hang_before(
-    scene: Scene, rng: np.random.Generator, *, depth_m: float, focal_px: float, things: int = 14, size: float = 0.13
+    scene: Scene,
+    rng: np.random.Generator,
+    *,
+    depth_m: float,
+    focal_px: float,
+    things: int = 14,
+    size: float = 0.13,
+    drift_per_s: tuple[float, float] = (0.0, 0.0),
 ) -> ReliefScene:
     """Hang discs, ellipses and polygons of leaves' texture on a nearer plane, facing the camera.
 
     focal_px: of the camera, as for :func:`make_scene`.  size: mean radius in units of x/z, as seen from the origin.
+    drift_per_s: how fast they all move.
     """
     height, width = scene.chart.shape[:2]
     oversampling = scene.chart_focal_px / focal_px
@@ -140,8 +173,33 @@ def hang_before(
     drawing = _draw_leaves(rng, width, height, oversampling)
     layers = np.dstack([drawing * cover[..., None], cover])
     layers = cv2.GaussianBlur(layers, (0, 0), LENS_SIGMA_PX * oversampling, borderType=cv2.BORDER_REFLECT)
-    near = Scene(layers, scene.chart_focal_px, depth_m)
-    return ReliefScene(scene.chart, scene.chart_focal_px, scene.depth_m, scene.normal, near)
+    near = Scene(layers, scene.chart_focal_px, depth_m, drift_per_s=drift_per_s)
+    others = scene.nearer if isinstance(scene, ReliefScene) else ()
+    return ReliefScene(
+        scene.chart, scene.chart_focal_px, scene.depth_m, scene.normal, scene.drift_per_s, (*others, near)
+    )
+
+
+MOVING_LAYERS, MOVING_THINGS, MOVING_SIZE = 3, 4, 0.09
+"""Planes of things that move, things on each, and their mean radius in units of x/z: about a fifth of the picture."""
+
+
+def move_things_before(scene: Scene, rng: np.random.Generator, *, speed_px_s: float, focal_px: float) -> ReliefScene:
+    """Let things as far away as the scene move across it, each plane of them in its own direction.
+
+    speed_px_s: in the picture of a camera of focal_px that stands still.
+    """
+    first = rng.uniform(0, 2 * np.pi)
+    for layer in range(MOVING_LAYERS):
+        angle = first + 2 * np.pi * layer / MOVING_LAYERS
+        speed = speed_px_s / focal_px * float(rng.uniform(0.7, 1.3))
+        drift = (speed * float(np.cos(angle)), speed * float(np.sin(angle)))
+        scene = hang_before(
+            scene, rng, depth_m=scene.depth_m, focal_px=focal_px, things=MOVING_THINGS, size=MOVING_SIZE,
+            drift_per_s=drift,
+        )  # fmt: skip
+    assert isinstance(scene, ReliefScene)
+    return scene
 
 
 def make_scene(

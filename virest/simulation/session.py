@@ -26,7 +26,7 @@ from virest.simulation.hidden import NOTHING, Hidden, gyro_reading
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
-from virest.simulation.scenes import Scene, make_scene
+from virest.simulation.scenes import Scene, hang_before, make_scene, move_things_before
 from virest.simulation.sensor import eight_bit, grey_of_light, noisy_levels, round_levels, sensor_light
 
 Array = NDArray[np.float64]
@@ -65,8 +65,14 @@ class SessionSettings:
     """RMS of the angular rate; 0: the camera does not turn, and without a sway stands still, as on a tripod."""
     sway_m: float | None = None
     """RMS of the sway; None: DEFAULT_SWAY_M where the scene has a depth, else none."""
+    pan_rad_s: float = 0.0
+    """Steady turn about the camera's vertical axis, on top of the hand's."""
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     """Turn of the scene's plane about world x and y; only with a finite depth."""
+    near_m: float | None = None
+    """Distance of things that hang before the scene; None: none do."""
+    moving_px_s: float = 0.0
+    """Speed of things that move across the scene, in the picture of a camera at rest; 0: there are none."""
     noise_levels: float = 1.5
     """Standard deviation of the noise in grey levels of 255."""
     imu_rate_hz: float = 200.0
@@ -186,7 +192,7 @@ def plan_session(
     offset = abs(true.time_offset_s or 0.0)
     lead = _IMU_LEAD_S if offset <= 0.4 else float(np.ceil(offset + _IMU_LEAD_S))
     span = (-lead, duration + lead)
-    depth = np.inf if true.depth_m is None else true.depth_m
+    depth = scene_depth_m(true)
     if motion is None:
         sway = settings.sway_m if settings.sway_m is not None else (DEFAULT_SWAY_M if np.isfinite(depth) else 0.0)
         # whole seconds: a small effect must not change where the integration starts, nor its last digits
@@ -196,6 +202,7 @@ def plan_session(
             rate_rms_rad_s=settings.rate_rad_s,
             duration_s=duration,
             sway_rms_m=sway,
+            pan_rad_s=settings.pan_rad_s,
             margin_s=float(spare),
         )
     shows = shown_captures(true, settings)
@@ -204,6 +211,7 @@ def plan_session(
         if np.isfinite(depth):
             tilt = Rotation.from_rotvec([*settings.tilt_rad, 0.0]).as_matrix()[:, 2]
             scene = _at_median_depth(scene.at_plane(depth, tuple(tilt.tolist())), motion, true, settings, shows)
+        scene = _with_things_before(scene, nominal, settings)
     base_ns = 1_000 * int(np.random.default_rng([settings.seed, 2]).integers(40_000_000_000, 60_000_000_000))
     ticks = np.array([_stamp_tick(k, settings.fps) for k in range(settings.frames)])
     stamps = base_ns + np.array([round(_stamp_s(k, settings.fps) * 1e9) for k in range(settings.frames)])
@@ -294,6 +302,13 @@ def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
         refuse("the exposure is not positive", "use about 1 to 20 ms")
     if not max(settings.exposure_s) <= LONGEST_EXPOSURE_S:
         refuse(f"an exposure of {max(settings.exposure_s):g} s", f"at most {LONGEST_EXPOSURE_S:g} s are rendered")
+    if settings.moving_px_s < 0:
+        refuse(f"things that move at {settings.moving_px_s:g} px/s", "use 0 or more")
+    if abs(settings.pan_rad_s) > FASTEST_HAND_RAD_S:
+        refuse(f"a pan of {settings.pan_rad_s:g} rad/s", f"use -{FASTEST_HAND_RAD_S:g} to {FASTEST_HAND_RAD_S:g}")
+    far = scene_depth_m(profile)
+    if settings.near_m is not None and not NEAREST_M <= settings.near_m < far:
+        refuse(f"things {settings.near_m:g} m away before a scene {far:g} m away", "they must be nearer than the scene")
     if not (settings.imu_rate_hz >= 1 and settings.noise_levels >= 0 and settings.rate_rad_s >= 0):
         refuse("a negative rate or noise", "use 0 or more")
     if settings.noise_levels > 255:
@@ -315,6 +330,11 @@ def _require_renderable(profile: CameraProfile, refuse: Callable[[str, str], Non
         refuse(f"a time offset of {offset:g} s", f"at most {LONGEST_OFFSET_S:g} s, or the inertial log has no end")
     if depth is not None and depth != np.inf and not NEAREST_M <= depth <= FARTHEST_M:
         refuse(f"a scene {depth:g} m away", f"use {NEAREST_M:g} to {FARTHEST_M:g} m, or inf")
+
+
+def scene_depth_m(profile: CameraProfile) -> float:
+    """Distance of the scene; infinite where the profile names none."""
+    return np.inf if profile.depth_m is None else profile.depth_m
 
 
 def _stamp_tick(index: int, fps: float) -> int:
@@ -372,6 +392,19 @@ def _draw_scene(nominal: CameraProfile, motion: HandMotion, settings: SessionSet
         half_extent=(float(extent[0]), float(extent[1])),
         oversampling=settings.oversampling,
     )
+
+
+def _with_things_before(scene: Scene, nominal: CameraProfile, settings: SessionSettings) -> Scene:
+    """The scene with what hangs or moves before it."""
+    assert nominal.intrinsics is not None
+    focal_px = max(nominal.intrinsics.fx_px, nominal.intrinsics.fy_px)
+    if settings.near_m is not None:
+        rng = np.random.default_rng([settings.seed, 7])
+        scene = hang_before(scene, rng, depth_m=settings.near_m, focal_px=focal_px)
+    if settings.moving_px_s:
+        rng = np.random.default_rng([settings.seed, 8])
+        scene = move_things_before(scene, rng, speed_px_s=settings.moving_px_s, focal_px=focal_px)
+    return scene
 
 
 def _at_median_depth(

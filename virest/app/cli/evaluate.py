@@ -94,7 +94,10 @@ def deblur(
     ] = None,
     reference: Annotated[Path | None, typer.Option(metavar="DIR", help="Their references, by the same names.")] = None,
     out: Maps = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Two simulated captures, two frames each.")] = False,
+    over_time: Annotated[
+        bool, typer.Option("--over-time", help="Frames with their neighbours, against merging aligned frames.")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Two simulated captures, two or three frames each.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -110,6 +113,7 @@ def deblur(
     skimage richardson_lucy       288.0    23.54  0.7435      362       328
     virest balanced               190.6    25.33  0.8268      526       483
     ...
+    $ virest evaluate deblur --over-time
     $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
@@ -125,7 +129,7 @@ def deblur(
     one_thread_each()
     from virest.app.evaluate_deblur import DeblurOptions, run_deblur
 
-    options = DeblurOptions(tuple(paths), config, chosen, restored, reference, out, quick)
+    options = DeblurOptions(tuple(paths), config, chosen, restored, reference, out, quick, over_time)
     with console.progress_bar(100, "evaluate deblur", quiet=quiet) as bar:
         facts, text = run_deblur(options, on_bar(bar))
     emit_facts(facts, text, as_json=json, quiet=quiet)

@@ -76,11 +76,18 @@ def simulate(
     ] = None,
     focal_px: Annotated[float | None, typer.Option(metavar="PX", help="Focal length.")] = None,
     rate: Annotated[float, typer.Option(metavar="RAD_S", help="How fast the hand turns; 0: not at all.")] = 1.0,
+    pan: Annotated[float, typer.Option(metavar="RAD_S", help="A steady turn to the side on top of it.")] = 0.0,
     noise: Annotated[float, typer.Option(metavar="LEVELS", help="Noise of the picture, grey levels.")] = 1.5,
     response: Annotated[
         str, typer.Option(metavar="CURVE", help="srgb, linear, gamma:2.2, five_segment[:xb,yb,xc,yc,y_max].")
     ] = "srgb",
     depth_m: Annotated[float | None, typer.Option(metavar="M", help="Distance of the scene. [infinity]")] = None,
+    near_m: Annotated[
+        float | None, typer.Option(metavar="M", help="Things hang before the scene, this far away. [none]")
+    ] = None,
+    moving: Annotated[
+        float, typer.Option(metavar="PX_S", help="Things move across the scene at this speed; 0: none.")
+    ] = 0.0,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Take the camera from this profile.")] = None,
     effect: Annotated[
         list[str] | None,
@@ -166,6 +173,9 @@ def simulate(
             direction=direction,
             focal_px=focal_px,
             rate_rad_s=rate,
+            pan_rad_s=pan,
+            near_m=near_m,
+            moving_px_s=moving,
             noise_levels=noise,
             response=response,
             depth_m=depth_m,

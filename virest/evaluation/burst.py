@@ -1,0 +1,112 @@
+"""Other people's ways to merge a frame with its neighbours, given the true motion: baselines for joint restoration.
+
+The neighbours are brought to the frame's pixels by the same map as ours and merged in linear light, and the result is
+straightened by the same warp.  Neither method undoes a blur: they profit from neighbours that are blurred otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from virest.camera.response import ResponseCurve
+from virest.degradation.neighbour import neighbour_view
+from virest.degradation.row_motion import RowMotion
+from virest.motion.optics import MovingLens
+from virest.motion.trajectory import Trajectory
+from virest.restoration.encoding import encode_picture
+from virest.restoration.shutter import rowwise_map, warp
+
+Picture = NDArray[np.uint8]
+Light = NDArray[np.float32]
+ANCHOR = 0.5
+REACHES = (1, 2, 3)
+"""Neighbours on each side that are tried."""
+EXPONENTS = (3.0, 11.0, 30.0)
+"""Of Fourier burst accumulation; the paper takes 11 (Delbracio & Sapiro 2015, doi:10.1109/CVPR.2015.7298855)."""
+SMOOTHED_SIDE = 50
+"""Its weights are smoothed over this part of the picture's shorter side (the paper's σ)."""
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedFrames:
+    """A frame and its neighbours in linear light, each brought to the frame's pixels."""
+
+    motion: RowMotion
+    """Of the frame."""
+    curve: ResponseCurve
+    light: Mapping[int, Light]
+    """(height, width, 3) by the neighbour's distance in frames; 0: the frame itself."""
+
+    def within(self, reach: int) -> list[Light]:
+        """Those at most ``reach`` frames away, in order."""
+        return [self.light[k] for k in sorted(self.light) if abs(k) <= reach]
+
+    def straightened(self, light: Light) -> Picture:
+        """Grey levels of a merged picture, every row brought to the reference time."""
+        planes = [np.ascontiguousarray(light[..., k]) for k in range(3)]
+        return warp(encode_picture(planes, self.curve), rowwise_map(self.motion, ANCHOR))
+
+
+def align_frames(
+    numbered: Sequence[tuple[int, Picture]],
+    here: int,
+    motions: Mapping[int, RowMotion],
+    trajectory: Trajectory,
+    lens: MovingLens,
+) -> AlignedFrames:
+    """Bring pictures (by their index in the movie) to the pixels of frame ``here``."""
+    motion = motions[here]
+    curve = motion.profile.response or ResponseCurve("srgb")
+    table = curve.linear_table()
+    light = {}
+    for number, picture in numbered:
+        recorded = np.asarray(table[picture], np.float32)
+        if number != here:
+            source = neighbour_view(motion, motions[number], trajectory, lens, ANCHOR).map_px()
+            recorded = cv2.remap(recorded, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        light[number - here] = recorded
+    return AlignedFrames(motion, curve, light)
+
+
+def align_and_average(frames: AlignedFrames) -> Iterator[Picture]:
+    """The mean of the aligned frames, for each reach."""
+    for reach in REACHES:
+        yield frames.straightened(np.mean(frames.within(reach), axis=0, dtype=np.float32))
+
+
+def fourier_burst(frames: AlignedFrames) -> Iterator[Picture]:
+    """Fourier burst accumulation, for each reach and exponent.
+
+    Σ w_i F_i with w_i = |G F_i|^p / Σ |G F_j|^p: at each frequency the frames count by their smoothed magnitude there,
+    averaged over the colours (Delbracio & Sapiro 2015, eq. 4).
+    """
+    spectra = {k: np.asarray(fft.rfft2(light, axes=(0, 1))) for k, light in frames.light.items()}
+    height, width = frames.motion.profile.height, frames.motion.profile.width
+    sigma = min(height, width) / SMOOTHED_SIDE
+    size = {k: _smoothed(np.abs(spectrum).mean(axis=2), sigma) for k, spectrum in spectra.items()}
+    for reach, exponent in product(REACHES, EXPONENTS):
+        near = [k for k in spectra if abs(k) <= reach]
+        largest = np.max([size[k] for k in near], axis=0)
+        powers = {k: (size[k] / largest) ** exponent for k in near}
+        total = np.sum(list(powers.values()), axis=0)
+        merged = np.sum([spectra[k] * (powers[k] / total)[..., None] for k in near], axis=0)
+        yield frames.straightened(np.asarray(fft.irfft2(merged, (height, width), axes=(0, 1)), np.float32))
+
+
+def _smoothed(magnitude: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """A half spectrum's magnitude under a Gaussian; frequencies go around along y and are mirrored at x = 0."""
+    border = int(np.ceil(3 * sigma))
+    around = np.pad(np.pad(magnitude, ((border, border), (0, 0)), mode="wrap"), ((0, 0), (border, border)), "reflect")
+    smooth = cv2.GaussianBlur(around.astype(np.float32), (0, 0), sigma)
+    inside = smooth[border:-border, border:-border]
+    return np.maximum(inside, np.float32(1e-12))
+
+
+BURSTS = {"align and average": align_and_average, "Fourier burst": fourier_burst}
