@@ -78,6 +78,22 @@ def test_every_figure_comes_with_its_count_and_mse_agrees_with_psnr(judged_shutt
     assert sheet[30:, width : 2 * width].mean() > 3 * sheet[30:, -width:].mean()
 
 
+def test_frames_with_neighbours_are_judged_beside_merged_ones(tmp_path: Path) -> None:
+    """Neighbours in the movie are used although one frame is judged; joint is ahead of single and of merging."""
+    folder = tmp_path / "over_time"
+    wishes: dict[str, Any] = {"rate_rad_s": 1.8, "exposure_ms": 16.0, "bitrate_bits_per_px": 1.0, "seed": 80}
+    simulate_command(folder, scene="leaves", width=320, height=240, frames=7, **wishes)
+    facts, text = run_deblur(DeblurOptions((str(folder),), frames=slice(4, 5), over_time=True))
+    psnr = {name: summary["psnr_db"] for name, summary in facts["methods"].items()}
+    assert facts["frames"] == 1
+    assert set(psnr) == {
+        "blurred", "align and average", "Fourier burst", "virest best, single", "virest balanced", "virest best",
+    }  # fmt: skip
+    assert psnr["blurred"] < psnr["virest best, single"] < psnr["virest balanced"] < psnr["virest best"]
+    assert psnr["virest best"] > psnr["Fourier burst"] > psnr["align and average"]
+    assert "over time" in text
+
+
 def test_deblurring_is_ahead_of_the_baselines_in_all_three(shaken: Path, tmp_path: Path) -> None:
     """PSNR, SSIM and matches at once where the blur differs over the picture; the table's PSNR is that of its MSE."""
     facts, text = run_deblur(DeblurOptions((str(shaken),), frames=slice(0, 1), out=tmp_path))

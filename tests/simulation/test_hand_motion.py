@@ -67,3 +67,13 @@ def test_a_walk_goes_from_side_to_side_on_top_of_the_sway():
     walked = walking.position_m(times) - still.position_m(times)
     np.testing.assert_allclose(walked, [[0.25, 0, 0], [0, -0.1, 0.2], [-0.25, 0, 0]], atol=1e-12)
     np.testing.assert_array_equal(walking.node_quat, still.node_quat)
+
+
+def test_a_pan_is_a_steady_turn_on_top_of_the_tremor():
+    """The rate about the camera's y axis is the tremor's and the pan's, at all times; the other axes stay."""
+    options = {"rate_rms_rad_s": 0.7, "duration_s": 1.0}
+    still = random_hand_motion(np.random.default_rng(4), **options)
+    panning = random_hand_motion(np.random.default_rng(4), pan_rad_s=1.2, **options)
+    times = np.linspace(0, 1, 7)
+    expected = np.broadcast_to((0.0, 1.2, 0.0), (7, 3))
+    np.testing.assert_allclose(panning.rate_rad_s(times) - still.rate_rad_s(times), expected, atol=1e-9)

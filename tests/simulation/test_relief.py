@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from virest.simulation.scenes import ReliefScene, Scene, hang_before
+from virest.simulation.scenes import ReliefScene, Scene, hang_before, move_things_before
 
 NEAR_M, FAR_M, FOCAL = 1.1, 1.9, 50.0
 CENTRE = np.array([59.5, 39.5])
@@ -71,3 +71,18 @@ def test_things_hung_before_a_scene_hide_some_of_it_and_not_all(rng: np.random.G
     cover = near.chart[..., 3]
     assert 0.02 < cover.mean() < 0.9
     assert (near.chart[..., :3].max(axis=2) <= cover + 1e-6).all()
+
+
+def test_things_that_move_go_their_own_ways_and_the_scene_stays(rng: np.random.Generator):
+    """Three planes of things, in directions a third of a turn apart; at time 0 they are where they were drawn."""
+    plane = Scene(chart(rng), FOCAL)
+    scene = move_things_before(plane, rng, speed_px_s=100.0, focal_px=FOCAL)
+    drifts = np.array([p.drift_per_s for p in scene.nearer])
+    assert drifts.shape == (3, 2)
+    assert (np.hypot(*drifts.T) * FOCAL > 60).all()
+    assert scene.fastest_per_s == np.hypot(*drifts.T).max()
+    angles = np.sort(np.arctan2(drifts[:, 1], drifts[:, 0]))
+    np.testing.assert_allclose(np.diff(angles), 2 * np.pi / 3, atol=1e-9)
+    start, later = (scene.chart_from_ray(np.eye(3), np.zeros(3), time_s) for time_s in (0.0, 0.1))
+    np.testing.assert_allclose(later[0], start[0])
+    np.testing.assert_allclose((start - later)[1:, :2, 2], 0.1 * FOCAL * drifts)

@@ -219,3 +219,19 @@ def test_rays_invert_the_lens(model):
         )
     rows, columns = np.mgrid[0:60, 0:80]
     assert np.abs(found - np.stack([columns, rows], axis=-1)).max() < 1e-3
+
+
+def test_a_scene_that_slides_is_smeared_by_its_own_motion_and_rolls_with_the_rows():
+    """A still camera sees a sliding spot at the middle of its row's exposure, drawn out by speed times exposure."""
+    speed_px_s, exposure_s, readout_s = 300.0, 0.02, 0.03
+    profile = camera(readout_time_s=readout_s)
+    motion = constant_motion((0.0, 0.0, 0.0))
+    sliding = replace(spot_scene(), drift_per_s=(speed_px_s / FOCAL, 0.0))
+    light = expose(sliding, motion, make_view(profile, motion), 0.0, exposure_s)
+    middle_s = 47.0 / HEIGHT * readout_s + exposure_s / 2
+    np.testing.assert_allclose(centroid_px(light), (57.0 + speed_px_s * middle_s, 47.0), atol=0.3)
+    weight = light[..., 0].astype(float)
+    columns = np.arange(WIDTH)
+    spread = np.average((columns - np.average(columns, weights=weight.sum(0))) ** 2, weights=weight.sum(0))
+    box = (speed_px_s * exposure_s) ** 2 / 12
+    assert spread == pytest.approx(3.0**2 + box, rel=0.1)

@@ -12,9 +12,10 @@ from virest.degradation.blur import Image
 from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
 from virest.restoration.encoding import grey_levels
+from virest.restoration.neighbours.joint import HALF, NeighbourPicture
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED
-from virest.restoration.tile_layout import COARSE_OVERLAP, noise_to_signal, tile_deconvolution
+from virest.restoration.tile_layout import COARSE_OVERLAP, join_neighbours, noise_to_signal, tile_deconvolution
 
 COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 4
 COLOUR_TILE_PX = 384
@@ -76,10 +77,23 @@ def _sharp_differences(
         cv2.blur(slope, (side, side)) for slope in _slopes_on(luma, differences, cv2.multiply(noise, noise), side)
     ]
     ratios = noise_to_signal(deconvolution, settings, blurred.chroma, scale)
-    for difference, slope in zip(differences, slopes, strict=True):
-        left = cv2.subtract(difference, cv2.multiply(slope, luma))
-        filtered = deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(left), *ratios))
+
+    def left_over(luma: Image, differences: list[Image]) -> list[Image]:
+        return [cv2.subtract(d, cv2.multiply(s, luma)) for d, s in zip(differences, slopes, strict=True)]
+
+    join_neighbours(
+        blurred, deconvolution, lambda neighbour: left_over(*_neighbour_differences(neighbour, scale)), scale
+    )
+    for number, (left, slope) in enumerate(zip(left_over(luma, differences), slopes, strict=True)):
+        filtered = deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(left, number), *ratios))
         yield cv2.add(filtered, cv2.multiply(slope, sharp))
+
+
+def _neighbour_differences(neighbour: NeighbourPicture, scale: int) -> tuple[Image, list[Image]]:
+    """Luma of a neighbour's light, and red and blue less it, at the size of the colour differences."""
+    red, green, blue = (_block_means(plane, scale // HALF) for plane in cv2.split(neighbour.half_light))
+    luma = luma_of([red, green, blue])
+    return luma, [cv2.subtract(plane, luma) for plane in (red, blue)]
 
 
 def _slopes_on(luma: Image, differences: list[Image], noise_power: Any, side: int) -> list[Image]:
@@ -134,6 +148,8 @@ def _block_means(plane: Image, side: int) -> Image:
 
     OpenCV is quickest with squares of two pixels, so larger even ones are made of such.
     """
+    if side == 1:
+        return plane
     if side > 2 and side % 2 == 0:
         return _block_means(_block_means(plane, 2), side // 2)
     height, width = plane.shape

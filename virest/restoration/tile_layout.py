@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
+import cv2
 import numpy as np
 
 from virest.degradation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.blurred import BlurredPicture
+from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.settings import RestorationSettings
-from virest.restoration.statistics.on_tiles import on_spectrum, packed
+from virest.restoration.statistics.on_tiles import on_spectrum, packed, packed_frequency
 from virest.restoration.statistics.records import PictureStatistics
 
 Surroundings = tuple[float, int, int]
@@ -99,3 +103,37 @@ def noise_to_signal(
         ratio[0, 0] = mean
     guarded[0, 0] = ratio[0, 0]
     return ratio, guarded
+
+
+def join_neighbours(
+    blurred: BlurredPicture,
+    deconvolution: tiles.TileDeconvolution,
+    channels: Callable[[NeighbourPicture], Sequence[Image]],
+    scale: float = 1.0,
+) -> None:
+    """Add the neighbours to the data term of all tiles; channels: of a neighbour, at the deconvolution's scale.
+
+    Beside clipped light neighbours would hold what is taken out of the frame: such tiles do without them.
+    """
+    if not blurred.neighbours:
+        return
+    centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
+    alone: list[int] = []
+    if blurred.holes is not None:
+        height, width = deconvolution.grid.height, deconvolution.grid.width
+        holes = cv2.resize(blurred.holes, (width, height), interpolation=cv2.INTER_AREA)
+        alone = deconvolution.touched(holes)
+    shared = np.zeros(len(deconvolution.kernels))
+    for one in blurred.neighbours:
+        weights = one.weight_at(centres_px, scale * deconvolution.grid.side / 2)
+        weights[alone] = 0.0
+        kernels = one.field(centres_px).scaled(1 / scale).arrays()
+        kept = _kept_sharpness(one.shift_std_px / scale, deconvolution.size)
+        deconvolution.join(channels(one), kernels, weights, kept)
+        shared += one.shared_noise * weights
+    deconvolution.share_noise(shared)
+
+
+def _kept_sharpness(shift_std_px: float, size: int) -> Image:
+    """What is left on average of a picture that lies this far off, each axis, on a packed spectrum."""
+    return np.exp(-0.5 * (2 * np.pi * shift_std_px * packed_frequency(size)) ** 2)

@@ -16,7 +16,7 @@ from virest.restoration.clipped_light import measured_part
 from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import LEVELS_PER_UNIT, shrinkage_levels
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
-from virest.restoration.statistics.on_tiles import on_spectrum, packed_frequency
+from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.tile_layout import (
     BORDER_NOISE_TO_SIGNAL,
@@ -25,6 +25,7 @@ from virest.restoration.tile_layout import (
     THINNEST_MARGIN,
     UNEVEN_NOISE_TO_SIGNAL,
     Surroundings,
+    join_neighbours,
     luma_tiles,
     noise_to_signal,
 )
@@ -72,31 +73,14 @@ def _tile_factors(
 def _projected_luma(
     blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
 ) -> Image:
-    """Spectra of Kᵀ g, (tiles, size, size), with those of the neighbours; tiles with clipped light are tamed.
-
-    Beside clipped light neighbours would hold what was taken out of the frame: such tiles do without them.
-    """
+    """Spectra of Kᵀ g, (tiles, size, size), with those of the neighbours; tiles with clipped light are tamed."""
     luma, holes = luma_of(blurred.light), blurred.holes
-    alone = deconvolution.touched(holes) if holes is not None and blurred.neighbours else []
-    shared = np.zeros(len(deconvolution.kernels))
-    for one in blurred.neighbours:
-        weights = one.weight_at(deconvolution.grid.centres_px, deconvolution.grid.side / 2)
-        weights[alone] = 0.0
-        kernels = one.field(deconvolution.grid.centres_px).arrays()
-        deconvolution.join(one.light, kernels, weights, _kept_sharpness(one.shift_std_px, deconvolution.size))
-        shared += one.shared_noise * weights
-    if blurred.neighbours:
-        deconvolution.share_noise(shared)
+    join_neighbours(blurred, deconvolution, lambda neighbour: [neighbour.light])
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
         deconvolution.tame(numbers, kernels, luma, measured_part(holes), float(luma.max()))
     return deconvolution.back_projected(luma)
-
-
-def _kept_sharpness(shift_std_px: float, size: int) -> Image:
-    """What is left on average of a picture that lies this far off, each axis, on a packed spectrum."""
-    return np.exp(-0.5 * (2 * np.pi * shift_std_px * packed_frequency(size)) ** 2)
 
 
 def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:

@@ -7,7 +7,7 @@ side, so real filters are plain products.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import repeat
 
@@ -72,8 +72,8 @@ class TileDeconvolution:
         if variance is not None:
             self.powers += variance(self.size)
         self._once: Image | np.float32 = np.float32(1)
-        self._joined: Image | None = None
-        """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra."""
+        self._joined: list[Image] = []
+        """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra of each channel."""
         self._tamed: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
         self._lamps: dict[int, tuple[Image, Image]] = {}
@@ -84,9 +84,10 @@ class TileDeconvolution:
         for power, border in zip(self.powers, self.at_border, strict=True):
             yield (at_border or make)(power) if border else make(power)
 
-    def back_projected(self, channel: Image) -> Image:
+    def back_projected(self, channel: Image, number_joined: int = 0) -> Image:
         """Spectra of Kᵀ g, (tiles, size, size); channel (height, width) is extended, never wrapped.
 
+        number_joined: which of the channels that were joined goes with it.
         Of tamed tiles, g is what they would have recorded without their lamps.
         """
         padded, projected = self.padded(channel), np.empty_like(self.kernels)
@@ -99,28 +100,29 @@ class TileDeconvolution:
             np.multiply(_inner_numbers(spectrum), _inner_numbers(self.kernels[number]), out=inner)
             ends[number] = _ends(spectrum)
         _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
-        if self._joined is not None:
-            projected += self._joined
+        if self._joined:
+            projected += self._joined[number_joined]
             projected *= self._once
         return projected
 
-    def join(self, channel: Image, kernels: Image, weights: NDArray[np.float64], sharpness: Image) -> None:
-        """Take a further picture (height, width) of the same scene into account, with a weight for each tile.
+    def join(self, channels: Sequence[Image], kernels: Image, weights: NDArray[np.float64], sharpness: Image) -> None:
+        """Take a further picture of the same scene into account, channels (height, width) with a weight for each tile.
 
         kernels: (tiles, k, k).  sharpness: what its uncertain place leaves of it on average, a packed real factor;
         the power |K|² stays, as in any expected data term.
         """
-        if self._joined is None:
-            self._joined = np.zeros_like(self.kernels)
-        padded = self.padded(channel)
+        if not self._joined:
+            self._joined = [np.zeros_like(self.kernels) for _ in channels]
+        padded = [self.padded(channel) for channel in channels]
         one = np.empty((self.size, self.size), np.float32)
         tiles = zip(self.grid.corners(), weights.tolist(), _kernel_spectra(kernels, self.size), strict=True)
         for number, ((top, left), weight, kernel) in enumerate(tiles):
             if not weight:
                 continue
-            spectrum = cv2.dft(self.periodic(padded, top, left), self._spectrum)
-            back = cv2.mulSpectrums(spectrum, kernel, 0)
-            cv2.scaleAdd(cv2.multiply(back, sharpness, back), weight, self._joined[number], self._joined[number])
+            for one_padded, joined in zip(padded, self._joined, strict=True):
+                spectrum = cv2.dft(self.periodic(one_padded, top, left), self._spectrum)
+                back = cv2.mulSpectrums(spectrum, kernel, 0)
+                cv2.scaleAdd(cv2.multiply(back, sharpness, back), weight, joined[number], joined[number])
             _power_inside(kernel, one)
             _power_at_ends(kernel[None], one[None])
             cv2.scaleAdd(one, weight, self.powers[number], self.powers[number])
@@ -131,7 +133,7 @@ class TileDeconvolution:
         shared: (tiles,) sum over the further pictures of their weight times that part.  Of n equal pictures whose noise
         is wholly shared the sum tells no more than one, so their sums are divided by n.
         """
-        if self._joined is None:
+        if not self._joined:
             return
         self._once = (1.0 / (1.0 + shared)).astype(np.float32)[:, None, None]
         self.powers *= self._once

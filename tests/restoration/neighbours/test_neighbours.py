@@ -103,6 +103,27 @@ def test_frames_restored_together_are_better_than_each_alone(simulated):
     assert joint.mean() > single.mean() + 0.5
 
 
+def test_colour_is_restored_together_too(simulated):
+    """What neighbours bring to the colour differences comes on top of what they bring to the luma."""
+    capture = simulated(rate_rad_s=2.4, bitrate_bits_per_px=2.0)
+    plan = replace(capture.plan(PRESETS["best"]), confirmed=None)
+
+    def colour_error() -> float:
+        errors = []
+        for restored in capture.restored(plan):
+            left, top, right, bottom = restored.valid_px
+            error = restored.picture.astype(float) - capture.truth(restored.frame.index)
+            error = (error - (error @ (0.299, 0.587, 0.114))[..., None])[top:bottom, left:right]
+            errors.append(np.mean(error[16:-16, 16:-16] ** 2))
+        return float(np.mean(errors))
+
+    joint = colour_error()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("virest.restoration.colour.join_neighbours", lambda *_: None)
+        alone = colour_error()
+    assert joint < 0.95 * alone
+
+
 def test_a_neighbour_that_shows_something_else_is_left_out(simulated):
     """A picture of another scene in a neighbour's place takes nothing away from the frame."""
     capture = simulated()

@@ -34,6 +34,8 @@ LEAST_SHIFTS = 6
 LOOKED_AT = 6
 """Places at which a neighbour's kernels are looked at for what it may bring."""
 HUBER, ROBUST_STEPS = 1.5, 6
+HALF = 2
+"""Colour is brought at this many times less resolution: a movie stores no more of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,8 @@ class NeighbourPicture:
     """Index in the movie."""
     light: Image
     """(height, width) luma of its light, as bright as the frame's."""
+    half_light: Image
+    """(height / 2, width / 2, 3), rounded up: its light in colour, as bright as the frame's."""
     field: Callable[[Array], KernelField]
     """Its kernels at centres in the frame."""
     places_px: Array
@@ -79,9 +83,16 @@ class NeighbourPicture:
 
 
 def neighbour_picture(
-    view: NeighbourView, number: int, light: Image, agreement: TileAgreement, independent_error: float
+    view: NeighbourView,
+    number: int,
+    light: Image,
+    half_light: Image,
+    agreement: TileAgreement,
+    independent_error: float,
 ) -> NeighbourPicture | None:
-    """Bring a neighbour's light (height, width) to the frame's pixels; None where it does not fit.
+    """Bring a neighbour's luma of light (height, width), and its light at half that size, to the frame's pixels.
+
+    None where it does not fit.
 
     independent_error: what the frame's noise would make them differ by if the neighbour had none of it.
 
@@ -94,6 +105,7 @@ def neighbour_picture(
     height, width = light.shape
     source = view.map_px(lambda points_px: points_px - _at(affine, points_px))
     brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     noise = float(np.median(agreement.error[used]))
     expected = independent_error + OWN_ERROR * agreement.signal
     weights = np.where(used, expected / np.maximum(agreement.error, expected), 0.0)
@@ -102,12 +114,21 @@ def neighbour_picture(
     return NeighbourPicture(
         number,
         brought / np.float32(agreement.gain),
+        brought_half / np.float32(agreement.gain),
         view.field(),
         agreement.centres_px,
         np.where(inside, weights, 0.0),
         std_px,
         float(np.clip(1 - noise / independent_error, 0.0, 1.0)),
     )
+
+
+def _halved(source_px: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A map (height, width, 2) between pictures of half the size, sides rounded up."""
+    height, width = source_px.shape[:2]
+    even = cv2.copyMakeBorder(source_px, 0, height % HALF, 0, width % HALF, cv2.BORDER_REPLICATE)
+    small = cv2.resize(even, (-(-width // HALF), -(-height // HALF)), interpolation=cv2.INTER_AREA)
+    return (small + np.float32(0.5)) / np.float32(HALF) - np.float32(0.5)
 
 
 def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array, float]:

@@ -18,7 +18,7 @@ from virest.degradation.neighbour import neighbour_view
 from virest.degradation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
-from virest.restoration.neighbours.joint import NeighbourPicture, neighbour_picture
+from virest.restoration.neighbours.joint import HALF, NeighbourPicture, neighbour_picture
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import PairTurn, pair_turn, reduced_light, tile_agreement
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
@@ -104,7 +104,7 @@ class FrameNeighbours:
             level = 255 * float(curve.encode(np.array(agreement.light)))
             slope = float(np.interp(level, np.arange(256), curve.slope_table()))
             error = agreement.expected_error(luma.frequency, luma.noise, slope)
-            found.append(neighbour_picture(view, other.frame.index, _luma_light(other), agreement, error))
+            found.append(neighbour_picture(view, other.frame.index, *_luma_and_half(other), agreement, error))
         return tuple(one for one in found if one is not None and one.weights.any())
 
     def _turn(self, first: Sight, second: Sight) -> PairTurn | None:
@@ -135,12 +135,20 @@ def light_of(sight: Sight) -> Image:
     return reduced_light(luma, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
 
 
-def _luma_light(sight: Sight) -> Image:
-    """Luma of a frame's light, (height, width)."""
+def _luma_and_half(sight: Sight) -> tuple[Image, Image]:
+    """Luma of a frame's light, (height, width), and its light at half the size, (height / 2, width / 2, 3)."""
     assert sight.motion is not None
     light = cv2.LUT(sight.picture, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
     weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
-    return np.asarray(cv2.transform(light, weights), np.float32)
+    height, width = light.shape[:2]
+    size = (-(-width // HALF), -(-height // HALF))
+    even = (
+        cv2.copyMakeBorder(light, 0, height % HALF, 0, width % HALF, cv2.BORDER_REPLICATE)
+        if height % HALF or width % HALF
+        else light
+    )
+    half = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.transform(light, weights), np.float32), half
 
 
 @lru_cache(maxsize=4)
