@@ -79,11 +79,16 @@ class NeighbourPicture:
 
 
 def neighbour_picture(
-    view: NeighbourView, number: int, light: Image, agreement: TileAgreement, independent_error: float
+    view: NeighbourView,
+    field: Callable[[Array], KernelField],
+    number: int,
+    light: Image,
+    agreement: TileAgreement,
+    independent_error: float,
 ) -> NeighbourPicture | None:
     """Bring a neighbour's light (height, width) to the frame's pixels; None where it does not fit.
 
-    independent_error: what the frame's noise would make them differ by if the neighbour had none of it.
+    field: of its kernels, from the view.  independent_error: what the frame's noise would make them differ by if the neighbour had none of it.
 
     What is left between the two after the predicted motion is a smooth field, affine over the picture.
     """
@@ -102,7 +107,7 @@ def neighbour_picture(
     return NeighbourPicture(
         number,
         brought / np.float32(agreement.gain),
-        view.field(),
+        field,
         agreement.centres_px,
         np.where(inside, weights, 0.0),
         std_px,
