@@ -69,6 +69,11 @@ _LEAST_FALL = 2.0
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
+NeighbourFinder = Callable[
+    [PictureStatistics, Callable[[NDArray[np.float64]], KernelField]], tuple[NeighbourPicture, ...]
+]
+"""Neighbours to restore a frame with, by what was measured on its luma and by its kernels."""
+
 
 @dataclass(frozen=True, slots=True)
 class RestoredFrame:
@@ -101,7 +106,7 @@ def restore_frame(
     seen: RowMotion | None = None,
     refined: RefinedMotion | None = None,
     confirmed: ConfirmedGain | None = None,
-    neighbours: Callable[[PictureStatistics], tuple[NeighbourPicture, ...]] | None = None,
+    neighbours: NeighbourFinder | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
@@ -323,7 +328,7 @@ def _deblurred(
     light: FrameLight | None,
     covariance_px2: NDArray[np.float64],
     confirmed: ConfirmedGain | None,
-    neighbours: Callable[[PictureStatistics], tuple[NeighbourPicture, ...]] | None = None,
+    neighbours: NeighbourFinder | None = None,
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
@@ -341,7 +346,7 @@ def _deblurred(
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    joined = neighbours(luma) if neighbours is not None and light is None and anchor == 0.5 else ()
+    joined = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
     longest_px = max((longest_px, *(one.longest_px for one in joined)))
     if joined:
         shared = sum(float(one.weights.mean()) * one.shared_noise for one in joined)

@@ -113,15 +113,14 @@ class TileDeconvolution:
         """
         if not self._joined:
             self._joined = [np.zeros_like(self.kernels) for _ in channels]
-        padded = [self.padded(channel) for channel in channels]
-        one = np.empty((self.size, self.size), np.float32)
-        tiles = zip(self.grid.corners(), weights.tolist(), _kernel_spectra(kernels, self.size), strict=True)
-        for number, ((top, left), weight, kernel) in enumerate(tiles):
-            if not weight:
-                continue
-            for one_padded, joined in zip(padded, self._joined, strict=True):
-                spectrum = cv2.dft(self.periodic(one_padded, top, left), self._spectrum)
-                back = cv2.mulSpectrums(spectrum, kernel, 0)
+        used = np.flatnonzero(weights)
+        padded, corners = [self.padded(channel) for channel in channels], list(self.grid.corners())
+        one, back = np.empty((2, self.size, self.size), np.float32)
+        for number, kernel in zip(used.tolist(), _kernel_spectra(kernels[used], self.size), strict=True):
+            for plane, joined in zip(padded, self._joined, strict=True):
+                spectrum, weight = cv2.dft(self.periodic(plane, *corners[number]), self._spectrum), weights[number]
+                np.multiply(_inner_numbers(spectrum), _inner_numbers(kernel), out=_inner_numbers(back))
+                _ends(back)[:] = _ends_product(np.array(_ends(spectrum)), np.array(_ends(kernel)))
                 cv2.scaleAdd(cv2.multiply(back, sharpness, back), weight, joined[number], joined[number])
             _power_inside(kernel, one)
             _power_at_ends(kernel[None], one[None])

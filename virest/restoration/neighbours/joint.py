@@ -84,6 +84,7 @@ class NeighbourPicture:
 
 def neighbour_picture(
     view: NeighbourView,
+    field: Callable[[Array], KernelField],
     number: int,
     light: Image,
     half_light: Image,
@@ -94,7 +95,8 @@ def neighbour_picture(
 
     None where it does not fit.
 
-    independent_error: what the frame's noise would make them differ by if the neighbour had none of it.
+    field: of its kernels, from the view.  independent_error: what the frame's noise would make them differ by if the
+    neighbour had none of it.
 
     What is left between the two after the predicted motion is a smooth field, affine over the picture.
     """
@@ -115,7 +117,7 @@ def neighbour_picture(
         number,
         brought / np.float32(agreement.gain),
         brought_half / np.float32(agreement.gain),
-        view.field(),
+        field,
         agreement.centres_px,
         np.where(inside, weights, 0.0),
         std_px,

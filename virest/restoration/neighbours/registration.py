@@ -7,6 +7,7 @@ their spectra agree best (Kuglin & Hines 1975), from low frequencies to high one
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from virest.degradation.blur import Image
-from virest.degradation.kernels import smooth_field
+from virest.degradation.kernels import KernelField, smooth_field
 from virest.degradation.neighbour import NeighbourView, turn_jacobian_px
 
 Array = NDArray[np.float64]
@@ -75,20 +76,60 @@ def reduced_light(luma: NDArray[np.uint8], light: NDArray[np.float32]) -> Image:
     return cv2.LUT(small, light)
 
 
+@dataclass(frozen=True, slots=True)
+class FrameTiles:
+    """Tiles of a reduced frame and their kernels, to be compared with those of any of its neighbours."""
+
+    tops_lefts: NDArray[np.intp]
+    """(n, 2) in the reduced picture."""
+    times: float
+    """How many times smaller that is."""
+    means: Array
+    """(n,) of the light."""
+    brightest: Array
+    """(n,) of the light."""
+    spectra: NDArray[np.complex64]
+    """(n, TILE, TILE / 2 + 1) of the light over its mean."""
+    kernels: NDArray[np.complex64]
+    """(n, TILE, TILE / 2 + 1) transposes of the kernels."""
+
+    @property
+    def centres_px(self) -> Array:
+        """(n, 2) in the recorded picture."""
+        return _full_px(self.tops_lefts, self.times, (TILE - 1) / 2)
+
+
+def frame_tiles(
+    light: Image, height: int, field: Callable[[Array], KernelField], everywhere: bool = False
+) -> FrameTiles | None:
+    """Tiles of a frame's light, from :func:`reduced_light`; None where a path does not fit into a tile.
+
+    height: of the recorded picture.  everywhere: tiles all over the picture instead of a few.
+    """
+    times = height / light.shape[0]
+    tops_lefts = _tiles(*light.shape, light.size if everywhere else MOST_TILES)
+    kernels = _kernel_spectra(field, tops_lefts, times)
+    if kernels is None:
+        return None
+    tiles = _cut(light, tops_lefts)
+    return FrameTiles(tops_lefts, times, tiles.mean(axis=(1, 2)), tiles.max(axis=(1, 2)), _spectra(tiles), kernels)
+
+
 def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | None:
     """The turn rate missing between two frames; None where they do not show it.
 
     first, second: from :func:`reduced_light`, of the view's frame and its neighbour.
     """
-    times = view.frame.profile.height / first.shape[0]
-    tops_lefts = _tiles(*first.shape)
-    kernels = _kernel_spectra(view, tops_lefts, times)
-    if kernels is None:
+    tiles = frame_tiles(first, view.frame.profile.height, smooth_field(view.frame, view.anchor))
+    if tiles is None:
         return None
-    a = _spectra(_cut(first, tops_lefts)) * kernels[1]
-    apart = np.zeros(2)
+    tops_lefts, times = tiles.tops_lefts, tiles.times
+    there = _kernel_spectra(view.field(), tops_lefts, times)
+    if there is None:
+        return None
+    a, apart = tiles.spectra * there, np.zeros(2)
     for _ in range(2):
-        b = _spectra(_seen(view, second, tops_lefts, apart, times)) * kernels[0]
+        b = _spectra(_seen(view, second, tops_lefts, apart, times)) * tiles.kernels
         common = _common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
             break
@@ -125,30 +166,35 @@ class TileAgreement:
 
         noise: (rings,) power in grey levels at frequencies in cycles per recorded pixel.  slope: grey levels per light.
         """
-        wx, wy = _frequencies()
-        recorded = np.hypot(wx, wy) / (2 * np.pi * self.times)
+        recorded = _radii() / self.times
         power = np.interp(recorded, frequency, noise) / (self.times * slope * max(self.light, 1e-6)) ** 2
         return float(np.mean(self.passed * power) * (_window() ** 2).sum())
 
 
-def tile_agreement(view: NeighbourView, first: Image, second: Image) -> TileAgreement | None:
-    """Compare all tiles of two reduced pictures; None where a path does not fit into a tile."""
-    times = view.frame.profile.height / first.shape[0]
-    tops_lefts = _tiles(first.shape[0], first.shape[1], first.size)
-    kernels = _kernel_spectra(view, tops_lefts, times)
+def tile_agreement(
+    view: NeighbourView, tiles: FrameTiles, field: Callable[[Array], KernelField], second: Image
+) -> TileAgreement | None:
+    """Compare a frame's tiles with its neighbour's reduced picture; None where a path does not fit into a tile.
+
+    field: of the neighbour's kernels, from the view.
+    """
+    kernels = _kernel_spectra(field, tiles.tops_lefts, tiles.times)
     if kernels is None:
         return None
-    here, there = _cut(first, tops_lefts), _seen(view, second, tops_lefts, np.zeros(2), times)
-    a, b = _spectra(here) * kernels[1], _spectra(there) * kernels[0]
+    there = _seen(view, second, tiles.tops_lefts, np.zeros(2), tiles.times)
+    a, b = tiles.spectra * kernels, _spectra(there) * tiles.kernels
     shift, precision = _tile_shifts(a, b, np.zeros(2))
-    wx, wy = _frequencies()
-    ahead = shift[:, 0, None, None].astype(np.float32) * wx + shift[:, 1, None, None].astype(np.float32) * wy
-    error = (np.abs(a * np.exp(1j * ahead) - b) ** 2).mean(axis=(1, 2))
-    gain = float(np.median(there.mean(axis=(1, 2)) / np.maximum(here.mean(axis=(1, 2)), 1e-6)))
-    centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)
-    passed = sum((np.abs(kernel) ** 2).mean(axis=0) for kernel in kernels)
-    signal, light = (np.abs(b) ** 2).mean(axis=(1, 2)), float(np.median(here.mean(axis=(1, 2))))
-    return TileAgreement(centres_px, shift * times, precision, error, signal, gain, light, np.asarray(passed), times)
+    return TileAgreement(
+        tiles.centres_px,
+        shift * tiles.times,
+        precision,
+        _difference(a, b, shift),
+        _power(b).mean(axis=(1, 2)),
+        float(np.median(there.mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
+        float(np.median(tiles.means)),
+        np.asarray(_power(tiles.kernels).mean(axis=0) + _power(kernels).mean(axis=0)),
+        tiles.times,
+    )
 
 
 def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Image) -> tuple[float, float] | None:
@@ -159,22 +205,30 @@ def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Ima
     """
     times = view.frame.profile.height / first.shape[0]
     tops_lefts = _tiles(*first.shape)
-    kernels = _kernel_spectra(view, tops_lefts, times)
+    kernels = _kernel_spectra(view.field(), tops_lefts, times)
     if kernels is None:
         return None
     there = _seen(view, second, tops_lefts, np.zeros(2), times)
     b, left = _spectra(there), []
     used = np.maximum(_cut(first, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT
     for picture in (first, sharp):
-        a = _spectra(_cut(picture, tops_lefts)) * kernels[1]
+        a = _spectra(_cut(picture, tops_lefts)) * kernels
         shift, precision = _tile_shifts(a, b, np.zeros(2))
         used &= precision > 0
-        wx, wy = _frequencies()
-        ahead = shift[:, 0, None, None] * wx + shift[:, 1, None, None] * wy
-        left.append((np.abs(a * np.exp(1j * ahead) - b) ** 2).mean(axis=(1, 2)))
+        left.append(_difference(a, b, shift))
     if np.count_nonzero(used) < LEAST_TILES:
         return None
     return float(left[0][used].mean()), float(left[1][used].mean())
+
+
+def _difference(a: NDArray[np.complex64], b: NDArray[np.complex64], shift: Array) -> Array:
+    """(n,) mean squares between spectra (n, TILE, TILE / 2 + 1) once the first are shifted onto the second."""
+    along, down = (np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64) for d, f in zip(shift.T, _axes(), strict=True))
+    return np.asarray(_power(a * along[:, None, :] * down[:, :, None] - b).mean(axis=(1, 2)), np.float64)
+
+
+def _power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
+    return spectra.real**2 + spectra.imag**2
 
 
 def _tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
@@ -196,23 +250,19 @@ def _full_px(tops_lefts: NDArray[np.intp], times: float, at: float) -> Array:
 
 
 def _kernel_spectra(
-    view: NeighbourView, tops_lefts: NDArray[np.intp], times: float
-) -> list[NDArray[np.complex64]] | None:
-    """Transposes of the kernels of the frame and of its neighbour, (n, TILE, TILE / 2 + 1) each.
+    field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: float
+) -> NDArray[np.complex64] | None:
+    """Transposes of the kernels at tiles' centres, (n, TILE, TILE / 2 + 1).
 
     None where a path does not fit into half a tile.
     """
-    centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)
-    found = []
-    for field in (smooth_field(view.frame, view.anchor), view.field()):
-        kernels = field(centres_px).scaled(1 / times)
-        radius = kernels.radius_px
-        if 2 * radius + 1 > TILE // 2:
-            return None
-        padded = np.zeros((len(centres_px), TILE, TILE), np.float32)
-        padded[:, : 2 * radius + 1, : 2 * radius + 1] = kernels.arrays()
-        found.append(np.conj(fft.rfft2(np.roll(padded, (-radius, -radius), (1, 2)))))
-    return found
+    kernels = field(_full_px(tops_lefts, times, (TILE - 1) / 2)).scaled(1 / times)
+    radius = kernels.radius_px
+    if 2 * radius + 1 > TILE // 2:
+        return None
+    padded = np.zeros((len(tops_lefts), TILE, TILE), np.float32)
+    padded[:, : 2 * radius + 1, : 2 * radius + 1] = kernels.arrays()
+    return np.asarray(np.conj(fft.rfft2(np.roll(padded, (-radius, -radius), (1, 2)))))
 
 
 def _cut(picture: Image, tops_lefts: NDArray[np.intp]) -> Image:
@@ -248,11 +298,27 @@ def _window() -> Image:
     return np.outer(hann, hann).astype(np.float32)
 
 
+def _axes() -> tuple[Array, Array]:
+    """Frequencies along and down of half a spectrum (TILE, TILE / 2 + 1), cycles per pixel."""
+    return np.fft.rfftfreq(TILE), np.fft.fftfreq(TILE)
+
+
 @lru_cache(maxsize=1)
-def _frequencies() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """2π f_x and 2π f_y, radians per pixel, over half a spectrum (TILE, TILE / 2 + 1)."""
-    fx, fy = np.meshgrid(np.fft.rfftfreq(TILE), np.fft.fftfreq(TILE))
-    return (2 * np.pi * fx).astype(np.float32), (2 * np.pi * fy).astype(np.float32)
+def _radii() -> Array:
+    """Distance from zero over half a spectrum, cycles per pixel."""
+    along, down = _axes()
+    return np.hypot(*np.meshgrid(along, down))
+
+
+@lru_cache(maxsize=1)
+def _looked_at() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
+    """Places of half a spectrum whose phases are looked at, by rising frequency; 2π f there, (2, m); and how many of
+    them each of CUTOFFS takes."""
+    radius = _radii().ravel()
+    order = np.argsort(radius, kind="stable")
+    order = order[(radius[order] > 1 / TILE) & (radius[order] <= CUTOFFS[-1])]
+    waves = 2 * np.pi * np.stack([f.ravel()[order] for f in np.meshgrid(*_axes())]).astype(np.float32)
+    return order, waves, tuple(int(n) for n in np.searchsorted(radius[order], CUTOFFS, side="right"))
 
 
 def _common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
@@ -267,30 +333,28 @@ def _common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
 
 def _tile_shifts(a: NDArray[np.complex64], b: NDArray[np.complex64], start_px: Array) -> tuple[Array, Array]:
     """Shifts (n, 2) of tiles and their precision (n,), 1 / px², by the phases' scatter; 0: it shows something else."""
-    wx, wy = _frequencies()
-    product, shift = np.conj(a) * b, np.tile(start_px, (len(a), 1))
-    radius = np.hypot(wx, wy) / (2 * np.pi)
-    size = np.abs(product)
-    for cutoff in CUTOFFS:
-        weight = size * ((radius <= cutoff) & (radius > 1 / TILE))
-        phase = _left(product, shift, wx, wy)
-        weight = weight * np.maximum(np.cos(phase), 0)
-        xx, xy, yy = (np.einsum("nij,ij->n", weight, w) for w in (wx * wx, wx * wy, wy * wy))
-        x, y = (np.einsum("nij,ij->n", weight * phase, w) for w in (wx, wy))
+    places, waves, counts = _looked_at()
+    product = np.conj(a.reshape(len(a), -1)[:, places]) * b.reshape(len(b), -1)[:, places]
+    size, phase, shift = np.abs(product), np.angle(product), np.tile(start_px, (len(a), 1))
+    squares = np.stack([waves[0] ** 2, waves[0] * waves[1], waves[1] ** 2], -1)
+    for count in counts:
+        left = _left(phase[:, :count], shift, waves[:, :count])
+        weight = size[:, :count] * np.maximum(np.cos(left), 0)
+        xx, xy, yy = (weight @ squares[:count]).T.astype(float)
+        x, y = ((weight * left) @ waves[:, :count].T).T.astype(float)
         determinant = np.maximum(xx * yy - xy * xy, 1e-3 * (xx + yy) ** 2 + 1e-20)
         shift += np.stack([(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant], -1)
-    inside = (radius <= CUTOFFS[-1]) & (radius > 1 / TILE)
-    turned = size * np.cos(_left(product, shift, wx, wy)) * inside
-    coherence = turned.sum((1, 2)) / np.maximum((size * inside).sum((1, 2)), 1e-20)
+    total = np.maximum(size.sum(axis=1, dtype=float), 1e-20)
+    coherence = (size * np.cos(_left(phase, shift, waves))).sum(axis=1, dtype=float) / total
     scatter = np.maximum(1 - coherence**2, 1e-4) / np.maximum(coherence**2, 1e-4)
-    narrow = determinant / np.maximum(xx + yy, 1e-20) / np.maximum((size * inside).sum((1, 2)), 1e-20)
+    narrow = determinant / np.maximum(xx + yy, 1e-20) / total
     return shift, np.where(coherence > LEAST_COHERENCE, narrow / scatter, 0.0)
 
 
-def _left(product: NDArray[np.complex64], shift: Array, wx: Image, wy: Image) -> NDArray[np.float32]:
-    """Phases (n, ...) that shifts (n, 2) leave."""
-    ahead = shift[:, 0, None, None].astype(np.float32) * wx + shift[:, 1, None, None].astype(np.float32) * wy
-    return np.angle(product * np.exp(-1j * ahead))
+def _left(phase: NDArray[np.float32], shift: Array, waves: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Phases (n, m) that shifts (n, 2) leave, within a half turn."""
+    left = phase - shift.astype(np.float32) @ waves
+    return np.asarray(left - np.float32(2 * np.pi) * np.rint(left * np.float32(0.5 / np.pi)), np.float32)
 
 
 def _turn(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import Image
+from virest.degradation.kernels import KernelField
 from virest.degradation.neighbour import neighbour_view
 from virest.degradation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.joint import HALF, NeighbourPicture, neighbour_picture
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
-from virest.restoration.neighbours.registration import PairTurn, pair_turn, reduced_light, tile_agreement
+from virest.restoration.neighbours.registration import PairTurn, frame_tiles, pair_turn, reduced_light, tile_agreement
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
 
@@ -75,6 +76,7 @@ class FrameNeighbours:
         """lens: of the whole trajectory.  missing: what the capture usually lacks; None: nothing."""
         self._trajectory, self._lens, self._missing = trajectory, lens, missing
         self._light: dict[int, Image] = {}
+        self._full: dict[int, tuple[Image, Image]] = {}
         self._turns: dict[int, PairTurn | None] = {}
 
     def refined(self, before: Sequence[Sight], here: Sight, after: Sequence[Sight]) -> RefinedMotion | None:
@@ -87,24 +89,33 @@ class FrameNeighbours:
         return self._missing.refined(here.motion, *turns)
 
     def pictures(
-        self, around: Sequence[Sight], here: Sight, refined: RefinedMotion | None, luma: PictureStatistics
+        self,
+        around: Sequence[Sight],
+        here: Sight,
+        refined: RefinedMotion | None,
+        luma: PictureStatistics,
+        field: Callable[[NDArray[np.float64]], KernelField],
     ) -> tuple[NeighbourPicture, ...]:
-        """The usable ones of a frame's neighbours, brought to its pixels; luma: what was measured on the frame's."""
+        """The usable ones of a frame's neighbours, brought to its pixels.
+
+        luma: what was measured on the frame's.  field: of its kernels.
+        """
         assert here.motion is not None
-        curve = here.motion.profile.response or ResponseCurve("srgb")
-        found = []
+        height, curve = here.motion.profile.height, here.motion.profile.response or ResponseCurve("srgb")
+        tiles = frame_tiles(self._light_of(here), height, field, everywhere=True)
+        turn, found = None if refined is None else refined.turn, []
         for other in around:
-            if not other.usable or other.motion is None or other.frame.index == here.frame.index:
+            if tiles is None or not other.usable or other.motion is None or other.frame.index == here.frame.index:
                 continue
-            turn = None if refined is None else refined.turn
             view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, turn=turn)
-            agreement = tile_agreement(view, self._light_of(here), self._light_of(other))
+            along = view.field()
+            agreement = tile_agreement(view, tiles, along, self._light_of(other))
             if agreement is None:
                 continue
             level = 255 * float(curve.encode(np.array(agreement.light)))
             slope = float(np.interp(level, np.arange(256), curve.slope_table()))
             error = agreement.expected_error(luma.frequency, luma.noise, slope)
-            found.append(neighbour_picture(view, other.frame.index, *_luma_and_half(other), agreement, error))
+            found.append(neighbour_picture(view, along, other.frame.index, *self._full_of(other), agreement, error))
         return tuple(one for one in found if one is not None and one.weights.any())
 
     def _turn(self, first: Sight, second: Sight) -> PairTurn | None:
@@ -122,8 +133,13 @@ class FrameNeighbours:
             self._light[sight.frame.index] = light_of(sight)
         return self._light[sight.frame.index]
 
+    def _full_of(self, sight: Sight) -> tuple[Image, Image]:
+        if sight.frame.index not in self._full:
+            self._full[sight.frame.index] = _luma_and_half(sight)
+        return self._full[sight.frame.index]
+
     def _forget_before(self, number: int) -> None:
-        for kept in (self._light, self._turns):
+        for kept in (self._light, self._full, self._turns):
             for old in [n for n in kept if n < number]:
                 del kept[old]  # type: ignore[attr-defined]
 
