@@ -63,6 +63,8 @@ def compose_settings(file: Path | None, **options: Any) -> RestorationSettings:
     """Preset, then file, then options; an option of None is not set."""
     content = read_settings(file) if file else {}
     chosen = {name: value for name, value in options.items() if value is not None}
+    if "neighbours" in chosen:
+        chosen["most_joined"] = 2 * chosen["neighbours"]
     preset = chosen.get("preset") or content.get("preset") or "balanced"
     if preset not in PRESETS:
         raise SettingsError(f"preset '{preset}' is unknown", hint=f"choose from {', '.join(PRESETS)}")

@@ -72,7 +72,7 @@ class RestorationPlan:
         return max(joined, 0 if self.missing_turn is None else 1)
 
     def joined(self, before: Sequence[Sight], after: Sequence[Sight]) -> tuple[Sight, ...]:
-        """Those of a frame's neighbours that are restored with it, in order."""
+        """Those of a frame's neighbours that it may be restored with, in order."""
         count = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
         return (*before[max(len(before) - count, 0) :], *after[:count]) if count else ()
 
@@ -135,7 +135,9 @@ def restore_frames(
         refined, pictures = None, None
         if neighbours is not None:
             refined = neighbours.refined(before, here, after)
-            pictures = partial(neighbours.pictures, plan.joined(before, after), here, refined)
+            pictures = partial(
+                neighbours.pictures, plan.joined(before, after), here, refined, plan.settings.most_joined
+            )
         yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures)
 
 

@@ -28,7 +28,7 @@ from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.neighbours.confirmation import ConfirmedGain
-from virest.restoration.neighbours.joint import NeighbourPicture
+from virest.restoration.neighbours.joint import NeighbourPicture, worth_joining
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
@@ -346,13 +346,13 @@ def _deblurred(
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    joined = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
-    longest_px = max((longest_px, *(one.longest_px for one in joined)))
-    if joined:
-        shared = sum(float(one.weights.mean()) * one.shared_noise for one in joined)
-        promised_db = luma_model.joint_gain_db(np.sum([one.passed() for one in joined], axis=0), shared)
+    found = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
+    joined = worth_joining(found, luma_model)
+    longest_px = max((longest_px, *(one.longest_px for one in joined.pictures)))
+    if joined.pictures:
+        promised_db = luma_model.joint_gain_db(joined.passed, joined.shared)
         expected_db = promised_db if confirmed is None else confirmed.expected_db(promised_db)
-    blurred = replace(blurred, spread=spread, neighbours=joined, longest_px=longest_px)
+    blurred = replace(blurred, spread=spread, neighbours=joined.pictures, longest_px=longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
     recorded = picture
@@ -377,7 +377,7 @@ def _deblurred(
         "expected_gain_std_db": None if confirmed is None else confirmed.std_db,
         "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
-        "neighbours": [{"frame": one.number, "weight": float(one.weights.mean())} for one in joined],
+        "neighbours": [{"frame": one.number, "weight": float(one.weights.mean())} for one in joined.pictures],
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }

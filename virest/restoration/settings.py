@@ -43,7 +43,9 @@ class RestorationSettings:
     min_blur_px: float = 1.0
     """Frames whose longest blur path is shorter are not deblurred."""
     neighbours: int = 0
-    """Neighbours on each side that a frame is restored together with."""
+    """A frame may be restored together with any of this many frames on each side."""
+    most_joined: int = 6
+    """It is restored with at most this many of them, those that make up for what its own path cancels."""
     keep_start_up: bool = False
     """Process the frames of the recorder's start-up too, although their content is later than their stamps."""
 
@@ -51,7 +53,7 @@ class RestorationSettings:
 PRESETS: dict[str, RestorationSettings] = {
     "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=176, strength=0.8),
     "balanced": RestorationSettings(
-        "balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=1
+        "balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3, most_joined=2
     ),
     "best": RestorationSettings("best", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3),
 }

@@ -9,7 +9,7 @@ things that move, parallax, shadows.  Its weight is the frame's noise over that.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,6 +20,7 @@ from virest.degradation.blur import Image
 from virest.degradation.kernels import KernelField
 from virest.degradation.neighbour import NeighbourView
 from virest.restoration.neighbours.registration import TileAgreement
+from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 from virest.restoration.statistics.tile_power import passed_power
 
@@ -64,15 +65,14 @@ class NeighbourPicture:
         """Longest of its blur paths where its weights hold."""
         return float(self.field(self.places_px).length_px.max())
 
-    def passed(self) -> Array:
-        """(RINGS,) mean |K|² over some of the places, times the mean weight."""
+    def passed(self, frequency: Array) -> Array:
+        """(RINGS,) mean |K|² over some of the places, times the mean weight and what its uncertain place leaves of it.
+
+        frequency: (RINGS,) cycles per pixel.
+        """
         some = np.linspace(0, len(self.places_px) - 1, min(len(self.places_px), LOOKED_AT)).round().astype(int)
-        kernels = self.field(self.places_px[some]).arrays()
-        if kernels.shape[1] > SIDE:
-            return np.zeros(RINGS)
-        power = np.mean([passed_power(kernel) for kernel in kernels], axis=0)
-        counts = np.maximum(np.bincount(place_ring().ravel(), minlength=RINGS), 1)
-        return np.asarray(self.weights.mean() * np.bincount(place_ring().ravel(), power.ravel(), RINGS) / counts)
+        sharpness = np.exp(-((2 * np.pi * self.shift_std_px * frequency) ** 2))
+        return np.asarray(self.weights.mean() * sharpness * rings_passed(self.field(self.places_px[some])))
 
     def weight_at(self, centres_px: Array, half_side_px: float) -> Array:
         """(m,) least weight near each centre: within half a tile's side, and at the nearest place."""
@@ -123,6 +123,65 @@ def neighbour_picture(
         std_px,
         float(np.clip(1 - noise / independent_error, 0.0, 1.0)),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class JoinedNeighbours:
+    """Those of a frame's neighbours that it is restored with, and what they bring by the spectra."""
+
+    pictures: tuple[NeighbourPicture, ...]
+    passed: Array
+    """(RINGS,) sum of their |K|², weighted."""
+    shared: float
+    """Sum of their weights times the part of the noise that they have in common with the frame."""
+
+
+def worth_joining(found: Sequence[NeighbourPicture], luma: PictureStatistics) -> JoinedNeighbours:
+    """Choose neighbours one by one, each time the one that leaves least wrong by the ideal linear filter.
+
+    Those that lose the same frequencies and repeat the frame's noise bring nothing but the error of their place.
+    luma: measured on the frame.
+    """
+    found_passed = [one.passed(luma.frequency) for one in found]
+    found_shared = [float(one.weights.mean()) * one.shared_noise for one in found]
+    taken = most_telling(found_passed, found_shared, luma, len(found))
+    passed = np.sum([np.zeros(RINGS), *(found_passed[k] for k in taken)], axis=0)
+    return JoinedNeighbours(tuple(found[k] for k in taken), passed, sum(found_shared[k] for k in taken))
+
+
+def most_telling(passed: Sequence[Array], shared: Sequence[float], luma: PictureStatistics, most: int) -> list[int]:
+    """Numbers, in order, of at most ``most`` further pictures: one by one that which leaves least wrong.
+
+    By the ideal linear filter and the rings' spectra; the choice ends where the next one would leave more.
+
+    passed: (RINGS,) weighted |K|² of each.  shared: its weight times the part of the frame's noise that it repeats.
+    luma: measured on the frame.
+    """
+    taken: list[int] = []
+    sum_passed, sum_shared = np.zeros(RINGS), 0.0
+    error = luma.joint_error(sum_passed, sum_shared) if luma.measured else 0.0
+    while len(taken) < min(most, len(passed)):
+        errors = {
+            k: luma.joint_error(sum_passed + passed[k], sum_shared + shared[k])
+            for k in range(len(passed))
+            if k not in taken
+        }
+        best = min(errors, key=errors.__getitem__)
+        if errors[best] >= error:
+            break
+        taken.append(best)
+        error, sum_passed, sum_shared = errors[best], sum_passed + passed[best], sum_shared + shared[best]
+    return sorted(taken)
+
+
+def rings_passed(kernels: KernelField) -> Array:
+    """(RINGS,) mean |K|² of some kernels; 0 where one does not fit into a measured tile."""
+    arrays = kernels.arrays()
+    if arrays.shape[1] > SIDE:
+        return np.zeros(RINGS)
+    power = np.mean([passed_power(kernel) for kernel in arrays], axis=0)
+    counts = np.maximum(np.bincount(place_ring().ravel(), minlength=RINGS), 1)
+    return np.asarray(np.bincount(place_ring().ravel(), power.ravel(), RINGS) / counts)
 
 
 def _halved(source_px: NDArray[np.float32]) -> NDArray[np.float32]:

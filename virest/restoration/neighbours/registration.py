@@ -223,7 +223,9 @@ def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Ima
 
 def _difference(a: NDArray[np.complex64], b: NDArray[np.complex64], shift: Array) -> Array:
     """(n,) mean squares between spectra (n, TILE, TILE / 2 + 1) once the first are shifted onto the second."""
-    along, down = (np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64) for d, f in zip(shift.T, _axes(), strict=True))
+    along, down = (
+        np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64) for d, f in zip(shift.T, _axes(), strict=True)
+    )
     return np.asarray(_power(a * along[:, None, :] * down[:, :, None] - b).mean(axis=(1, 2)), np.float64)
 
 

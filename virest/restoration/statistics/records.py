@@ -157,10 +157,14 @@ class PictureStatistics:
             return self.places.expected_gain_db(self.signal, self.noise)
         real = np.sqrt(self.passed) if self.real is None else self.real
         left = np.sum(self.frequency * ((1 - 2 * real + self.passed) * self.signal + self.noise))
+        return max(float(10 * np.log10(left / self.joint_error(further, shared))), 0.0)
+
+    def joint_error(self, further: Array, shared: float) -> float:
+        """Power that the ideal linear filter leaves wrong, by the rings' spectra; arguments of :meth:`joint_gain_db`."""
         count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
         signal, noise, passed = self.signal[:, None], (1 + shared) * self.noise[:, None], passed + further[:, None]
         wrong = (count * signal * noise / (passed * signal + noise)).sum(axis=1) / np.maximum(count.sum(axis=1), 1)
-        return max(float(10 * np.log10(left / np.sum(self.frequency * wrong))), 0.0)
+        return float(np.sum(self.frequency * wrong))
 
 
 def falling_power(frequency: Array, signal: Array, ring: int) -> Array:
