@@ -31,19 +31,21 @@ from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_
 Picture = NDArray[np.uint8]
 COLOURS = 192
 """Of a palette picture: a third of the bytes. Photographs keep all of theirs."""
-PHOTOGRAPHS = ("before_after", "blur_paths")
+PHOTOGRAPHS = ("before_after", "joint", "blur_paths")
 ARROW_STEP_PX = 80
 
 
 @dataclass(frozen=True, slots=True)
 class _Shot:
-    """One frame as recorded, as restored, and as it truly was."""
+    """One frame as recorded, as restored, and as the sharp truth."""
 
     capture: Capture
     profile: CameraProfile
     frame: int
     recorded: Picture
     restored: Picture
+    single: Picture
+    """Restored without its neighbours."""
     truth: Picture
 
 
@@ -51,9 +53,10 @@ def write_pictures(folder: Path) -> None:
     """Write all pictures below ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as work:
-        photographs, board = _photographs(Path(work)), _board(Path(work))
+        photographs, board, page = _photographs(Path(work)), _board(Path(work)), _page(Path(work))
         files = {
             "before_after": _before_after(photographs),
+            "joint": _joint(page),
             "rolling_shutter": _rolling_shutter(board),
             "blur_paths": _blur_paths(photographs),
             "rows": _rows(photographs),
@@ -92,20 +95,35 @@ def _board(work: Path) -> _Shot:
     return _shot(work / "board", 4)
 
 
+def _page(work: Path) -> _Shot:
+    simulate_command(
+        work / "page", scene="text", width=960, height=720, frames=9, exposure_ms=18.0, readout_ms=25.0,
+        rate_rad_s=1.2, noise_levels=2.0, seed=55,
+    )  # fmt: skip
+    return _shot(work / "page", 4)
+
+
 def _shot(folder: Path, frame: int) -> _Shot:
     capture = api.open(folder)
-    restored = capture.restore(frame, "best").picture
+    restored, single = (capture.restore(frame, "best", **alone).picture for alone in ({}, {"neighbours": 0}))
     truth = cv2.imread(str(folder / "truth" / "frames" / f"{frame:06d}.png"))
-    if restored is None or truth is None:
+    if restored is None or single is None or truth is None:
         raise RuntimeError(f"{folder}: frame {frame} was not restored")
     sharp = np.ascontiguousarray(truth[..., ::-1])
-    return _Shot(capture.record, capture.profile, frame, capture.read_frame(frame), restored, sharp)
+    return _Shot(capture.record, capture.profile, frame, capture.read_frame(frame), restored, single, sharp)
 
 
 def _before_after(shot: _Shot, side: int = 330, corner: tuple[int, int] = (600, 352)) -> bytes:
     x, y = corner
     pictures = (("as recorded", shot.recorded), ("restored", shot.restored), ("truth", shot.truth))
     return strip_figure([(name, picture[y : y + side, x : x + side]) for name, picture in pictures])
+
+
+def _joint(shot: _Shot, side: int = 250, corner: tuple[int, int] = (340, 200)) -> bytes:
+    """What neighbours bring, on one part of a frame."""
+    (x, y), names = corner, ("as recorded", "this frame alone", "with its neighbours", "truth")
+    pictures = (shot.recorded, shot.single, shot.restored, shot.truth)
+    return strip_figure([(n, p[y : y + side, x : x + side]) for n, p in zip(names, pictures, strict=True)])
 
 
 def _rolling_shutter(shot: _Shot) -> bytes:

@@ -24,9 +24,10 @@ from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import PairTurn, frame_tiles, pair_turn, reduced_light, tile_agreement
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
-TYPICAL_WEIGHTS = (0.95, 0.85, 0.65)
-"""What neighbours one, two, and three or more frames away weighed in the mean, before any was compared: on four
-simulated captures that obey their profile (1.0, 0.98, 0.9) and two that do not (0.9, 0.7, 0.4)."""
+TYPICAL_WEIGHTS, CORRECTED_WEIGHTS = (1.0, 0.95, 0.85), (0.9, 0.7, 0.35)
+"""What neighbours one, two, and three or more frames away weighed in the mean before any was chosen: on captures that
+obey their profile, and on such as need a correction of their turns, which is measured between direct neighbours only
+(simulated: a shake, a pan, a walk and photographs; two phones)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +113,7 @@ class FrameNeighbours:
         turn, found = None if refined is None else refined.turn, []
         usable = [other for other in around if other.usable and other.frame.index != here.frame.index]
         if len(usable) > most:
-            passed = [_typical_weight(other, here) * self._passed_of(other) for other in usable]
+            passed = [self._typical_weight(other, here) * self._passed_of(other) for other in usable]
             usable = [usable[k] for k in most_telling(passed, [0.0] * len(usable), luma, most)]
         for other in usable if tiles is not None else ():
             assert other.motion is not None
@@ -143,6 +144,10 @@ class FrameNeighbours:
             self._light[sight.frame.index] = light_of(sight)
         return self._light[sight.frame.index]
 
+    def _typical_weight(self, other: Sight, here: Sight) -> float:
+        weights = TYPICAL_WEIGHTS if self._missing is None else CORRECTED_WEIGHTS
+        return weights[min(abs(other.frame.index - here.frame.index), len(weights)) - 1]
+
     def _passed_of(self, sight: Sight) -> NDArray[np.float64]:
         """(RINGS,) mean |K|² over a frame's picture."""
         assert sight.motion is not None
@@ -162,10 +167,6 @@ class FrameNeighbours:
         for kept in (self._light, self._full, self._passed, self._turns):
             for old in [n for n in kept if n < number]:
                 del kept[old]  # type: ignore[attr-defined]
-
-
-def _typical_weight(other: Sight, here: Sight) -> float:
-    return TYPICAL_WEIGHTS[min(abs(other.frame.index - here.frame.index), len(TYPICAL_WEIGHTS)) - 1]
 
 
 def light_of(sight: Sight) -> Image:

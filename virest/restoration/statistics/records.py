@@ -160,7 +160,7 @@ class PictureStatistics:
         return max(float(10 * np.log10(left / self.joint_error(further, shared))), 0.0)
 
     def joint_error(self, further: Array, shared: float) -> float:
-        """Power that the ideal linear filter leaves wrong, by the rings' spectra; arguments of :meth:`joint_gain_db`."""
+        """Power that the ideal linear filter leaves wrong, by the rings' spectra; further, shared: as above."""
         count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
         signal, noise, passed = self.signal[:, None], (1 + shared) * self.noise[:, None], passed + further[:, None]
         wrong = (count * signal * noise / (passed * signal + noise)).sum(axis=1) / np.maximum(count.sum(axis=1), 1)
