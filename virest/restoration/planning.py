@@ -34,12 +34,12 @@ from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.conflict_plan import MAX_FOCAL_SPREAD, MAX_OFFSET_STD_S, explains_points, settle
-from virest.restoration.frame import deblurred_luma
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbours.sights import Sight
 from virest.restoration.neighbours.survey import kept_lumas, survey_gain, survey_runs, survey_turns
 from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import PRESETS, RestorationSettings
+from virest.restoration.trial import tried
 
 MIN_COARSE_EXPLAINED = 0.5
 """Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
@@ -230,7 +230,7 @@ def _with_neighbours(
         missing,
         trajectory,
         lens,
-        lambda luma, motion, refined: deblurred_luma(luma, motion, quick, refined),
+        lambda luma, motion, refined: tried(luma, motion, quick, refined),
     )
     return replace(plan, confirmed=confirmed)
 
