@@ -16,6 +16,7 @@ from virest.degradation.kernels import kernel_field
 from virest.restoration.frame import blurred_part, restore_frame
 from virest.restoration.settings import PRESETS, RestorationSettings
 from virest.restoration.statistics.measure import measure_picture
+from virest.restoration.statistics.of_picture import most_blurred
 from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.records import PictureStatistics, PlaceStatistics
 

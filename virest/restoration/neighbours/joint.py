@@ -88,7 +88,8 @@ def neighbour_picture(
 ) -> NeighbourPicture | None:
     """Bring a neighbour's light (height, width) to the frame's pixels; None where it does not fit.
 
-    field: of its kernels, from the view.  independent_error: what the frame's noise would make them differ by if the neighbour had none of it.
+    field: of its kernels, from the view.  independent_error: what the frame's noise would make them differ by if the
+    neighbour had none of it.
 
     What is left between the two after the predicted motion is a smooth field, affine over the picture.
     """

@@ -203,8 +203,9 @@ def judged_change(
     """What restoring a frame gains by a neighbour's account, what it changed, and what it left.
 
     With D what restoring changed, M what the recorded frame lacks of the neighbour, both blurred as that one was, and G
-    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in light over its mean, and |M − D|² / |G|².  What only shifts a tile is no error of the blur.  All pictures are reduced; None where
-    a path does not fit into a tile or the frames show different things.
+    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in light over its mean, and |M − D|² / |G|².  What
+    only shifts a tile is no error of the blur.  All pictures are reduced; None where a path does not fit into a tile or
+    the frames show different things.
     """
     times = view.frame.profile.height / recorded.shape[0]
     tops_lefts = _tiles(*recorded.shape)

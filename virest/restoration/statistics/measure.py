@@ -37,8 +37,9 @@ def measure_picture(
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
-    picture: (height, width, 3) RGB, or a luma (height, width), which then stands for the chroma too.  clipped: (height, width), 1 where light was too much to be measured; it and what a
-    path reaches from it are left out.  Returns the statistics of luma and of chroma, both colour differences together.
+    picture: (height, width, 3) RGB, or a luma (height, width), which then stands for the chroma too.  clipped: (height,
+    width), 1 where light was too much to be measured; it and what a path reaches from it are left out.  Returns the
+    statistics of luma and of chroma, both colour differences together.
     """
     corners = _corners(field, picture.shape[:2])
     if not corners or field.radius_px >= SIDE // 2:

@@ -1,4 +1,4 @@
-"""Statistics of a picture as it is restored: where they are measured, of long paths, defocus and doubt about the curve."""
+"""Statistics of a picture as restoring takes them: most blurred places; long paths, defocus, doubt about the curve."""
 
 from __future__ import annotations
 
@@ -48,8 +48,9 @@ def picture_statistics(
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Statistics of luma and chroma of a picture (height, width, 3) or of a luma alone, (height, width).
 
-    Noise shows where the paths cancel; a Gaussian, the same all round, hides it.  So the paths alone are fitted, which measures the noise and the defocused picture, and that is focused afterwards.
-    Paths too long for a tile are measured on a picture that is smaller; the finer frequencies take the finest one's.
+    Noise shows where the paths cancel; a Gaussian, the same all round, hides it.  So the paths alone are fitted, which
+    measures the noise and the defocused picture, and that is focused afterwards.  Paths too long for a tile are
+    measured on a picture that is smaller; the finer frequencies take the finest one's.
     """
     sigma_px, times = field.defocus_sigma_px, 1
     field = replace(field, defocus_sigma_px=0.0)
