@@ -236,7 +236,8 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     joined = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
     longest_px = max((longest_px, *(one.longest_px for one in joined)))
-    shared = sum(float(one.weights.mean()) * one.shared_noise for one in joined)
+    weights = [float(one.weights.mean()) for one in joined]
+    shared = sum(weight * one.shared_noise for weight, one in zip(weights, joined, strict=True))
     further = np.sum([np.zeros(RINGS), *(one.passed() for one in joined)], axis=0)
     if joined:
         promised_db = luma_model.joint_gain_db(further, shared)
@@ -253,6 +254,7 @@ def _deblurred(
         part = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
         part, measured = part * _share_map(blurred, share), measured_share(blurred)
         part = part if measured is None else part * measured
+        part = part if confirmed is None else part * np.float32(confirmed.taken(sum(weights)))
     restored = _mixed(sharp, recorded, part)
     ideal = luma_model.ideal_error(further, shared)
     gain_db = (None, None) if confirmed is None else confirmed.of_change_db(_mean_square(restored, recorded), ideal)

@@ -84,7 +84,7 @@ def fit_workloads(scale: Scale) -> list[Workload]:
 def fit_left_over(rows: Sequence[Row]) -> Row:
     """Coefficients of :data:`confirmation.LEFT_OVER` that promise the gains best, their deviations, and the scatter.
 
-    rows: with ``capture``, ``share``, ``logarithms`` (1, ln ideal, ln changed, ln left) and ``gain_db``.  Captures
+    rows: with ``capture``, ``changed``, ``logarithms`` (1, ln ideal, ln changed, ln left) and ``gain_db``.  Captures
     count alike.
     """
     captures = np.array([row["capture"] for row in rows])
@@ -159,7 +159,6 @@ def _promises(
                 "capture": workload.name,
                 "preset": preset,
                 "frame": restored.frame.index,
-                "share": min(watched.share, 1.0),
                 "changed": changed,
                 "logarithms": confirmation.tellers(ideal, changed, watched.left).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
@@ -183,8 +182,8 @@ def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straig
 
 
 def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
-    logarithms, share, changed = (np.array([row[k] for row in rows]) for k in ("logarithms", "share", "changed"))
-    return np.asarray(10 * np.log10(1 + share * changed / np.exp(logarithms @ coefficients)))
+    logarithms, changed = (np.array([row[k] for row in rows]) for k in ("logarithms", "changed"))
+    return np.asarray(10 * np.log10(1 + changed / np.exp(logarithms @ coefficients)))
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:

@@ -5,7 +5,7 @@ what is left is unrelated to it, and |M|² − |M − D|² = |D|² (the projecti
 what it gained, if it is right.  Whether it is, its neighbours tell: blurred as each was, the share
 (|M|² − |M − D|²) / |D|² is 1 for the best restoration, 0 for one that changes as much for the worse as for the better,
 and less for one that harms.  Noise of the neighbour's own and what it cannot see cancel in it, since D holds none of
-that.
+that.  Where the share s is below 1, too much is changed: of a D, (1 + s) / 2 leaves the least error, and that is taken.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 LEAST_PAIRS = 2
 """A single one has no scatter."""
-LEFT_OVER = (2.74, 0.56, 0.20, 0.31)
+LEFT_OVER = (3.13, 0.60, 0.13, 0.37)
 """ln of the squared error that is left in a restored picture, grey levels squared: a constant, and how much it grows
 with the logarithms of what the spectra leave, of the squared change, and of the part that neighbours see left.
 
 Each of the three tells it to a factor only.  ``python -m virest.app.bench --only fits`` fits them to pictures with
 truth."""
-LEFT_OVER_STD = 0.4
+LEFT_OVER_STD = 0.56
 """One standard deviation of that logarithm; by the same bench."""
 
 
@@ -44,15 +44,22 @@ class ConfirmedGain:
         """The gain to be expected where the model promises so much, before anything is restored."""
         return _gain_db(min(self.share, 1.0) * (1 - 10 ** (-promised_db / 10)))
 
+    def taken(self, further: float) -> float:
+        """Part of the change that leaves the least error.
+
+        further: sum of the weights of pictures restored with the frame; what is wrong with one's kernels is not what is
+        wrong with another's, so the wrong part of the change falls with their number.
+        """
+        return float(np.clip(1 - 0.5 * (1 - self.share) / (1 + further), 0.0, 1.0))
+
     def of_change_db(self, changed: float, ideal: float) -> tuple[float, float]:
         """The gain of a restored picture that differs by ``changed`` from the recorded one, and its deviation.
 
         Mean squares in grey levels; ideal: what an ideal filter would leave by the spectra.
         """
         over = changed / float(np.exp(tellers(ideal, changed, self.left) @ np.array(LEFT_OVER)))
-        share = float(np.clip(self.share, 0.0, 1.0))
-        slope = 10 / np.log(10) * over / (1 + share * over)
-        return 10 * float(np.log10(1 + share * over)), float(slope * np.hypot(share * LEFT_OVER_STD, self.std))
+        slope = 10 / np.log(10) * over / (1 + over)
+        return 10 * float(np.log10(1 + over)), float(slope * np.hypot(LEFT_OVER_STD, self.std))
 
 
 def tellers(ideal: float, changed: float, left: float) -> NDArray[np.float64]:
