@@ -26,8 +26,8 @@ CURVE_SLOPE_STD = 0.1
 """One standard deviation of the real tone curve's slope over the profile's, from one brightness to another.
 
 No phone keeps to a curve that nobody measured on it.  A slope that differs by ε makes an error of ε times the picture's
-own detail wherever brightness changes, blurred or not: ε² S beside the noise.  Which ε gains most on simulated captures,
-``python -m virest.app.bench --only fits`` tells: 0.093 ± 0.011 on 15; no measured curves stand behind it."""
+own detail wherever brightness changes, blurred or not: ε² S beside the noise.  On 14 simulated captures 0.093 ± 0.011
+gains most (``python -m virest.app.bench --only fits``); no measured curves stand behind it."""
 _LEAST_FALL = 2.0
 """The power of pictures falls with frequency at least so steeply: f⁻² is that of edges alone, without texture."""
 
