@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.degradation.kernels import kernel_field
-from virest.restoration.frame import _blurred_part, _most_blurred, restore_frame
+from virest.restoration.frame import blurred_part, restore_frame
 from virest.restoration.settings import PRESETS, RestorationSettings
 from virest.restoration.statistics.measure import measure_picture
+from virest.restoration.statistics.of_picture import most_blurred
 from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.records import PictureStatistics, PlaceStatistics
 
@@ -47,7 +48,7 @@ def _canvas(scene: Scene) -> NDArray[np.float32]:
 
 def _statistics(turning: TurningCamera, picture: NDArray[np.uint8]) -> PictureStatistics:
     x, y = np.meshgrid(np.arange(64, WIDTH, 110.0), np.arange(64, HEIGHT, 110.0))
-    centres_px = _most_blurred(turning.motion, np.stack([x, y], -1).reshape(-1, 2))
+    centres_px = most_blurred(turning.motion, np.stack([x, y], -1).reshape(-1, 2))
     return measure_picture(picture, kernel_field(turning.motion, centres_px, 0.5), ResponseCurve("srgb"))[0]
 
 
@@ -135,7 +136,7 @@ def test_where_paths_change_within_a_tile_its_kernel_is_not_used() -> None:
     motion = camera((0.0, 0.0, 6.0), width=WIDTH, height=HEIGHT).motion
     left_alone = []
     for tile_px in (0, 60, 120, 180):
-        part = np.broadcast_to(_blurred_part(motion, 1.0, tile_px), (HEIGHT, WIDTH))
+        part = np.broadcast_to(blurred_part(motion, 1.0, tile_px), (HEIGHT, WIDTH))
         left_alone.append(float(np.mean(1 - part)))
         assert part[0, 0] == 1.0
     assert (np.diff(left_alone) > 0).all()
@@ -145,4 +146,4 @@ def test_where_paths_change_within_a_tile_its_kernel_is_not_used() -> None:
 def test_a_pan_is_restored_everywhere() -> None:
     """Where the paths are about the same in all of the picture, tiles of any size hold."""
     motion = camera(RATE_RAD_S, 0.02, width=WIDTH, height=HEIGHT).motion
-    assert _blurred_part(motion, 1.0, 144) == 1.0
+    assert blurred_part(motion, 1.0, 144) == 1.0

@@ -16,12 +16,12 @@ from virest.camera.response import ResponseCurve
 from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.restoration.frame import (
     RestoredFrame,
-    _most_blurred,
     copied_frame,
-    degradation_parameters,
     restore_frame,
 )
+from virest.restoration.parameters import degradation_parameters
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
+from virest.restoration.statistics.of_picture import most_blurred
 
 BALANCED = RestorationSettings()
 METHODS = [m for m in DEBLUR_METHODS if m != "none"]
@@ -284,7 +284,7 @@ def test_noise_is_measured_where_the_blur_is() -> None:
     turning = camera((0.0, 0.0, 2.0))
     x, y = np.meshgrid(np.linspace(20, 315, 8), np.linspace(20, 220, 6))
     centres = np.stack([x, y], -1).reshape(-1, 2)
-    kept = _most_blurred(turning.motion, centres)
+    kept = most_blurred(turning.motion, centres)
     far = np.linalg.norm(kept - (167.5, 119.5), axis=1)
     assert 6 <= len(kept) < len(centres)
     assert far.min() > 0.4 * far.max()

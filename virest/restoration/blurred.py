@@ -124,11 +124,13 @@ def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
 
 
 def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.uint8] | None:
-    """1 where any channel of a picture (height, width, 3) is clipped; None: nowhere."""
+    """1 where any channel of a picture (height, width, 3), or a luma (height, width), is clipped; None: nowhere."""
     table = curve.clipped_table(CLIPPED_LEVELS)
     if not table[int(picture.max())]:
         return None
     brightest = int(np.argmax(table)) - 1
+    if picture.ndim == 2:
+        return (picture > brightest).view(np.uint8)
     return (cv2.inRange(picture, (0, 0, 0), (brightest,) * 3) == 0).view(np.uint8)
 
 

@@ -20,13 +20,12 @@ from virest.motion.trajectory import Trajectory
 from virest.restoration.frame import (
     RestoredFrame,
     copied_frame,
-    degradation_parameters,
     restore_frame,
-    unknown_parameters,
 )
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.refinement import MissingTurn
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight, with_neighbours
+from virest.restoration.parameters import degradation_parameters, unknown_parameters
 from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 
 UNTRUSTED = "the inertial log does not follow the camera"

@@ -16,13 +16,13 @@ from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.degradation.blur import tile_grid
 from virest.degradation.kernel_spread import kernel_spread
-from virest.degradation.kernels import KernelField, angle_and_length, blur_chords, smooth_field
+from virest.degradation.kernels import KernelField, blur_chords, smooth_field
 from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
-from virest.motion.trajectory import Trajectory, quaternion_wxyz
+from virest.motion.trajectory import Trajectory
 from virest.restoration.bands import LevelsOfRows, bands
-from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture, clipped_anywhere
+from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture
 from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept
 from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.deblur import deblur
@@ -30,23 +30,15 @@ from virest.restoration.encoding import encode_picture
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.joint import NeighbourPicture, worth_joining
 from virest.restoration.neighbours.refinement import RefinedMotion
+from virest.restoration.parameters import degradation_parameters, unknown_parameters
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
-from virest.restoration.statistics.measure import measure_picture
-from virest.restoration.statistics.records import PictureStatistics, falling_power
-from virest.restoration.statistics.rings import SIDE
+from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
+from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
 
-LOG_TILE_PX = 128
-"""Spacing of the tiles in the log."""
 MIN_WARP_PX = 0.1
 """Straightening that moves no point further than this is left out: so much a gyroscope at rest seems to turn, too."""
-SAMPLE_TILE_PX = 128
-"""Spacing of the tiles on which a picture's noise is measured."""
-MIN_SAMPLES = 6
-"""So many tiles, the most blurred ones, are measured in any case."""
-LARGEST_RADIUS = SIDE // 4
-"""Kernels of a larger radius leave too little of a measured tile that is not bent by its window."""
 MIN_GAIN_DB = 0.1
 """A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
@@ -58,14 +50,6 @@ PART_STEP_PX = 80
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
-CURVE_SLOPE_STD = 0.1
-"""One standard deviation of the real tone curve's slope over the profile's, from one brightness to another.
-
-No phone keeps to a curve that nobody measured on it.  A slope that differs by ε makes an error of ε times the picture's
-own detail wherever brightness changes, blurred or not: ε² S beside the noise.  Of ε² = 0.005 to 0.04, 0.01 gained most
-on seven simulated captures with `fast`; no measured curves stand behind it."""
-_LEAST_FALL = 2.0
-"""The power of pictures falls with frequency at least so steeply: f⁻² is that of edges alone, without texture."""
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -125,7 +109,7 @@ def restore_frame(
     parameters = degradation_parameters(motion, trajectory, settings)
     longest_px = max(tile["length_px"] for tile in parameters["blur"]["tiles"])
     longest_px = float(equivalent_length_px(motion.profile, longest_px))
-    method, why_not = _deblur_method(motion, settings, longest_px)
+    method, why_not = deblur_method(motion, settings, longest_px)
     if seen is not None and method != "none" and deblurring_loses(motion, seen):
         method, why_not = "none", (OTHER_BLUR,)
     straighten = settings.shutter != "none"
@@ -171,27 +155,6 @@ def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
     return replace(motion, start_s=start_s, exposure_s=seen.exposure_s)
 
 
-def deblurred_luma(
-    luma: NDArray[np.uint8], motion: RowMotion, settings: RestorationSettings, refined: RefinedMotion | None
-) -> tuple[NDArray[np.uint8], float] | None:
-    """A luma (height, width) deblurred, its rows at the middles of their exposures, and the gain promised for it in dB.
-
-    None where it is left alone.
-    """
-    height, width = luma.shape
-    grid = tile_grid(height, width, LOG_TILE_PX, 0)
-    longest_px = float(np.linalg.norm(blur_chords(motion, grid.centres_px), axis=-1).max())
-    longest_px = float(equivalent_length_px(motion.profile, longest_px))
-    if _deblur_method(motion, settings, longest_px)[0] == "none":
-        return None
-    covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-    picture = cv2.merge([luma] * 3)
-    sharp, details, _ = _deblurred(picture, motion, settings, 0.5, longest_px, None, covariance_px2, None)
-    if details["method"] == "none":
-        return None
-    return rounded(np.ascontiguousarray(sharp[..., 1])), float(details["promised_gain_db"])
-
-
 def _limits(motion: RowMotion) -> tuple[str, ...]:
     """What the model leaves out."""
     depth_m = motion.profile.depth_m
@@ -204,65 +167,6 @@ def _limits(motion: RowMotion) -> tuple[str, ...]:
     if not motion.translation.in_metres:
         return ("travel known over depth, not in metres",)
     return ()
-
-
-def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: RestorationSettings) -> dict[str, Any]:
-    """The log's account of one frame: motion (eqs 4-10), blur (eqs 12-18), shutter (eq 28)."""
-    profile = motion.profile
-    width, height = profile.width, profile.height
-    centre = np.array([[(width - 1) / 2, (height - 1) / 2]])
-    row_start_s = float(motion.row_start_s(centre)[0])
-    r_end_start, t_end_start = motion.relative_pose(row_start_s, row_start_s + motion.exposure_s)
-    moved_m = None if t_end_start is None or not _in_metres(motion) else (-r_end_start.T @ t_end_start).tolist()
-    depth_m, depth_source = _depth(motion)
-    grid = tile_grid(height, width, LOG_TILE_PX, LOG_TILE_PX // 4)
-    points = np.concatenate([centre, grid.centres_px])
-    angle, length = angle_and_length(blur_chords(motion, points))
-    corners = straightened_points(motion, corner_points(width, height))
-    return {
-        "motion": {
-            "delta_position_m": moved_m,
-            "delta_q_wxyz": quaternion_wxyz(r_end_start.T).tolist(),
-            "rate_rad_s": trajectory.rate_rad_s(row_start_s + motion.exposure_s / 2).tolist(),
-            "velocity_m_s": _velocity_m_s(motion, row_start_s),
-        },
-        "depth_m": depth_m,
-        "depth_source": depth_source,
-        "blur": {
-            "angle_rad": float(angle[0]),
-            "length_px": float(length[0]),
-            "tiles": [
-                {"centre_px": c, "angle_rad": a, "length_px": n}
-                for c, a, n in zip(points[1:].tolist(), angle[1:].tolist(), length[1:].tolist(), strict=True)
-            ],
-        },
-        "shutter": {
-            "readout_time_s": motion.readout_time_s,
-            "method": settings.shutter,
-            "corners_px": corners.tolist(),
-            "max_displacement_px": float(np.linalg.norm(corners - corner_points(width, height), axis=1).max()),
-        },
-        "response": (profile.response or ResponseCurve("srgb")).describe(),
-    }
-
-
-def _depth(motion: RowMotion) -> tuple[float | None, str]:
-    """Depth at the picture's centre and where it is from; a plane at infinity has none."""
-    if motion.translation is None or motion.translation.depth_m is None or np.isinf(motion.translation.depth_m):
-        return None, "none"
-    return motion.translation.depth_m, motion.translation.source
-
-
-def _in_metres(motion: RowMotion) -> bool:
-    return motion.translation is not None and motion.translation.in_metres
-
-
-def _velocity_m_s(motion: RowMotion, time_s: float) -> list[float] | None:
-    """Velocity of the camera's centre at a time, in its axes at that time (eq 5)."""
-    if motion.translation is None or not motion.translation.in_metres:
-        return None
-    rotation, _ = motion.pose(time_s)
-    return list((rotation @ motion.translation.velocity_at(time_s - motion.reference_s)).tolist())
 
 
 def copied_frame(
@@ -280,24 +184,6 @@ def copied_frame(
     return RestoredFrame(frame, "copied", picture, (reason,), (0, 0, width, height), exposure_s, details)
 
 
-def unknown_parameters(profile: CameraProfile) -> dict[str, Any]:
-    """The log's keys for a frame whose motion is not known."""
-    return {
-        "motion": {"delta_position_m": None, "delta_q_wxyz": None, "rate_rad_s": None, "velocity_m_s": None},
-        "depth_m": None,
-        "depth_source": "none",
-        "blur": {"angle_rad": None, "length_px": None, "tiles": []},
-        "shutter": {
-            "readout_time_s": profile.shutter.readout_time_s if profile.readout_known else None,
-            "method": "none",
-            "corners_px": None,
-            "max_displacement_px": None,
-        },
-        "response": (profile.response or ResponseCurve("srgb")).describe(),
-        "deblur": {"method": "none"},
-    }
-
-
 def _source_map(
     motion: RowMotion, settings: RestorationSettings, anchor: float, deblurred: str
 ) -> NDArray[np.float32] | None:
@@ -309,7 +195,8 @@ def _source_map(
     return perspective_map(motion, anchor) if settings.shutter == "perspective" else rowwise_map(motion, anchor)
 
 
-def _deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: float) -> tuple[str, tuple[str, ...]]:
+def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: float) -> tuple[str, tuple[str, ...]]:
+    """The method for a frame of so long a blur, and why it is ``none``."""
     if settings.deblur == "none":
         return "none", ("no deblurring asked for",)
     if motion.exposure_s <= 0:
@@ -333,16 +220,16 @@ def _deblurred(
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
-    centres_px = _most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
+    centres_px = most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
     field = smooth_field(motion, anchor)
-    luma, chroma = _measured(picture, field(centres_px), curve, tiles)
+    luma, chroma = picture_statistics(picture, field(centres_px), curve, tiles)
     spread = kernel_spread(field, width, height, covariance_px2)
-    luma_model = luma if spread is None else luma.doubted(spread.variance(SIDE))
-    share = 1.0 if anchor != 0.5 else _trusted_share(luma_model)
+    luma_model = luma.doubted_by(spread)
+    share = 1.0 if anchor != 0.5 else trusted_share(luma_model)
     promised_db = luma_model.expected_gain_db
     expected_db = promised_db if confirmed is None else confirmed.expected_db(promised_db)
-    why_not = _too_little_to_gain(luma_model, expected_db)
+    why_not = too_little_to_gain(luma_model, expected_db)
     if why_not:
         return picture, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
@@ -351,7 +238,6 @@ def _deblurred(
     longest_px = max((longest_px, *(one.longest_px for one in joined.pictures)))
     if joined.pictures:
         promised_db = luma_model.joint_gain_db(joined.passed, joined.shared)
-        expected_db = promised_db if confirmed is None else confirmed.expected_db(promised_db)
     blurred = replace(blurred, spread=spread, neighbours=joined.pictures, longest_px=longest_px)
     if light is not None:
         blurred = _evened(blurred, light)
@@ -362,10 +248,17 @@ def _deblurred(
     part: NDArray[np.float32] | np.float32 = np.float32(1.0)
     if anchor == 0.5:
         by_tile = settings.deblur not in WHOLE_PICTURE or luma.unevenness > 0
-        part = _blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
+        part = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
         part, measured = part * _share_map(blurred, share), measured_share(blurred)
         part = part if measured is None else part * measured
+        part = (
+            part
+            if confirmed is None
+            else part * np.float32(confirmed.taken(sum(float(one.weights.mean()) for one in joined.pictures)))
+        )
     restored = _mixed(sharp, recorded, part)
+    ideal = luma_model.ideal_error(joined.passed, joined.shared)
+    gain_db = (None, None) if confirmed is None else confirmed.of_change_db(_mean_square(restored, recorded), ideal)
     details = {
         "method": settings.deblur,
         "preset": settings.preset,
@@ -373,8 +266,8 @@ def _deblurred(
         "strength": settings.strength,
         "tile_px": settings.tile_px,
         "noise_grey_levels": luma.noise_levels,
-        "expected_gain_db": None if confirmed is None else expected_db,
-        "expected_gain_std_db": None if confirmed is None else confirmed.std_db,
+        "expected_gain_db": gain_db[0],
+        "expected_gain_std_db": gain_db[1],
         "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
         "neighbours": [{"frame": one.number, "weight": float(one.weights.mean())} for one in joined.pictures],
@@ -382,75 +275,6 @@ def _deblurred(
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
     return restored, details, ()
-
-
-def _most_blurred(motion: RowMotion, centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Centres (m, 2) of the tiles to measure on: the most blurred, and all that are blurred half as much.
-
-    A path of a pixel cancels nothing, and tells no noise from signal; a coder's noise is where the motion is.
-    """
-    length_px = np.linalg.norm(blur_chords(motion, centres_px), axis=-1)
-    ranked = np.sort(length_px)[::-1]
-    least_px = min(ranked[0] / 2, ranked[min(MIN_SAMPLES, len(ranked)) - 1])
-    return np.asarray(centres_px[length_px >= least_px])
-
-
-def _measured(
-    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve, most_tiles: int
-) -> tuple[PictureStatistics, PictureStatistics]:
-    """Statistics of luma and chroma. Noise shows where the paths cancel; a Gaussian, the same all round, hides it.
-
-    So the paths alone are fitted, which measures the noise and the defocused picture, and that is focused afterwards.
-    Paths too long for a tile are measured on a picture that is smaller; the finer frequencies take the finest one's.
-    """
-    sigma_px, times = field.defocus_sigma_px, 1
-    field = replace(field, defocus_sigma_px=0.0)
-    while field.scaled(1 / times).radius_px > LARGEST_RADIUS and min(picture.shape[:2]) >= 2 * times * SIDE:
-        times *= 2
-    if times > 1:
-        height, width = picture.shape[:2]
-        picture = cv2.resize(picture, (width // times, height // times), interpolation=cv2.INTER_AREA)
-        field = replace(field.scaled(1 / times), centres_px=(field.centres_px + 0.5) / times - 0.5)
-    luma, chroma = (
-        found.scaled(times) if times > 1 and found.measured else found
-        for found in measure_picture(picture, field, curve, clipped_anywhere(picture, curve), most_tiles)
-    )
-    focused = (_focused(luma, sigma_px), _focused(chroma, sigma_px))
-    return focused[0].with_error_share(CURVE_SLOPE_STD**2), focused[1].with_error_share(CURVE_SLOPE_STD**2)
-
-
-def _focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics:
-    """Spectra of the picture before a Gaussian came over it.
-
-    The Gaussian leaves next to nothing of high frequencies, and what is recorded there divided by next to nothing is no
-    picture: no scene's power falls slower than f⁻².  So S is held to that law ring by ring, and what was recorded
-    beyond it counts as noise; where less than the noise is left, S falls as f⁻³.
-    """
-    if not sigma_px or not defocused.measured:
-        return defocused
-    frequency = defocused.frequency
-    left = np.exp(-((2 * np.pi * sigma_px * frequency) ** 2))
-    through = defocused.passed * defocused.signal
-    rise, signal = frequency**_LEAST_FALL, defocused.signal / left
-    signal[1:] = np.minimum.accumulate((signal * rise)[1:]) / rise[1:]
-    passed = defocused.passed * left
-    noise = np.maximum(defocused.noise, through - passed * signal)
-    drowned = np.flatnonzero(passed * signal < noise)
-    drowned = drowned[drowned > 0]
-    if len(drowned):
-        last = drowned[0] - 1
-        signal[last + 1 :] = np.minimum(signal, falling_power(frequency, signal, last))[last + 1 :]
-    places = defocused.places and defocused.places.after(left)
-    real, cells = defocused.real, defocused.cells
-    return replace(
-        defocused,
-        signal=signal,
-        noise=noise,
-        passed=passed,
-        places=places,
-        real=None if real is None else real * np.sqrt(left),
-        cells=None if cells is None else (cells[0], cells[1] * left[:, None]),
-    )
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
@@ -490,7 +314,13 @@ def _mixed(
     return mixed
 
 
-def _too_little_to_gain(luma: PictureStatistics, expected_db: float) -> str:
+def _mean_square(restored: NDArray[np.float32], recorded: NDArray[np.uint8]) -> float:
+    """Of what restoring changed, (height, width, 3) each; seen in every fourth row."""
+    changed = cv2.subtract(restored[::4], recorded[::4], dtype=cv2.CV_32F)
+    return float(cv2.norm(changed, cv2.NORM_L2SQR)) / changed.size
+
+
+def too_little_to_gain(luma: PictureStatistics, expected_db: float) -> str:
     """Why the picture is better left as it was recorded; empty: it is not."""
     if not luma.measured:
         return "picture too small, or its blur too long, for its noise to be measured: left alone"
@@ -499,7 +329,7 @@ def _too_little_to_gain(luma: PictureStatistics, expected_db: float) -> str:
     return ""
 
 
-def _blurred_part(motion: RowMotion, min_blur_px: float, tile_px: int) -> NDArray[np.float32] | np.float32:
+def blurred_part(motion: RowMotion, min_blur_px: float, tile_px: int) -> NDArray[np.float32] | np.float32:
     """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on.
 
     So too where it is shorter than the path changes from a tile's middle to its side, as around the centre of a turn
@@ -527,7 +357,7 @@ def _share_map(blurred: BlurredPicture, share: float) -> NDArray[np.float32] | n
     return np.float32(share) if near is None else np.float32(share) + np.float32(1.0 - share) * near
 
 
-def _trusted_share(luma: PictureStatistics) -> float:
+def trusted_share(luma: PictureStatistics) -> float:
     """How much of a restored picture to take, the rest being the recorded one.
 
     Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of

@@ -2,6 +2,7 @@
 
 $ python -m virest.app.bench --only quality --quick
 $ python -m virest.app.bench --only honesty --quick --preset balanced --keep captures
+$ python -m virest.app.bench --only fits --keep captures
 $ python -m virest.app.bench --compare OLD.json NEW.json
 """
 
@@ -27,6 +28,7 @@ from virest.app.bench.compare import NOISE, compare_text, read_report
 from virest.app.bench.cost import cost_section
 from virest.app.bench.curves import curves_section
 from virest.app.bench.diagnosis import diagnosis_section
+from virest.app.bench.fits import fits_section
 from virest.app.bench.growth import growth_section
 from virest.app.bench.honesty import honesty_section
 from virest.app.bench.memory import memory_section
@@ -43,6 +45,7 @@ Section = Callable[[Path, Scale], tuple[dict[str, Any], str]]
 SECTIONS: dict[str, Section] = {
     "quality": quality_section,
     "honesty": honesty_section,
+    "fits": fits_section,
     "shutter": shutter_section,
     "speed": speed_section,
     "growth": growth_section,

@@ -1,8 +1,11 @@
 """What deblurring really gains on a capture, confirmed by neighbours that were blurred along other paths.
 
-A frame is restored, blurred as its neighbour was and compared with what the neighbour recorded; so is the frame as it
-was recorded.  The neighbour holds noise of its own and cancels some frequencies, so it sees only a part of the gain;
-but it sees what the model of light, noise and kernels does not know, since none of that went into it.
+Restoring changes a picture by D, and takes its error from |M|² to |M − D|².  Where D is the best that the data allow,
+what is left is unrelated to it, and |M|² − |M − D|² = |D|² (the projection theorem): a restored picture tells by itself
+what it gained, if it is right.  Whether it is, its neighbours tell: blurred as each was, the share
+(|M|² − |M − D|²) / |D|² is 1 for the best restoration, 0 for one that changes as much for the worse as for the better,
+and less for one that harms.  Noise of the neighbour's own and what it cannot see cancel in it, since D holds none of
+that.  Where the share s is below 1, too much is changed: of a D, (1 + s) / 2 leaves the least error, and that is taken.
 """
 
 from __future__ import annotations
@@ -11,42 +14,74 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-SEEN_BY_TRUTH = 0.65
-"""Gain against the true picture for a gain of 1 against the neighbours.
-
-Of eight simulated captures the ratio was 0.15 to 1.65, median 0.54, and about 0.7 for two of four without a phone's own
-processing.  This value was read off between these; no bench fits it yet."""
 LEAST_PAIRS = 2
 """A single one has no scatter."""
+LEFT_OVER = (3.25, 0.60, 0.12, 0.38)
+"""ln of the squared error that is left in a restored picture, grey levels squared: a constant, and how much it grows
+with the logarithms of what the spectra leave, of the squared change, and of the part that neighbours see left.
+
+Each of the three tells it to a factor only.  ``python -m virest.app.bench --only fits`` fits them to pictures with
+truth: 3.25 ± 1.14, 0.60 ± 0.17, 0.12 ± 0.12, 0.38 ± 0.19 on 13 captures, together to 0.75 dB in the median."""
+LEFT_OVER_STD = 0.56
+"""One standard deviation of that logarithm; by the same bench."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfirmedGain:
-    """How much of a promised gain neighbours confirm on this capture."""
+    """How much of what restoring changes on this capture is for the better, by its neighbours."""
 
     share: float
-    """Gain to be expected for a promise of 1 dB; 0 or less: none."""
-    std_db: float
-    """One standard deviation of a frame's gain about what is expected."""
+    """Of the square of the change, what the error's square falls by."""
+    std: float
+    """One standard deviation of the share from pair to pair."""
+    left: float
+    """Of what a neighbour shows, the part of its power that the restored frame, blurred as it was, does not."""
     pairs: int
 
     def expected_db(self, promised_db: float) -> float:
-        """The gain to be expected where the model promises so much."""
-        return self.share * promised_db
+        """The gain to be expected where the model promises so much, before anything is restored."""
+        return _gain_db(min(self.share, 1.0) * (1 - 10 ** (-promised_db / 10)))
+
+    def taken(self, further: float) -> float:
+        """Part of the change that leaves the least error.
+
+        further: sum of the weights of pictures restored with the frame; what is wrong with one's kernels is not what is
+        wrong with another's, so the wrong part of the change falls with their number.
+        """
+        return float(np.clip(1 - 0.5 * (1 - self.share) / (1 + further), 0.0, 1.0))
+
+    def of_change_db(self, changed: float, ideal: float) -> tuple[float, float]:
+        """The gain of a restored picture that differs by ``changed`` from the recorded one, and its deviation.
+
+        Mean squares in grey levels; ideal: what an ideal filter would leave by the spectra.
+        """
+        over = changed / float(np.exp(tellers(ideal, changed, self.left) @ np.array(LEFT_OVER)))
+        slope = 10 / np.log(10) * over / (1 + over)
+        return 10 * float(np.log10(1 + over)), float(slope * np.hypot(LEFT_OVER_STD, self.std))
 
 
-def confirmed_gain(found: Sequence[tuple[float, float]]) -> ConfirmedGain | None:
-    """The share by pairs of (promised, confirmed) gains in dB; None where they are too few.
+def tellers(ideal: float, changed: float, left: float) -> NDArray[np.float64]:
+    """(4,) what :data:`LEFT_OVER` multiplies."""
+    return np.asarray(np.log(np.maximum((np.e, ideal, changed, left), 1e-6)))
 
-    A ratio of medians: single pairs see too little of a gain to be divided by.
+
+def _gain_db(part: float) -> float:
+    """Gain in dB where so much of the error is taken away."""
+    return float(-10 * np.log10(max(1 - part, 1e-3)))
+
+
+def confirmed_gain(found: Sequence[tuple[float, float, float]]) -> ConfirmedGain | None:
+    """The share by pairs of (fall of the squared error, squared change, part left); None where they are too few.
+
+    A ratio of sums: pairs that changed little tell little.
     """
     if len(found) < LEAST_PAIRS:
         return None
-    promised, confirmed = np.array(found).T
-    if np.median(promised) <= 0:
+    gained, changed, left = np.array(found).T
+    if changed.sum() <= 0:
         return None
-    share = SEEN_BY_TRUTH * float(np.median(confirmed) / np.median(promised))
-    left = SEEN_BY_TRUTH * confirmed - share * promised
-    std_db = float(1.4826 * np.median(np.abs(left - np.median(left))))
-    return ConfirmedGain(share, std_db, len(found))
+    share, weight = gained.sum() / changed.sum(), changed / changed.sum()
+    scatter = float(np.sqrt(weight @ (gained / changed - share) ** 2))
+    return ConfirmedGain(float(share), scatter, float(np.mean(left)), len(found))

@@ -159,10 +159,10 @@ def most_telling(passed: Sequence[Array], shared: Sequence[float], luma: Picture
     """
     taken: list[int] = []
     sum_passed, sum_shared = np.zeros(RINGS), 0.0
-    error = luma.joint_error(sum_passed, sum_shared) if luma.measured else 0.0
+    error = luma.ideal_error(sum_passed, sum_shared) if luma.measured else 0.0
     while len(taken) < min(most, len(passed)):
         errors = {
-            k: luma.joint_error(sum_passed + passed[k], sum_shared + shared[k])
+            k: luma.ideal_error(sum_passed + passed[k], sum_shared + shared[k])
             for k in range(len(passed))
             if k not in taken
         }

@@ -107,7 +107,7 @@ def frame_tiles(
     height: of the recorded picture.  everywhere: tiles all over the picture instead of a few.
     """
     times = height / light.shape[0]
-    tops_lefts = _tiles(*light.shape, light.size if everywhere else MOST_TILES)
+    tops_lefts = _tiles(light.shape[0], light.shape[1], light.size if everywhere else MOST_TILES)
     kernels = _kernel_spectra(field, tops_lefts, times)
     if kernels is None:
         return None
@@ -188,7 +188,7 @@ def tile_agreement(
         tiles.centres_px,
         shift * tiles.times,
         precision,
-        _difference(a, b, shift),
+        _power(_shifted(a, shift) - b).mean(axis=(1, 2)),
         _power(b).mean(axis=(1, 2)),
         float(np.median(there.mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
@@ -197,36 +197,42 @@ def tile_agreement(
     )
 
 
-def predicted_error(view: NeighbourView, first: Image, sharp: Image, second: Image) -> tuple[float, float] | None:
-    """How far a frame, as recorded and as restored, is from its neighbour once each is blurred as that one was.
+def judged_change(
+    view: NeighbourView, recorded: Image, restored: Image, second: Image
+) -> tuple[float, float, float] | None:
+    """What restoring a frame gains by a neighbour's account, what it changed, and what it left.
 
-    Mean squares over spectra of light over its mean; what only shifts a tile is no error of the blur.  All pictures
-    are reduced; None where a path does not fit into a tile or the frames show different things.
+    With D what restoring changed, M what the recorded frame lacks of the neighbour, both blurred as that one was, and G
+    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in light over its mean, and |M − D|² / |G|².  What
+    only shifts a tile is no error of the blur.  All pictures are reduced; None where a path does not fit into a tile or
+    the frames show different things.
     """
-    times = view.frame.profile.height / first.shape[0]
-    tops_lefts = _tiles(*first.shape)
+    times = view.frame.profile.height / recorded.shape[0]
+    tops_lefts = _tiles(*recorded.shape)
     kernels = _kernel_spectra(view.field(), tops_lefts, times)
     if kernels is None:
         return None
     there = _seen(view, second, tops_lefts, np.zeros(2), times)
-    b, left = _spectra(there), []
-    used = np.maximum(_cut(first, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT
-    for picture in (first, sharp):
+    b, onto = _spectra(there), []
+    used = np.maximum(_cut(recorded, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT
+    for picture in (recorded, restored):
         a = _spectra(_cut(picture, tops_lefts)) * kernels
         shift, precision = _tile_shifts(a, b, np.zeros(2))
         used &= precision > 0
-        left.append(_difference(a, b, shift))
+        onto.append(_shifted(a, shift))
     if np.count_nonzero(used) < LEAST_TILES:
         return None
-    return float(left[0][used].mean()), float(left[1][used].mean())
+    spectra = b, b - onto[0], b - onto[1], onto[1] - onto[0]
+    shown, lacked, left, changed = (float(_power(one[used]).mean()) for one in spectra)
+    return lacked - left, changed, left / shown
 
 
-def _difference(a: NDArray[np.complex64], b: NDArray[np.complex64], shift: Array) -> Array:
-    """(n,) mean squares between spectra (n, TILE, TILE / 2 + 1) once the first are shifted onto the second."""
+def _shifted(spectra: NDArray[np.complex64], shift: Array) -> NDArray[np.complex64]:
+    """Spectra (n, TILE, TILE / 2 + 1) of tiles that lie so far (n, 2) on."""
     along, down = (
         np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64) for d, f in zip(shift.T, _axes(), strict=True)
     )
-    return np.asarray(_power(a * along[:, None, :] * down[:, :, None] - b).mean(axis=(1, 2)), np.float64)
+    return np.asarray(spectra * along[:, None, :] * down[:, :, None])
 
 
 def _power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
@@ -300,22 +306,23 @@ def _window() -> Image:
     return np.outer(hann, hann).astype(np.float32)
 
 
-def _axes() -> tuple[Array, Array]:
+def _axes() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Frequencies along and down of half a spectrum (TILE, TILE / 2 + 1), cycles per pixel."""
-    return np.fft.rfftfreq(TILE), np.fft.fftfreq(TILE)
+    return np.fft.rfftfreq(TILE).astype(np.float32), np.fft.fftfreq(TILE).astype(np.float32)
 
 
 @lru_cache(maxsize=1)
 def _radii() -> Array:
     """Distance from zero over half a spectrum, cycles per pixel."""
-    along, down = _axes()
-    return np.hypot(*np.meshgrid(along, down))
+    return np.hypot(*np.meshgrid(np.fft.rfftfreq(TILE), np.fft.fftfreq(TILE)))
 
 
 @lru_cache(maxsize=1)
 def _looked_at() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
-    """Places of half a spectrum whose phases are looked at, by rising frequency; 2π f there, (2, m); and how many of
-    them each of CUTOFFS takes."""
+    """Places of half a spectrum whose phases are looked at, by rising frequency, and 2π f there, (2, m).
+
+    The third: how many of them each of CUTOFFS takes.
+    """
     radius = _radii().ravel()
     order = np.argsort(radius, kind="stable")
     order = order[(radius[order] > 1 / TILE) & (radius[order] <= CUTOFFS[-1])]

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.degradation.blur import Image
 from virest.degradation.neighbour import neighbour_view
 from virest.degradation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion, missing_turn
-from virest.restoration.neighbours.registration import PairTurn, predicted_error
+from virest.restoration.neighbours.registration import PairTurn, judged_change
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight, light_of, turn_between
 
 RUN_FRAMES = 4
@@ -77,12 +77,12 @@ def survey_gain(
     missing: MissingTurn | None,
     trajectory: Trajectory,
     lens: MovingLens,
-    deblurred: Callable[[Picture, RowMotion, RefinedMotion | None], tuple[Picture, float] | None],
+    tried: Callable[[Picture, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
 ) -> ConfirmedGain | None:
     """What deblurring gains by the neighbours' account.
 
-    deblurred: the sharp luma of a frame, at the middle of its exposures, and the gain in dB that is promised for it;
-    None: it is left alone.  The most blurred inner frame of each run is restored and held against both its neighbours.
+    tried: a frame's luma in light, as recorded and as restored, at the middle of its exposures and reduced; None: it is
+    left alone.  The first inner frame of each run is restored and held against both its neighbours.
     """
     found = []
     turns = FrameNeighbours(trajectory, lens, missing) if missing is not None else None
@@ -92,15 +92,14 @@ def survey_gain(
             assert here.motion is not None
             refined = turns.refined((before,), here, (after,)) if turns is not None else None
             motion = here.motion if refined is None else refined.motion
-            sharp = deblurred(here.picture, motion, refined)
-            if sharp is None:
+            pictures = tried(here.picture, motion, refined)
+            if pictures is None:
                 continue
-            restored = light_of(replace(here, picture=sharp[0]))
             for other in (before, after):
                 assert other.motion is not None
                 view = neighbour_view(motion, other.motion, trajectory, lens)
-                errors = predicted_error(view, light_of(here), restored, light_of(other))
-                if errors is not None and min(errors) > 0:
-                    found.append((sharp[1], float(10 * np.log10(errors[0] / errors[1]))))
+                judged = judged_change(view, *pictures, light_of(other))
+                if judged is not None:
+                    found.append(judged)
             break
     return confirmed_gain(found)

@@ -37,8 +37,9 @@ def measure_picture(
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
-    picture: (height, width, 3) RGB.  clipped: (height, width), 1 where light was too much to be measured; it and what a
-    path reaches from it are left out.  Returns the statistics of luma and of chroma, both colour differences together.
+    picture: (height, width, 3) RGB, or a luma (height, width), which then stands for the chroma too.  clipped: (height,
+    width), 1 where light was too much to be measured; it and what a path reaches from it are left out.  Returns the
+    statistics of luma and of chroma, both colour differences together.
     """
     corners = _corners(field, picture.shape[:2])
     if not corners or field.radius_px >= SIDE // 2:
@@ -51,7 +52,7 @@ def measure_picture(
         None if clipped is None else known_part(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)
     ]
 
-    parts = [cv2.split(cv2.cvtColor(cut(picture, corners[i]), cv2.COLOR_RGB2YCrCb)) for i in chosen]
+    parts = [_planes(cut(picture, corners[i])) for i in chosen]
 
     def observed(plane: int, every: int) -> NDArray[np.float32]:
         tiles = zip(parts[::every], known[::every], strict=True)
@@ -61,13 +62,13 @@ def measure_picture(
     light = np.stack(
         [windowed_power(evenly_steep(_luma_light(cut(picture, corners[i]), curve), curve), seen) for i, seen in tiles]
     )
-    colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
-    luma, red, _ = cv2.split(cv2.cvtColor(_some_rows(picture), cv2.COLOR_RGB2YCrCb))
-    cells, white_levels = RingCells(passed), white_noise(luma)
-    grey, cells_of_colour = observed(0, 1), RingCells(passed[::2])
-    of_light, of_luma, of_chroma = fit_rings(
-        (light, cells, white_levels), (grey, cells, white_levels), (colour, cells_of_colour, white_noise(red))
-    )
+    luma, *red_blue = _planes(_some_rows(picture))
+    cells, white_levels, grey = RingCells(passed), white_noise(luma), observed(0, 1)
+    spectra, colour = [(light, cells, white_levels), (grey, cells, white_levels)], grey
+    if red_blue:
+        colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
+        spectra.append((colour, RingCells(passed[::2]), white_noise(red_blue[0])))
+    of_light, of_luma, *of_chroma = fit_rings(*spectra)
     of_luma = replace(
         of_luma,
         noise_levels=of_light.noise_levels,
@@ -75,12 +76,18 @@ def measure_picture(
         cells=(cells.count, cells.passed),
     )
     weight = unevenness(of_luma, grey, passed)
-    if not weight:
-        return of_luma, of_chroma
-    return (
-        replace(of_luma, places=place_statistics(of_luma, grey, passed, weight)),
-        replace(of_chroma, places=place_statistics(of_chroma, colour, passed[::2], weight)),
-    )
+    if weight:
+        of_luma = replace(of_luma, places=place_statistics(of_luma, grey, passed, weight))
+    if not of_chroma:
+        return of_luma, of_luma
+    if weight:
+        of_chroma = [replace(of_chroma[0], places=place_statistics(of_chroma[0], colour, passed[::2], weight))]
+    return of_luma, of_chroma[0]
+
+
+def _planes(picture: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
+    """Luma and both colour differences of a picture (height, width, 3); a luma (height, width) by itself."""
+    return (picture,) if picture.ndim == 2 else tuple(cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb)))
 
 
 def _less_one(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -97,15 +104,17 @@ def _ring_means(cells: RingCells, values: NDArray[np.float32]) -> NDArray[np.flo
 
 
 def _some_rows(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Every other four rows of a picture (height, width, 3): enough for :func:`white_noise`, which looks at such."""
-    height, width, channels = picture.shape
-    return picture[: height - height % 8].reshape(-1, 8, width, channels)[:, :4].reshape(-1, width, channels)
+    """Every other four rows of a picture (height, width, ...): enough for :func:`white_noise`, which looks at such."""
+    height, width, *channels = picture.shape
+    return picture[: height - height % 8].reshape(-1, 8, width, *channels)[:, :4].reshape(-1, width, *channels)
 
 
 def _luma_light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
-    """Luma of the light of a tile (height, width, 3), (height, width)."""
-    weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
-    return np.asarray(cv2.transform(cv2.LUT(tile, curve.linear_table()), weights), np.float32)
+    """Luma of the light of a tile (height, width, 3), (height, width); that of a luma's tile is its own."""
+    light = cv2.LUT(tile, curve.linear_table())
+    if light.ndim == 2:
+        return np.asarray(light, np.float32)
+    return np.asarray(cv2.transform(light, np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)))
 
 
 def _least_clipped(

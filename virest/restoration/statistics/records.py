@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.degradation.kernel_spread import KernelSpread
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 
 Array = NDArray[np.float64]
@@ -132,9 +133,11 @@ class PictureStatistics:
         )
         return replace(self, noise=noise, noise_levels=self.noise_levels * float(np.sqrt(after / before)))
 
-    def doubted(self, variance: NDArray[np.float32]) -> PictureStatistics:
-        """With kernels of some variance over a spectrum (SIDE, SIDE): what it leaves unknown of S counts as noise."""
-        over_places = variance[:, 1 : SIDE // 2]
+    def doubted_by(self, spread: KernelSpread | None) -> PictureStatistics:
+        """With kernels that are known to so much: what their variance leaves unknown of S counts as noise."""
+        if spread is None:
+            return self
+        over_places = spread.variance(SIDE)[:, 1 : SIDE // 2]
         sums = np.bincount(place_ring().ravel(), over_places.ravel(), RINGS)
         in_ring = sums / np.maximum(np.bincount(place_ring().ravel(), minlength=RINGS), 1)
         return replace(self, noise=self.noise + in_ring * self.signal)
@@ -157,14 +160,19 @@ class PictureStatistics:
             return self.places.expected_gain_db(self.signal, self.noise)
         real = np.sqrt(self.passed) if self.real is None else self.real
         left = np.sum(self.frequency * ((1 - 2 * real + self.passed) * self.signal + self.noise))
-        return max(float(10 * np.log10(left / self.joint_error(further, shared))), 0.0)
+        return max(float(10 * np.log10(left / np.sum(self.frequency * self._wrong(further, shared)))), 0.0)
 
-    def joint_error(self, further: Array, shared: float) -> float:
-        """Power that the ideal linear filter leaves wrong, by the rings' spectra; further, shared: as above."""
+    def ideal_error(self, further: Array, shared: float) -> float:
+        """Mean square, in grey levels, that the ideal linear filter leaves; arguments as of :meth:`joint_gain_db`."""
+        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0])
+        return float(area @ self._wrong(further, shared))
+
+    def _wrong(self, further: Array, shared: float) -> Array:
+        """(RINGS,) power of what the ideal linear filter leaves."""
         count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
         signal, noise, passed = self.signal[:, None], (1 + shared) * self.noise[:, None], passed + further[:, None]
-        wrong = (count * signal * noise / (passed * signal + noise)).sum(axis=1) / np.maximum(count.sum(axis=1), 1)
-        return float(np.sum(self.frequency * wrong))
+        wrong = count * signal * noise / (passed * signal + noise)
+        return np.asarray(wrong.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
 
 def falling_power(frequency: Array, signal: Array, ring: int) -> Array:

@@ -1,0 +1,36 @@
+"""The bench's fits: known constants come back from made-up gains."""
+
+import numpy as np
+import pytest
+
+from virest.app.bench.fits import best_value, fit_left_over, fit_workloads
+from virest.app.bench.workload import Scale, honesty_workloads
+
+
+def test_known_coefficients_come_back():
+    """Gains made by a law, with a little noise, give the law again within its deviations."""
+    rng, law = np.random.default_rng(3), np.array([2.0, 0.5, 0.3, 0.2])
+    rows = []
+    for k in range(240):
+        ideal, changed, left = np.exp(rng.normal((3.5, 4.0, -4.0), (0.8, 1.0, 1.0)))
+        logarithms = np.log([np.e, ideal, changed, left])
+        gain_db = 10 * np.log10(1 + changed / np.exp(logarithms @ law)) + rng.normal(0, 0.05)
+        rows.append({"capture": f"c{k % 8}", "changed": changed, "logarithms": logarithms, "gain_db": gain_db})
+    found = fit_left_over(rows)
+    assert found["coefficients"] == pytest.approx(law, abs=0.08)
+    assert np.all(np.array(found["std"]) < 0.1)
+    assert found["off_db"] < 0.1
+
+
+def test_the_best_value_lies_between_those_tried():
+    """A hill over the logarithm is found between its samples, and captures that differ give a deviation."""
+    values, shift = (0.03, 0.06, 0.1, 0.15, 0.25), np.linspace(-0.1, 0.1, 5)[:, None]
+    found = best_value(values, -((np.log(values) - np.log(0.08) - shift) ** 2))
+    assert found["best"] == pytest.approx(0.08, rel=0.05)
+    assert 0 < found["std"] < 0.02
+
+
+def test_what_is_fitted_is_not_what_is_judged():
+    """No capture has the seed of one that judges."""
+    judged = {w.name: w.options["seed"] for w in honesty_workloads(Scale())}
+    assert not {w.options["seed"] for w in fit_workloads(Scale())} & set(judged.values())

@@ -1,0 +1,60 @@
+"""What neighbours' account of a change makes of its promise, by hand-made figures and by the best filter."""
+
+import numpy as np
+import pytest
+
+from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
+
+FRAMES, PLACES = 2000, 16
+
+
+def _filtered(strength: float) -> tuple[np.ndarray, np.ndarray]:
+    """What recorded signals lack, and what a Wiener filter with so many times the noise changes, (FRAMES, PLACES)."""
+    rng = np.random.default_rng(5)
+    passed, noise = np.linspace(1.0, 0.0, PLACES) ** 2, 0.02
+    sharp = rng.normal(size=(FRAMES, PLACES))
+    recorded = passed * sharp + np.sqrt(noise) * rng.normal(size=sharp.shape)
+    restored = recorded * passed / (passed**2 + strength * noise)
+    return sharp - recorded, restored - recorded
+
+
+@pytest.mark.parametrize(("strength", "low", "high"), [(1.0, 0.97, 1.03), (0.1, -0.5, 0.7), (6.0, 1.1, 3.0)])
+def test_the_share_is_one_for_the_best_filter_and_less_for_one_that_does_too_much(strength, low, high):
+    """What the best filter leaves is unrelated to what it changed; too little noise assumed takes the share down."""
+    lacked, changed = _filtered(strength)
+    fall = (lacked**2).mean() - ((lacked - changed) ** 2).mean()
+    found = confirmed_gain([(fall, (changed**2).mean(), 0.01)] * 2)
+    assert found is not None
+    assert low < found.share < high
+
+
+def test_the_part_taken_leaves_the_least_error():
+    """Of a change that is too large, no other part leaves less of the error."""
+    lacked, changed = _filtered(0.1)
+    fall = (lacked**2).mean() - ((lacked - changed) ** 2).mean()
+    found = confirmed_gain([(fall, (changed**2).mean(), 0.01)] * 2)
+    assert found is not None
+    errors = {part: ((lacked - part * changed) ** 2).mean() for part in np.linspace(0, 1, 101)}
+    assert found.taken(0.0) == pytest.approx(min(errors, key=errors.__getitem__), abs=0.011)
+    assert found.taken(0.0) < found.taken(2.0) < 1.0
+
+
+def test_a_change_for_the_worse_promises_nothing():
+    """A share below nothing promises a loss before anything is restored."""
+    harmful = confirmed_gain([(-1.0, 2.0, 0.1), (-0.5, 1.0, 0.1)])
+    assert harmful is not None
+    assert harmful.expected_db(3.0) < 0
+
+
+def test_too_few_pairs_or_no_change_confirm_nothing():
+    """One pair has no scatter; no change has no share."""
+    assert confirmed_gain([(1.0, 1.0, 0.1)]) is None
+    assert confirmed_gain([(0.0, 0.0, 0.1)] * 3) is None
+
+
+def test_a_larger_change_promises_more_and_a_larger_rest_less():
+    """The promise grows with what was changed, falls with what the spectra leave, and has a deviation."""
+    found = ConfirmedGain(1.0, 0.2, 0.02, 4)
+    little, much, doubtful = (found.of_change_db(c, ideal) for c, ideal in ((5.0, 30.0), (50.0, 30.0), (50.0, 300.0)))
+    assert 0 < little[0] < doubtful[0] < much[0]
+    assert all(deviation > 0 for _, deviation in (little, much, doubtful))

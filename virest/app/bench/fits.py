@@ -1,0 +1,232 @@
+"""Constants that no single capture tells, fitted to captures with truth: which values fit best, and how well.
+
+The captures are those of the honesty table, made with other seeds, so that ``--only honesty`` judges what is fitted
+here.  Deviations are those of the captures: each is left out once (jackknife).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from virest.app.bench.tables import table
+from virest.app.bench.workload import Scale, Workload, honesty_workloads, simulated
+from virest.app.console import emit
+from virest.app.evaluation_captures import TrueCapture, open_true_capture
+from virest.evaluation.fidelity import psnr_db
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.frame import RestoredFrame
+from virest.restoration.neighbours import confirmation
+from virest.restoration.neighbours.confirmation import ConfirmedGain
+from virest.restoration.settings import PRESETS
+from virest.restoration.statistics import of_picture, ring_fit
+
+Array = NDArray[np.float64]
+Row = dict[str, Any]
+OTHER_SEEDS = 1000
+"""Added to the seeds of the captures that judge."""
+LEFT_OVER_NAMES = ("constant", "ideal filter's", "changed", "neighbours'")
+LEFT_OVER_PRESETS = ("fast", "balanced")
+OUTLYING_DB = 0.5
+"""Errors of the promised gain beyond this count by less than their square."""
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """A constant of which some values are tried on all captures."""
+
+    name: str
+    module: ModuleType
+    attribute: str
+    values: tuple[float, ...]
+
+
+SWEPT = (
+    Swept("curve error", of_picture, "CURVE_SLOPE_STD", (0.03, 0.06, 0.1, 0.15, 0.25)),
+    Swept("coder's slope", ring_fit, "_CODER_SLOPE", (0.5, 1.0, 1.5, 2.0, 2.5)),
+)
+
+
+def fits_section(work: Path, scale: Scale) -> tuple[Row, str]:
+    """Fit the promise to the gains, and look which values of the other constants gain most."""
+    rows: list[Row] = []
+    gains: dict[str, list[Array]] = {swept.name: [] for swept in SWEPT}
+    for workload in fit_workloads(scale):
+        truth = _opened(work, workload)
+        plan = truth.plan(PRESETS["fast"])
+        straight_db = _psnr_db(truth, replace(plan, settings=replace(plan.settings, deblur="none")))
+        rows += list(_promises(truth, plan, workload, straight_db))
+        for swept in SWEPT:
+            gains[swept.name].append(_swept_gains(truth, plan, swept, straight_db))
+        emit(f"{workload.name}: {len(straight_db)} frames")
+    promise = fit_left_over(rows)
+    best = {swept.name: best_value(swept.values, np.array(gains[swept.name])) for swept in SWEPT}
+    facts = {"left_over": promise, "swept": best, "frames": rows}
+    return facts, _text(promise, best, {s.name: (s.values, np.mean(gains[s.name], axis=0)) for s in SWEPT})
+
+
+def fit_workloads(scale: Scale) -> list[Workload]:
+    """The captures of the honesty table with other seeds."""
+    return [
+        dataclasses.replace(w, name=f"fit-{w.name}", options={**w.options, "seed": w.options["seed"] + OTHER_SEEDS})
+        for w in honesty_workloads(scale)
+    ]
+
+
+def fit_left_over(rows: Sequence[Row]) -> Row:
+    """Coefficients of :data:`confirmation.LEFT_OVER` that promise the gains best, their deviations, and the scatter.
+
+    rows: with ``capture``, ``changed``, ``logarithms`` (1, ln ideal, ln changed, ln left) and ``gain_db``.  Captures
+    count alike.
+    """
+    captures = np.array([row["capture"] for row in rows])
+    names = list(dict.fromkeys(captures.tolist()))
+    fitted = _fitted(rows, captures)
+    left_out = [_fitted([r for r in rows if r["capture"] != n], captures[captures != n]) for n in names]
+    spread = np.sqrt((len(names) - 1) * np.var(left_out, axis=0)) if len(names) > 1 else np.full(len(fitted), np.nan)
+    off_db = np.abs(_promised_db(rows, fitted) - [row["gain_db"] for row in rows])
+    slopes = (_promised_db(rows, fitted - (0.05, 0, 0, 0)) - _promised_db(rows, fitted)) / 0.05
+    return {
+        "coefficients": fitted.tolist(),
+        "std": spread.tolist(),
+        "scatter": float(1.4826 * np.median(off_db / np.maximum(slopes, 1e-3))),
+        "off_db": float(np.median(off_db)),
+        "captures": len(names),
+        "frames": len(rows),
+    }
+
+
+def best_value(values: Sequence[float], gains_db: Array) -> Row:
+    """Where the mean gain (captures, values) is greatest, by a parabola over the logarithm, and its deviation."""
+    found = _peak(values, gains_db.mean(axis=0))
+    count = len(gains_db)
+    left_out = [_peak(values, np.delete(gains_db, k, axis=0).mean(axis=0)) for k in range(count)] if count > 1 else []
+    spread = float(np.sqrt((count - 1) * np.var(left_out))) if left_out else float("nan")
+    return {"best": float(np.exp(found)), "std": float(np.exp(found) * spread), "captures": count}
+
+
+# ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class _Watched(ConfirmedGain):
+    """Keeps what it is asked about."""
+
+    asked: list[tuple[float, float]] = field(default_factory=list)
+
+    def of_change_db(self, changed: float, ideal: float) -> tuple[float, float]:
+        self.asked.append((changed, ideal))
+        return ConfirmedGain.of_change_db(self, changed, ideal)
+
+
+def _opened(work: Path, workload: Workload) -> TrueCapture:
+    folder = simulated(work, workload.name, **workload.options)
+    return open_true_capture(folder, folder / "truth" / "camera.yaml" if workload.true_profile else None)
+
+
+def _psnr_db(truth: TrueCapture, plan: RestorationPlan) -> dict[int, tuple[float, tuple[int, int, int, int]]]:
+    """PSNR and rectangle of each frame as a plan restores it."""
+    return {r.frame.index: (_against_truth(truth, r, r.valid_px), r.valid_px) for r in truth.restored(plan)}
+
+
+def _against_truth(truth: TrueCapture, restored: RestoredFrame, valid_px: tuple[int, int, int, int]) -> float:
+    assert restored.picture is not None
+    return float(psnr_db(restored.picture, truth.truth(restored.frame.index), valid_px))
+
+
+def _promises(
+    truth: TrueCapture, plan: RestorationPlan, workload: Workload, straight_db: dict[int, Any]
+) -> Iterator[Row]:
+    """What each deblurred frame's promise is made of, and its gain."""
+    if plan.confirmed is None or plan.confirmed.share <= 0:
+        return
+    for preset in LEFT_OVER_PRESETS:
+        watched = _Watched(**{f.name: getattr(plan.confirmed, f.name) for f in dataclasses.fields(ConfirmedGain)})
+        for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=watched)):
+            if restored.parameters["deblur"]["method"] == "none":
+                continue
+            changed, ideal = watched.asked[-1]
+            before_db, valid_px = straight_db[restored.frame.index]
+            yield {
+                "capture": workload.name,
+                "preset": preset,
+                "frame": restored.frame.index,
+                "changed": changed,
+                "logarithms": confirmation.tellers(ideal, changed, watched.left).tolist(),
+                "gain_db": _against_truth(truth, restored, valid_px) - before_db,
+            }
+
+
+def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straight_db: dict[int, Any]) -> Array:
+    """(values,) mean gain of a capture's frames with the constant set to each."""
+    usual, found = getattr(swept.module, swept.attribute), []
+    try:
+        for value in swept.values:
+            setattr(swept.module, swept.attribute, value)
+            gains = [
+                _against_truth(truth, r, straight_db[r.frame.index][1]) - straight_db[r.frame.index][0]
+                for r in truth.restored(plan)
+            ]
+            found.append(np.mean(gains))
+    finally:
+        setattr(swept.module, swept.attribute, usual)
+    return np.array(found)
+
+
+def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
+    logarithms, changed = (np.array([row[k] for row in rows]) for k in ("logarithms", "changed"))
+    return np.asarray(10 * np.log10(1 + changed / np.exp(logarithms @ coefficients)))
+
+
+def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
+    """(4,) coefficients."""
+    gain_db = np.array([row["gain_db"] for row in rows])
+    weight = 1 / np.sqrt([np.count_nonzero(captures == name) for name in captures])
+    weight /= weight.mean()
+
+    def off(coefficients: Array) -> Array:
+        return np.asarray((_promised_db(rows, coefficients) - gain_db) * weight)
+
+    return np.asarray(least_squares(off, confirmation.LEFT_OVER, loss="soft_l1", f_scale=OUTLYING_DB).x)
+
+
+def _peak(values: Sequence[float], gains_db: Array) -> float:
+    """Logarithm of the value at which a parabola through the best and its neighbours is highest."""
+    logarithms, at = np.log(values), int(np.clip(np.argmax(gains_db), 1, len(values) - 2))
+    bend, slope, _ = np.polyfit(logarithms[at - 1 : at + 2], gains_db[at - 1 : at + 2], 2)
+    peak = -slope / (2 * bend) if bend < 0 else logarithms[int(np.argmax(gains_db))]
+    return float(np.clip(peak, logarithms[at - 1], logarithms[at + 1]))
+
+
+def _text(promise: Row, best: dict[str, Row], swept: dict[str, tuple[Sequence[float], Array]]) -> str:
+    header = ["constant", "in use", "fits best", "std"]
+    lines = [
+        [f"LEFT_OVER, {name}", f"{used:.2f}", f"{value:.2f}", f"{std:.2f}"]
+        for name, used, value, std in zip(
+            LEFT_OVER_NAMES, confirmation.LEFT_OVER, promise["coefficients"], promise["std"], strict=True
+        )
+    ]
+    lines.append(["LEFT_OVER_STD", f"{confirmation.LEFT_OVER_STD:.2f}", f"{promise['scatter']:.2f}", "-"])
+    for one in SWEPT:
+        found = best[one.name]
+        used = getattr(one.module, one.attribute)
+        lines.append([one.name, f"{used:g}", f"{found['best']:.3g}", f"{found['std']:.2g}"])
+    curves = [
+        f"{name}: " + ", ".join(f"{value:g} {gain:+.3f} dB" for value, gain in zip(values, gains, strict=True))
+        for name, (values, gains) in swept.items()
+    ]
+    return (
+        f"FITS: {promise['frames']} frames of {promise['captures']} captures with seeds of their own; |promise-gain|\n"
+        f"{promise['off_db']:.2f} dB in the median with what fits best\n"
+        + table(header, lines)
+        + "\n"
+        + "\n".join(curves)
+    )

@@ -1,0 +1,60 @@
+"""What neighbouring frames show of the prediction, and of the gain, asked once for a capture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.capture.folder import Capture
+from virest.capture.join import outside_reason
+from virest.degradation.blur import Image
+from virest.degradation.row_motion import RowMotion
+from virest.motion.integration import integrate_gyro
+from virest.motion.optics import moving_lens
+from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame
+from virest.restoration.neighbours.refinement import RefinedMotion
+from virest.restoration.neighbours.sights import Sight
+from virest.restoration.neighbours.survey import survey_gain, survey_turns
+from virest.restoration.settings import PRESETS
+from virest.restoration.trial import tried
+
+
+def with_neighbours_asked(
+    plan: RestorationPlan,
+    capture: Capture,
+    runs: Sequence[Sequence[int]],
+    lumas: Mapping[int, NDArray[np.uint8]],
+) -> RestorationPlan:
+    """What neighbouring frames show that the predicted turns lack, and how much of a promised gain they confirm."""
+    profile = plan.profile
+    if not lumas or profile.intrinsics is None:
+        return plan
+    trajectory = integrate_gyro(capture.imu, profile)
+    lens, known = moving_lens(trajectory, profile), plan.translations or {}
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    sights = {}
+    for number, luma in lumas.items():
+        motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
+        end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
+        outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
+        sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
+    missing = survey_turns(runs, sights, trajectory, lens)
+    if missing is not None:
+        said = (
+            f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
+            "each frame's motion is corrected by its neighbours"
+        )
+        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, said))
+    if plan.settings.deblur == "none":
+        return plan
+    quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
+
+    def quickly(
+        luma: NDArray[np.uint8], motion: RowMotion, refined: RefinedMotion | None
+    ) -> tuple[Image, Image] | None:
+        return tried(luma, motion, quick, refined)
+
+    return replace(plan, confirmed=survey_gain(runs, sights, missing, trajectory, lens, quickly))

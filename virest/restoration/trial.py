@@ -1,0 +1,59 @@
+"""One frame's luma, quickly restored: what its neighbours are asked to judge at planning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.response import ResponseCurve
+from virest.degradation.blur import Image, tile_grid
+from virest.degradation.kernel_spread import kernel_spread
+from virest.degradation.kernels import blur_chords, smooth_field
+from virest.degradation.light import equivalent_length_px
+from virest.degradation.row_motion import RowMotion
+from virest.restoration.blurred import blurred_picture
+from virest.restoration.frame import blurred_part, deblur_method, too_little_to_gain, trusted_share
+from virest.restoration.neighbours.refinement import RefinedMotion
+from virest.restoration.neighbours.registration import reduction
+from virest.restoration.settings import RestorationSettings
+from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
+from virest.restoration.statistics.tile_power import FEW_TILES
+from virest.restoration.tile_layout import THIN_MARGIN
+from virest.restoration.tile_methods import tile_hyper_laplacian
+
+ANCHOR = 0.5
+"""Rows are restored to the middles of their exposures, at which neighbours are seen."""
+
+
+def tried(
+    luma: NDArray[np.uint8], motion: RowMotion, settings: RestorationSettings, refined: RefinedMotion | None
+) -> tuple[Image, Image] | None:
+    """Restore a luma (height, width); None where it is left alone.
+
+    Returns its light as recorded and as restored, of the size at which neighbours are compared.
+    """
+    height, width = luma.shape
+    centres_px = tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px
+    longest_px = float(np.linalg.norm(blur_chords(motion, centres_px), axis=-1).max())
+    longest_px = float(equivalent_length_px(motion.profile, longest_px))
+    if deblur_method(motion, settings, longest_px)[0] == "none":
+        return None
+    curve, field = motion.profile.response or ResponseCurve("srgb"), smooth_field(motion, ANCHOR)
+    statistics = picture_statistics(luma, field(most_blurred(motion, centres_px)), curve, FEW_TILES)
+    covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
+    spread = kernel_spread(field, width, height, covariance_px2)
+    model = statistics[0].doubted_by(spread)
+    if too_little_to_gain(model, model.expected_gain_db):
+        return None
+    blurred = blurred_picture(cv2.merge([luma] * 3), curve, statistics, field, longest_px)
+    sharp, recorded = tile_hyper_laplacian(replace(blurred, spread=spread), settings, THIN_MARGIN), blurred.light[0]
+    part = trusted_share(model) * blurred_part(motion, settings.min_blur_px, settings.tile_px)
+    restored = recorded + part * (np.clip(sharp, *curve.light_range) - recorded)
+    times = reduction(height, width)
+    size = width // times, height // times
+    return cv2.resize(recorded, size, interpolation=cv2.INTER_AREA), cv2.resize(
+        restored, size, interpolation=cv2.INTER_AREA
+    )
