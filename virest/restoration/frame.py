@@ -251,11 +251,8 @@ def _deblurred(
         part = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
         part, measured = part * _share_map(blurred, share), measured_share(blurred)
         part = part if measured is None else part * measured
-        part = (
-            part
-            if confirmed is None
-            else part * np.float32(confirmed.taken(sum(float(one.weights.mean()) for one in joined.pictures)))
-        )
+        if confirmed is not None:
+            part = part * np.float32(confirmed.taken(sum(float(one.weights.mean()) for one in joined.pictures)))
     restored = _mixed(sharp, recorded, part)
     ideal = luma_model.ideal_error(joined.passed, joined.shared)
     gain_db = (None, None) if confirmed is None else confirmed.of_change_db(_mean_square(restored, recorded), ideal)

@@ -24,10 +24,9 @@ from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import PairTurn, frame_tiles, pair_turn, reduced_light, tile_agreement
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
-TYPICAL_WEIGHTS, CORRECTED_WEIGHTS = (1.0, 0.95, 0.85), (0.9, 0.7, 0.35)
-"""What neighbours one, two, and three or more frames away weighed in the mean before any was chosen: on captures that
-obey their profile, and on such as need a correction of their turns, which is measured between direct neighbours only
-(simulated: a shake, a pan, a walk and photographs; two phones)."""
+TYPICAL_WEIGHTS = (1.0, 0.95, 0.85)
+"""What neighbours one, two, and three or more frames away weighed in the mean before any was chosen: on four simulated
+captures, a shake, a pan, a walk and photographs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +112,7 @@ class FrameNeighbours:
         turn, found = None if refined is None else refined.turn, []
         usable = [other for other in around if other.usable and other.frame.index != here.frame.index]
         if len(usable) > most:
-            passed = [self._typical_weight(other, here) * self._passed_of(other) for other in usable]
-            usable = [usable[k] for k in most_telling(passed, [0.0] * len(usable), luma, most)]
+            usable = self._most_telling(usable, here, luma, most)
         for other in usable if tiles is not None else ():
             assert other.motion is not None
             view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, turn=turn)
@@ -144,9 +142,14 @@ class FrameNeighbours:
             self._light[sight.frame.index] = light_of(sight)
         return self._light[sight.frame.index]
 
-    def _typical_weight(self, other: Sight, here: Sight) -> float:
-        weights = TYPICAL_WEIGHTS if self._missing is None else CORRECTED_WEIGHTS
-        return weights[min(abs(other.frame.index - here.frame.index), len(weights)) - 1]
+    def _most_telling(self, usable: Sequence[Sight], here: Sight, luma: PictureStatistics, most: int) -> list[Sight]:
+        """The best few by their blur; where turns are corrected, which holds between direct neighbours, only those."""
+        apart = [abs(other.frame.index - here.frame.index) for other in usable]
+        if self._missing is not None:
+            return [other for other, frames in zip(usable, apart, strict=True) if frames == 1]
+        weights = [TYPICAL_WEIGHTS[min(frames, len(TYPICAL_WEIGHTS)) - 1] for frames in apart]
+        passed = [weight * self._passed_of(other) for weight, other in zip(weights, usable, strict=True)]
+        return [usable[k] for k in most_telling(passed, [0.0] * len(usable), luma, most)]
 
     def _passed_of(self, sight: Sight) -> NDArray[np.float64]:
         """(RINGS,) mean |K|² over a frame's picture."""
