@@ -45,9 +45,16 @@ class MovingLens:
 
     def rays(self, points_px: Array, time_s: Any) -> Array:
         """Rays (..., 3) with z = 1 through pixels (..., 2) seen at times (...): the inverse of :meth:`project`."""
+        return self.from_rest(self.rays_at_rest(points_px, time_s), time_s)
+
+    def rays_at_rest(self, points_px: Array, time_s: Any) -> Array:
+        """Rays (..., 3) as if the stabiliser were at rest."""
         if self.focal_drift_per_s or self.zoom:
             points_px = self._about_centre(points_px, 1.0 / self._focal_scale(time_s))
-        rays = self.lens.rays(points_px)
+        return self.lens.rays(points_px)
+
+    def from_rest(self, rays: Array, time_s: Any) -> Array:
+        """Rays (..., 3) through where :meth:`rays_at_rest` go, with the stabiliser where it is at times (...)."""
         if self.shift is None:
             return rays
         plane = rays[..., :2] - self.shift_at(time_s)

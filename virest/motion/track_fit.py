@@ -312,15 +312,11 @@ class _Look:
     taken_px: Array
     """(n, 2) where the points were predicted when the slopes were taken."""
     taken_scene: Motion | None
-    flow: Array | None
-    """(n, 2, 3) of a unit step along each world axis, of a directed motion."""
 
     def is_stale(self, limit: tuple[float, float]) -> bool:
         """Whether points or scene have moved further than (px, part) since the slopes were taken."""
         if self.prediction.second_px is self.taken_px:
             return False
-        if isinstance(self.scene, DirectedMotion):
-            return True  # its directions are found anew at every look, and what lies across them with them
         moved_px = float(np.median(np.abs(self.prediction.second_px - self.taken_px)))
         return moved_px > limit[0] or _part_moved(self.taken_scene, self.scene) > limit[1]
 
@@ -389,24 +385,26 @@ class _Problem:
 
     def look(self, state: _State, before: _Look | None, limit: tuple[float, float] = NOT_AT_ALL) -> _Look:
         """Predict the points of a state; slopes of an earlier look serve while they are not stale."""
-        table, flow = self.table, None
-        if isinstance(state.scene, DirectedMotion):
-            scene, flow = _directed(table, state, state.scene)
-            state = replace(state, scene=scene)
+        table, scene = self.table, state.scene
         like = None if before is None else before.prediction
-        if before is not None:
-            prediction = predict(state.known, table, state.scene, like=like)
-            kept = _Look(state.scene, prediction, before.slope, before.taken_px, before.taken_scene, flow)
-            if not kept.is_stale(limit):
-                return kept
+        directed = isinstance(scene, DirectedMotion)
+        if before is not None or directed:
+            prediction = predict(state.known, table, scene, like=like)
+            if isinstance(scene, DirectedMotion):
+                prediction, scene = _directed(table, prediction, scene)
+            if before is not None:
+                kept = _Look(scene, prediction, before.slope, before.taken_px, before.taken_scene)
+                if not kept.is_stale(limit):
+                    return kept
             like = prediction
-        prediction = predict(state.known, table, state.scene, slopes=state.scene is not None, like=like)
-        slope = [self._term_slopes(state, prediction)]
-        slope += [] if prediction.slopes is None or self.start is None else [prediction.slopes]
+        if directed:  # whose points do not depend on which way it goes
+            slope = self._term_slopes(replace(state, scene=None), prediction)
+            return _Look(scene, prediction, slope, prediction.second_px, scene)
+        prediction = predict(state.known, table, scene, slopes=scene is not None, like=like)
+        slopes = [self._term_slopes(state, prediction)]
+        slopes += [] if prediction.slopes is None or self.start is None else [prediction.slopes]
         prediction = replace(prediction, slopes=None)
-        return _Look(
-            state.scene, prediction, np.concatenate(slope, axis=-1), prediction.second_px, state.scene, flow
-        )  # fmt: skip
+        return _Look(scene, prediction, np.concatenate(slopes, axis=-1), prediction.second_px, scene)
 
     def _term_slopes(self, state: _State, at: Prediction) -> Array:
         """(n, 2, k) change of the predicted points per unit of each term's values, by difference quotients."""
@@ -437,10 +435,10 @@ class _Problem:
         typical = NORMAL_MEDIAN if state.depth_spread == ANY_DEPTH else RAYLEIGH_MEDIAN
         scale = max(float(np.median(np.sqrt(squared))) / typical, SMALLEST_SCALE)
         weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
-        if isinstance(scene, DirectedMotion) and look.flow is not None:
-            noise = table.noise_px[table.pair]
+        if isinstance(scene, DirectedMotion):
+            noise, flow = table.noise_px[table.pair], np.asarray(look.prediction.per_step)
             rows, left = without_directions(
-                rows, left, weight, difference / noise[:, None], look.flow / noise[:, None, None], scene.direction,
+                rows, left, weight, difference / noise[:, None], flow / noise[:, None, None], scene.direction,
                 scene.group(table.pair),
             )  # fmt: skip
         flat = rows.reshape(2 * len(table), rows.shape[-1])
@@ -614,16 +612,14 @@ def many_directions(table: TrackTable) -> DirectedMotion:
     return DirectedMotion(np.zeros((table.n_pairs, 3)))
 
 
-def _directed(table: TrackTable, state: _State, motion: DirectedMotion) -> tuple[DirectedMotion, Array]:
-    """Directions found anew from the differences, and the flow (n, 2, 3) of a unit step along each world axis."""
-    known, groups = state.known, len(motion.direction)
-    turned_only = predict(known, table, None)
-    axes = (DirectedMotion(np.tile(axis, (groups, 1))) for axis in np.eye(3))
-    flow = np.stack([np.asarray(predict(known, table, axis, like=turned_only).along_px) for axis in axes], axis=-1)
-    difference = table.second_px - turned_only.second_px
-    noise = table.noise_px[table.pair]
+def _directed(table: TrackTable, at: Prediction, motion: DirectedMotion) -> tuple[Prediction, DirectedMotion]:
+    """Directions found anew from the differences, and the prediction with what lies along them."""
+    assert at.per_step is not None
+    noise, group = table.noise_px[table.pair], motion.group(table.pair)
     start = motion.direction if motion.direction.any() else None
     found = find_directions(
-        flow / noise[:, None, None], difference / noise[:, None], motion.group(table.pair), groups, start
-    )
-    return DirectedMotion(found), flow
+        at.per_step / noise[:, None, None], (table.second_px - at.second_px) / noise[:, None], group,
+        len(motion.direction), start,
+    )  # fmt: skip
+    along = np.squeeze(at.per_step @ found[group][..., None], -1)
+    return replace(at, along_px=along), DirectedMotion(found)

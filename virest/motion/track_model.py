@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from virest.camera.field import Field
+from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.displacement import Displacement, force_at_samples, integrate_accelerometer
@@ -133,6 +134,15 @@ class Poses:
 
 
 @dataclass(frozen=True, slots=True)
+class Sights:
+    """Rays through the first points with the stabiliser at rest: the same for every motion of one lens."""
+
+    lens: Intrinsics
+    rays: Array
+    """(n, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
 class Prediction:
     """Points as the model sees them, and how they depend on the scene and on the camera's translation."""
 
@@ -145,6 +155,10 @@ class Prediction:
     """(n, 2, k) change per entry of the motion's vector."""
     moved: Moved | None = None
     """How the camera moved between the two sights; None without translation."""
+    per_step: Array | None = None
+    """(n, 2, 3) change of second_px per unit of the camera's step over a point's depth, world axes; where asked for."""
+    sights: Sights | None = None
+    """Through which the first points are seen."""
 
     @property
     def first_s(self) -> Array:
@@ -283,16 +297,40 @@ def predict(
 
     like: an earlier prediction of the same table; what it shares with this one is not worked out again.
     """
-    poses = _poses(known, table, like)
-    world = turned(poses.before, known.lens.rays(table.first_px, poses.first_s))
-    if scene is None:
-        return Prediction(known.lens.project(turned(poses.back, world), poses.second_s), poses)
-    if isinstance(scene, DirectedMotion):
+    poses, sights = _poses(known, table, like), _sights(known.lens, table, like)
+    at_rest = known.lens.rays_at_rest(table.first_px, poses.first_s) if sights is None else sights.rays
+    world = turned(poses.before, known.lens.from_rest(at_rest, poses.first_s))
+    if scene is None or isinstance(scene, DirectedMotion):
+        rays = turned(poses.back, world)
+        expected = known.lens.project(rays, poses.second_s)
+        if scene is None:
+            return Prediction(expected, poses, sights=sights)
+        per_step = _lens_slope(known, rays, poses.second_s, expected) @ poses.back
         step = scene.direction[scene.group(table.pair)]
-        return _seen_again(known, world, poses, Moved(step, None, np.zeros(len(table)), np.zeros((len(table), 3, 0))))
+        along = np.squeeze(per_step @ step[..., None], -1)
+        return Prediction(expected, poses, along, per_step=per_step, sights=sights)
     paths = like.moved.paths if like is not None and like.moved is not None and like.poses is poses else None
     paths = paths or _paths(known, table, scene, poses)
-    return _seen_again(known, world, poses, _moved_inertially(table, scene, world, paths, slopes))
+    seen = _seen_again(known, world, poses, _moved_inertially(table, scene, world, paths, slopes))
+    return replace(seen, sights=sights)
+
+
+def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sights | None:
+    """Rays through the first points where they do not depend on the time, an earlier prediction's if the lens is its.
+
+    None: the focal length changes.
+    """
+    if lens.focal_drift_per_s or lens.zoom:
+        return None
+    if like is not None and like.sights is not None and like.sights.lens == lens.lens:
+        return like.sights
+    return Sights(lens.lens, lens.lens.rays(table.first_px))
+
+
+def _lens_slope(known: Ground, rays: Array, second_s: Array, expected: Array) -> Array:
+    """Change (n, 2, 3) of pixels per unit of each part of rays (n, 3)."""
+    steps = (known.lens.project(rays + RAY_STEP * axis, second_s) for axis in np.eye(3))
+    return np.stack([(step - expected) / RAY_STEP for step in steps], axis=-1)
 
 
 def _poses(known: Ground, table: TrackTable, like: Prediction | None) -> Poses:
@@ -362,10 +400,7 @@ def _seen_again(known: Ground, world: Array, poses: Poses, moved: Moved) -> Pred
         return Prediction(
             expected, poses, (known.lens.project(ahead, second_s) - expected) / RAY_STEP, None, moved
         )  # fmt: skip
-    lens_slope = np.stack(
-        [(known.lens.project(rays + RAY_STEP * axis, second_s) - expected) / RAY_STEP for axis in np.eye(3)], axis=-1
-    )
-    per_world = lens_slope @ back
+    per_world = _lens_slope(known, rays, second_s, expected) @ back
     along = np.squeeze(per_world @ moved.step[..., None], -1)
     return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
 
