@@ -31,6 +31,7 @@ TILT_STD, KNOWN_DEPTH_STD = 0.8, 0.03
 """Of a plane at a known depth: its slope, and the part by which the depth ahead differs between moments."""
 MISPLACED, HELD_DEPTH_STD = 4.0, 1e-3
 """A plane that points pull this many KNOWN_DEPTH_STD away is held where the profile says: that is what is judged."""
+ITERATIONS = 10
 START_INVERSE_DEPTH_PER_M = 0.5
 MIN_SWAY_DEPTH_PER_M = 1e-4
 
@@ -95,9 +96,11 @@ class Evidence:
         return distances(self.imu, fitted, table, depth_spread_per_m)
 
 
-def fit_model(imu: ImuSamples, model: Model, terms: Sequence[Term], table: TrackTable) -> TrackFit:
+def fit_model(
+    imu: ImuSamples, model: Model, terms: Sequence[Term], table: TrackTable, iterations: int = ITERATIONS
+) -> TrackFit:
     """Fit terms and the scene from a model."""
-    return fit_tracks(imu, table, model.profile, terms, model.scene, max_iterations=10)
+    return fit_tracks(imu, table, model.profile, terms, model.scene, max_iterations=iterations)
 
 
 def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:

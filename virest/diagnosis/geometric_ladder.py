@@ -42,6 +42,7 @@ from virest.diagnosis.trials import (
     judge,
     lagging_gain,
     promising,
+    race,
     screen,
     t_ratio,
 )
@@ -73,6 +74,8 @@ PAIR_FIRSTS, PAIRS_JUDGED = 8, 4
 """The best causes alone, each beside all others, which it may hide; pairs that each fold chooses from."""
 RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
+EVEN_T = 0.25
+"""Of two rivals neither is the better one below this many standard errors."""
 MAX_RUNGS = 5
 PLAUSIBLE = {
     "time_offset": 2.0,
@@ -160,7 +163,8 @@ def climb(
     say(0.6)
     verdict = _conclude(evidence, nominal_model, path.model, list(path.accepted), list(path.rungs), nominal)
     if fork is not None:
-        other, _ = _ascended(course, fork, max_rungs)
+        among = frozenset(entry.name for entry in path.accepted)
+        other, _ = _ascended(replace(course, among=among), fork, max_rungs)
         say(0.9)
         rival = _conclude(evidence, nominal_model, other.model, list(other.accepted), list(other.rungs), nominal)
         verdict = _either(evidence, verdict, rival)
@@ -201,8 +205,9 @@ def _ascended(course: _Course, path: _Path, max_rungs: int) -> tuple[_Path, _Pat
 def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
     """The better of two ends of the ladder by held-out blocks; where those do not tell, one with the other as a rival.
 
-    Which of the two was reached first may hang on rounding; which one is returned then follows from the causes' number
-    and names alone.
+    Which of the two was reached first may hang on rounding, and which is told must not: where the blocks do not tell,
+    it is the end with fewer causes; of equally many the one with the lower held-out loss; where the blocks' means differ
+    by less than EVEN_T standard errors, so that rounding may change their order, the names decide.
     """
     ends = [
         Screened(Candidate("", end.model, (), None), (end.model, end.model), (0.0, 0.0), end.fit.scale, 0.0)
@@ -213,7 +218,15 @@ def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdic
     worse = t_ratio(other.block_loss - one.block_loss)
     if abs(worse) >= RIVAL_T:
         return first if worse > 0 else second
-    chosen, rival = sorted((first, second), key=lambda end: (len(end.accepted), sorted(e.name for e in end.accepted)))
+    better = first if worse > 0 else second
+    chosen, rival = sorted(
+        (first, second),
+        key=lambda end: (
+            len(end.accepted),
+            abs(worse) >= EVEN_T and end is not better,
+            sorted(e.name for e in end.accepted),
+        ),
+    )
     rms = (other if rival is second else one).rms * evidence.typical_px
     names = {entry.name for entry in chosen.accepted}
     instead = [Rival(entry.name, rms) for entry in rival.accepted if entry.name not in names]
@@ -265,10 +278,13 @@ class _Course:
     lags: Sequence[Schedule]
     far: FarClock
     each: Each
+    among: frozenset[str] | None = None
+    """Names of the causes that may enter; None: all."""
 
     def candidates(self, model: Model, tried: set[str]) -> list[Candidate]:
         """All causes not yet in a model."""
         found = candidates_of(self.evidence, self.nominal, model, tried, self.lags, self.far)
+        found = [entry for entry in found if self.among is None or entry.name in self.among]
         return worth_beginning(self.evidence, model, found)
 
     def judged(self, base: Screened, better: Sequence[Screened], count: int) -> Trial:
@@ -394,25 +410,19 @@ def _best_pair(
 
     A stabiliser hides the clocks' drift, and the drift blurs what the stabiliser does.
     """
-    evidence = course.evidence
-    firsts = [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]
-    best: dict[frozenset[str], tuple[Candidate, Screened]] = {}
-    for first in firsts:
+    pairs: list[Candidate] = []
+    members_of: dict[str, tuple[Candidate, Candidate]] = {}
+    for first in [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]:
         with_it = replace(first.model, terms=(*first.model.terms, *first.added))
-        begun = course.candidates(with_it, {*tried, first.name})
-        seconds = [candidate for candidate in begun if candidate.added]
-        for second in best_of_each(screen(evidence, seconds, course.each)):
-            both = frozenset((first.name, second.candidate.name))  # A beside B is B beside A
-            if both not in best or second.loss < best[both][1].loss:
-                best[both] = first, second
-    found = list(best.values())
-    if not found:
+        for second in course.candidates(with_it, {*tried, first.name}):
+            if second.added:
+                name = JOINED.join(sorted((first.name, second.name)))  # A beside B is B beside A
+                members_of.setdefault(name, (first, second))
+                pairs.append(replace(second, name=name))
+    if not pairs:
         return None, None
-    members_of = {_pair_name(first, entry): (first, entry.candidate) for first, entry in found}
-    renamed = [
-        replace(entry, candidate=replace(entry.candidate, name=_pair_name(first, entry))) for first, entry in found
-    ]
-    trial = course.judged(base, sorted(renamed, key=lambda entry: entry.loss), PAIRS_JUDGED)
+    found = best_of_each(race(course.evidence, pairs, PAIRS_JUDGED, course.each))
+    trial = course.judged(base, found, PAIRS_JUDGED)
     before = trial.before
     for pair, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
@@ -444,10 +454,6 @@ def _pair_step(
         for member, p_value in zip(members, p_values, strict=True)
     )
     return _Step(entered, causes, float((before.block_loss - after.block_loss).mean() / before.block_loss.mean()))
-
-
-def _pair_name(first: Candidate, second: Screened) -> str:
-    return f"{first.name}{JOINED}{second.candidate.name}"
 
 
 def _with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:

@@ -11,7 +11,16 @@ from scipy import stats
 
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
-from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss, relief_loss
+from virest.diagnosis.geometric_evidence import (
+    ITERATIONS,
+    Evidence,
+    Model,
+    capped_rms,
+    distances,
+    fit_model,
+    loss,
+    relief_loss,
+)
 from virest.motion.shared_out import Each
 from virest.motion.track_fit import Term
 from virest.motion.track_model import TrackTable
@@ -22,6 +31,8 @@ JUDGE_POINTS = 3500
 LAGGING_BLOCK = 2
 """Pairs in a block of those that a start-up moves: neighbours share a frame, and nothing was fitted that more share."""
 
+GLANCE, RACED, RACED_STARTS = 2, 3, 2
+"""Steps that all of many candidates take; causes that go on from there, times those wanted, and starts of each."""
 
 FOLDS = (0, 1)
 """A fit of fold k sees the blocks of time whose number is k modulo 2; the others judge it."""
@@ -62,25 +73,52 @@ class Screened:
 
 def screen(evidence: Evidence, candidates: Sequence[Candidate], each: Each) -> list[Screened]:
     """Fit each candidate to the blocks of each fold."""
+    return _descended(evidence, [(c, (c.model, c.model)) for c in candidates], ITERATIONS, each)
+
+
+def race(evidence: Evidence, candidates: Sequence[Candidate], count: int, each: Each) -> list[Screened]:
+    """Screen many: all begin, those that are best for either fold after a few steps go on to the end.
+
+    Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  Of each cause up to RACED_STARTS starting points
+    go on, of the causes as many as RACED times the count that is wanted.
+    """
+    begun = _descended(evidence, [(c, (c.model, c.model)) for c in candidates], GLANCE, each)
+    going: set[int] = set()
+    for fold in FOLDS:
+        starts: dict[str, list[int]] = {}
+        for k in sorted(range(len(begun)), key=lambda k, f=fold: begun[k].losses[f]):  # type: ignore[misc]
+            starts.setdefault(begun[k].candidate.name, []).append(k)
+        going |= {k for own in list(starts.values())[: RACED * count] for k in own[:RACED_STARTS]}
+    further = [(candidates[k], begun[k].models) for k in sorted(going)]
+    return _descended(evidence, further, ITERATIONS - GLANCE, each)
+
+
+def _descended(
+    evidence: Evidence, starts: Sequence[tuple[Candidate, tuple[Model, Model]]], iterations: int, each: Each
+) -> list[Screened]:
+    """Fit each candidate to the blocks of each fold, from the model of that fold."""
     tables = {
-        lag: evidence.table(model, SCREEN_POINTS) for lag, model in {c.model.lag: c.model for c in candidates}.items()
-    }
+        lag: evidence.table(model, SCREEN_POINTS)
+        for lag, model in {c.model.lag: c.model for c, _ in starts}.items()
+    }  # fmt: skip
     use = [evidence.block % 2 == fold for fold in FOLDS]
     calls = [
-        (evidence.imu, tables[c.model.lag], c.model, (*c.model.terms, *c.added), use[fold])
-        for c in candidates
+        (evidence.imu, tables[c.model.lag], models[fold], (*c.model.terms, *c.added), use[fold], iterations)
+        for c, models in starts
         for fold in FOLDS
     ]
     found = each(_screen, calls)
-    return [_screened(c, *halves) for c, *halves in zip(candidates, found[::2], found[1::2], strict=True)]
+    return [_screened(c, *halves) for (c, _), *halves in zip(starts, found[::2], found[1::2], strict=True)]
 
 
 Half = tuple[float, Model, float, float]
 """Loss, fitted model, scale and spread of depths of a candidate on the blocks of one fold."""
 
 
-def _screen(imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask) -> Half:
-    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]))
+def _screen(
+    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, iterations: int
+) -> Half:
+    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]), iterations)
     found = replace(model, profile=fitted.profile, scene=fitted.scene)
     return relief_loss(fitted), found, fitted.scale, fitted.depth_spread_per_m
 
