@@ -97,10 +97,17 @@ class Evidence:
 
 
 def fit_model(
-    imu: ImuSamples, model: Model, terms: Sequence[Term], table: TrackTable, iterations: int = ITERATIONS
+    imu: ImuSamples,
+    model: Model,
+    terms: Sequence[Term],
+    table: TrackTable,
+    iterations: int = ITERATIONS,
+    covariances: bool = True,
 ) -> TrackFit:
     """Fit terms and the scene from a model."""
-    return fit_tracks(imu, table, model.profile, terms, model.scene, max_iterations=iterations)
+    return fit_tracks(
+        imu, table, model.profile, terms, model.scene, max_iterations=iterations, covariances=covariances
+    )
 
 
 def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:

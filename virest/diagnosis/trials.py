@@ -118,7 +118,7 @@ Half = tuple[float, Model, float, float]
 def _screen(
     imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, iterations: int
 ) -> Half:
-    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]), iterations)
+    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]), iterations, covariances=False)
     found = replace(model, profile=fitted.profile, scene=fitted.scene)
     return relief_loss(fitted), found, fitted.scale, fitted.depth_spread_per_m
 
@@ -213,7 +213,7 @@ def _held_out(
     imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, depth_spread_per_m: float
 ) -> Array:
     """Distances (n,) of all points from a fit on the pairs in ``use`` (pairs,)."""
-    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]))
+    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]), covariances=False)
     return distances(imu, fitted, table, depth_spread_per_m)
 
 

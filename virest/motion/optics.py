@@ -40,6 +40,8 @@ class MovingLens:
     """(m, 2) at those times, units of the focal length, added before distortion; straight lines between, ends held."""
     path: tuple[Array, Array] | None = None
     """All times (k,) of the motion and the camera's rates (k, 3) then, from which the shift was worked out."""
+    swing: tuple[float, Array] | None = None
+    """Cutoff (Hz) of the stabiliser and the shift (k, 2) at those times if it cancelled all above it, from rest."""
     zoom: tuple[Field, ...] = ()
     """Parts by which the focal length is longer, over time or over what is logged."""
 
@@ -82,7 +84,8 @@ class MovingLens:
             return self
         first = max(int(np.searchsorted(self.shift_time_s, start_s, side="right")) - 1, 0)
         last = int(np.searchsorted(self.shift_time_s, end_s)) + 1
-        return replace(self, shift_time_s=self.shift_time_s[first:last], shift=self.shift[first:last], path=None)
+        cut = slice(first, last)
+        return replace(self, shift_time_s=self.shift_time_s[cut], shift=self.shift[cut], path=None, swing=None)
 
     def _focal_scale(self, time_s: Any) -> Array:
         drifted = 1.0 + self.focal_drift_per_s * np.asarray(time_s, float)[..., None]
@@ -114,12 +117,15 @@ def moving_lens(
         grid_s = _shift_grid(*trajectory.span_s, step_s)
         path = grid_s, trajectory.rate_rad_s(grid_s)
     time_s, fraction, cutoff_hz = path[0], extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
-    shift = stabiliser_shift(*path, fraction, cutoff_hz)
+    swing = None if like is None else like.swing
+    if swing is None or swing[0] != cutoff_hz or like is None or like.path is not path:
+        swing = cutoff_hz, stabiliser_shift(*path, 1.0, cutoff_hz)
+    shift = fraction * swing[1]
     if any(extensions.stabilisation_lean_rad):
         about_x, about_y = extensions.stabilisation_lean_rad
         forgotten = np.exp(-2 * np.pi * cutoff_hz * (time_s - time_s[0]))
         shift = shift + fraction * forgotten[:, None] * np.array([about_y, -about_x])
-    return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path, zoom)
+    return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path, swing, zoom)
 
 
 def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:

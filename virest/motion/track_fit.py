@@ -228,8 +228,13 @@ def fit_tracks(
     known: Ground | None = None,
     blocks: int = 12,
     max_iterations: int = MAX_ITERATIONS,
+    covariances: bool = True,
 ) -> TrackFit:
-    """Gauss-Newton from a profile; scene None: rotation only. Raises ImuError for too few inertial samples."""
+    """Gauss-Newton from a profile; scene None: rotation only. Raises ImuError for too few inertial samples.
+
+    covariances: False leaves the last slopes where they were taken: values and differences are the same, covariances
+    are coarse.
+    """
     terms = tuple(terms)
     inertial = isinstance(scene, InertialMotion)
     if known is None or (inertial and known.displacement is None):
@@ -241,7 +246,7 @@ def fit_tracks(
     state = _State(known, scene, np.zeros(sum(map(len, terms))), ANY_DEPTH if directed else 0.0)
     look: _Look | None = None
     for _ in range(SPREAD_PASSES if inertial else 1):
-        state, system = _descend(imu, table, terms, scene, state, max_iterations, look)
+        state, system = _descend(imu, table, terms, scene, state, max_iterations, look, covariances)
         if inertial and abs(system.depth_spread - state.depth_spread) <= SPREAD_TOLERANCE * system.depth_spread:
             break
         state = replace(state, depth_spread=system.depth_spread if inertial else state.depth_spread)
@@ -257,10 +262,11 @@ def _descend(
     state: _State,
     max_iterations: int,
     look: _Look | None,
+    fresh: bool,
 ) -> tuple[_State, _System]:
     """Levenberg-Marquardt at one spread of depths; the robust scale follows each accepted step.
 
-    look: at this state, from an earlier descent.
+    look: at this state, from an earlier descent.  fresh: slopes are taken anew where it ends.
     """
     problem = _Problem(imu, table, terms, start)
     system, damping = problem.weighed(state, look or problem.look(state, None)), 0.0
@@ -285,7 +291,7 @@ def _descend(
             break
         if small:
             system = problem.weighed(state, problem.look(state, system.look, AT_THE_END))
-    if system.look.is_stale(AT_THE_END):
+    if fresh and system.look.is_stale(AT_THE_END):
         system = problem.weighed(state, problem.look(state, system.look, AT_THE_END))
     return state, system
 
