@@ -412,12 +412,14 @@ def _best_pair(
     """
     pairs: list[Candidate] = []
     members_of: dict[str, tuple[Candidate, Candidate]] = {}
+    done: set[str] = set()
     for first in [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]:
         with_it = replace(first.model, terms=(*first.model.terms, *first.added))
-        for second in course.candidates(with_it, {*tried, first.name}):
+        done |= {first.name}  # A beside B is B beside A
+        for second in course.candidates(with_it, {*tried, *done}):
             if second.added:
-                name = JOINED.join(sorted((first.name, second.name)))  # A beside B is B beside A
-                members_of.setdefault(name, (first, second))
+                name = f"{first.name}{JOINED}{second.name}"
+                members_of[name] = first, second
                 pairs.append(replace(second, name=name))
     if not pairs:
         return None, None
