@@ -87,6 +87,19 @@ def test_ends_that_held_out_points_do_not_tell_apart_are_rivals(swapped: bool, m
     assert found.rival is one
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_of_two_rivals_the_one_that_held_out_points_are_better_off_with_is_told(
+    swapped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By one standard error: too little to tell them apart, enough to say which is told first, whichever came first."""
+    good, bad = 0.5 + WOBBLE, 0.504 + 1.3 * WOBBLE
+    evidence, (one, other) = ends(monkeypatch, (bad, good) if swapped else (good, bad))
+    first, second = (other, one) if swapped else (one, other)
+    found = _either(evidence, first, second)
+    assert [entry.name for entry in found.accepted] == ["clock_skew", "stabilisation"]
+    assert [rival.name for rival in found.accepted[1].rivals] == ["principal_point"]
+
+
 def test_the_better_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where every block prefers one end there is no rival."""
     evidence, (one, other) = ends(monkeypatch, (0.5 + 0.1 * WOBBLE, 0.7 - 0.1 * WOBBLE))

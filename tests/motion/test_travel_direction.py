@@ -10,7 +10,7 @@ from synthetic_tracks import Setup, recorded
 
 from virest.motion import profile_terms as terms_of
 from virest.motion.scene_motion import DirectedMotion
-from virest.motion.track_fit import fit_tracks, many_directions, one_direction
+from virest.motion.track_fit import _Look, _Problem, fit_tracks, many_directions, one_direction
 from virest.motion.travel_direction import find_directions, without_directions
 
 Array = np.ndarray
@@ -114,3 +114,20 @@ def test_a_wandering_camera_has_a_direction_for_each_pair() -> None:
     agree = np.abs((many.scene.direction * recording.in_trajectory_axes(unit(travel))).sum(axis=1))
     assert fast.sum() > 15
     assert np.median(agree[fast]) > np.cos(np.radians(5))
+
+
+def test_slopes_serve_while_directions_are_found_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where points go by turning alone, and how that depends on a profile, no direction changes: fewer slopes do."""
+    recording = recorded(DRIVE)
+    table, taken = recording.table(), []
+    start = terms_of.shift_offset(recording.profile, np.array([0.004]))
+    of_terms = _Problem._term_slopes
+    monkeypatch.setattr(_Problem, "_term_slopes", lambda *given: taken.append(1) or of_terms(*given))
+    kept = fit_tracks(recording.imu, table, start, WANTED, one_direction())
+    few = len(taken)
+    monkeypatch.setattr(_Look, "is_stale", lambda look, _limit: look.prediction.second_px is not look.taken_px)
+    anew = fit_tracks(recording.imu, table, start, WANTED, one_direction())
+    assert 2 * few <= len(taken) - few
+    std = np.concatenate([anew.std(term.name) for term in WANTED])
+    assert (np.abs(kept.change - anew.change) < 0.1 * std).all()
+    np.testing.assert_allclose(np.diag(kept.covariance), np.diag(anew.covariance), rtol=0.05)

@@ -105,9 +105,7 @@ def fit_model(
     covariances: bool = True,
 ) -> TrackFit:
     """Fit terms and the scene from a model."""
-    return fit_tracks(
-        imu, table, model.profile, terms, model.scene, max_iterations=iterations, covariances=covariances
-    )
+    return fit_tracks(imu, table, model.profile, terms, model.scene, max_iterations=iterations, covariances=covariances)
 
 
 def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:

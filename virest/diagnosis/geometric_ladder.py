@@ -151,6 +151,8 @@ def climb(
     """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
 
     lags: the start-up schedules to try.  far: changes of the clocks at which turns were seen to agree.
+    Where a rival might have entered first, the ladder is climbed once more from there, with the causes of the first climb
+    alone: whatever else the rival needs makes it the less simple explanation.
     """
     say = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
@@ -205,9 +207,9 @@ def _ascended(course: _Course, path: _Path, max_rungs: int) -> tuple[_Path, _Pat
 def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
     """The better of two ends of the ladder by held-out blocks; where those do not tell, one with the other as a rival.
 
-    Which of the two was reached first may hang on rounding, and which is told must not: where the blocks do not tell,
-    it is the end with fewer causes; of equally many the one with the lower held-out loss; where the blocks' means differ
-    by less than EVEN_T standard errors, so that rounding may change their order, the names decide.
+    Which of the two was reached first may depend on rounding; which is told must not.  Where the blocks do not tell, it
+    is the end with fewer causes; of equally many, the one with the lower held-out loss; where that differs by less than
+    EVEN_T standard errors, so that rounding may change the order, the names decide.
     """
     ends = [
         Screened(Candidate("", end.model, (), None), (end.model, end.model), (0.0, 0.0), end.fit.scale, 0.0)
