@@ -151,8 +151,8 @@ def climb(
     """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
 
     lags: the start-up schedules to try.  far: changes of the clocks at which turns were seen to agree.
-    Where a rival might have entered first, the ladder is climbed once more from there, with the causes of the first climb
-    alone: whatever else the rival needs makes it the less simple explanation.
+    Where a rival might have entered first, the ladder is climbed once more from there, with the causes of the first
+    climb alone: whatever else the rival needs makes it the less simple explanation.
     """
     say = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
