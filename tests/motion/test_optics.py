@@ -88,6 +88,22 @@ def test_the_start_is_forgotten_after_the_settling_time() -> None:
     assert settling_time_s(phone()) == 0.0
 
 
+def test_what_a_lens_of_the_same_motion_knows_is_only_taken_where_it_holds() -> None:
+    """A lens worked out like another of the same motion is the lens worked out by itself, whatever else changed."""
+    profile = phone()
+    trajectory = sampled(HAND, profile, -0.5, 1.2)
+    first = moving_lens(trajectory, extended(profile, stabilisation_fraction=0.6, stabilisation_cutoff_hz=0.7))
+    for fraction, cutoff_hz in ((0.35, 0.7), (0.6, 1.9)):
+        other = extended(profile, stabilisation_fraction=fraction, stabilisation_cutoff_hz=cutoff_hz)
+        alone, alike = moving_lens(trajectory, other), moving_lens(trajectory, other, like=first)
+        assert alone.shift is not None
+        np.testing.assert_array_equal(alike.shift, alone.shift)
+        assert np.abs(alone.shift - first.shift).max() > 1e-3
+    turned = Trajectory(trajectory.time_s, trajectory.rotation_world_cam, 0.5 * trajectory.rate_polynomials)
+    again = extended(profile, stabilisation_fraction=0.6, stabilisation_cutoff_hz=0.7)
+    np.testing.assert_allclose(moving_lens(turned, again).shift, 0.5 * first.shift, atol=1e-12)
+
+
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_lens_at_rest_is_the_profiles_own(lens: tuple[str, tuple[float, ...]]) -> None:
     """Without drift and stabiliser, rays and pixels are those of the intrinsics, to the last bit."""
