@@ -44,3 +44,42 @@ def make_bracket(curve: ResponseCurve, rng: np.random.Generator, *, width: int =
     factors = 2.0 ** np.linspace(-span_ev / 2, span_ev / 2, count)
     return [BracketPicture(f"{i:02d}.png", take(light, f, curve, rng, noise), float(f / 60))
             for i, f in enumerate(factors)]  # fmt: skip
+
+
+def as_jpeg(levels: NDArray[np.float64], quality: int) -> NDArray[np.uint8]:
+    """A picture written as JPEG with its colours at half size, and read again."""
+    whole = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    halved = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    _, data = cv2.imencode(".jpg", whole[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality, *halved])
+    return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def make_dark_jpegs(
+    curve: ResponseCurve, rng: np.random.Generator, colour: float = 0.7, read_noise: float = 12.0
+) -> list[BracketPicture]:
+    """Nine pictures 1 EV apart, most of them dark, as a small sensor's.
+
+    Noise of electrons cut off at black, colours mixed by a matrix that goes below zero, greys rounded and coded.
+    """
+    light = make_scene(420, 310, rng).astype(np.float64)
+    patch = colour * rng.standard_normal((14, 18, 3)).astype(np.float32)
+    light *= np.exp(cv2.resize(patch, (420, 310), interpolation=cv2.INTER_NEAREST))
+    mix = np.array([[1.7, -0.5, -0.2], [-0.25, 1.5, -0.25], [0.05, -0.5, 1.45]])
+    seen = np.clip(light @ np.linalg.inv(mix).T, 0.0, None)
+    out = []
+    for i, ev in enumerate(np.arange(-9.0, 0.0)):
+        electrons = rng.poisson(np.minimum(seen * 2.0**ev, 3.0) * 1000) + read_noise * rng.standard_normal(seen.shape)
+        raw = np.clip(np.rint(electrons / 4) * 4 / 1000, 0.0, 1.0)
+        out.append(BracketPicture(f"{i}.jpg", as_jpeg(255 * curve.encode(raw @ mix.T), 80), float(2.0**ev)))
+    return out
+
+
+def make_scans(curve: ResponseCurve, rng: np.random.Generator, ends: NDArray[np.float64]) -> list[BracketPicture]:
+    """Scanned film, 1 EV apart: each channel runs between its own black and white (2, 3), levels."""
+    light = make_scene(420, 310, rng) ** 1.6
+    out = []
+    for i, ev in enumerate(np.linspace(-7.0, 6.0, 14)):
+        grey = curve.encode(np.clip(light * 2.0**ev, 0.0, 1.0))
+        levels = ends[0] + (ends[1] - ends[0]) * grey + 0.8 * rng.standard_normal(light.shape)
+        out.append(BracketPicture(f"{i:02d}.png", np.clip(np.rint(levels), 0, 255).astype(np.uint8), float(2.0**ev)))
+    return out

@@ -4,20 +4,28 @@ Pictures are aligned by what exposure does not change, the rank of each pixel am
 of Ward 2003, "Fast, robust image registration for compositing high dynamic range photographs from hand-held exposures",
 doi:10.1080/10867651.2003.10487583, whose median threshold bitmaps are ranks of one bit).  Samples are means over small
 flat squares, spread over the picture and over its brightnesses; squares on edges are left out, since there the smallest
-misalignment counts as light.  The three channels are pooled: one curve stands for all, as in the camera profile.
+misalignment counts as light.  Black, white and noise are each channel's own (``grey_levels``); beyond them the channels
+are pooled: one curve stands for all, as in the camera profile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from virest.calibration.grey_levels import (
+    CUT_SIGMA,
+    ChannelEnds,
+    GreyNoise,
+    channel_ends,
+    of_means,
+    pixel_noise,
+)
 from virest.errors import CalibrationError
 
 Array = NDArray[np.float64]
@@ -29,7 +37,6 @@ STEEPEST = 4 / 256
 CANDIDATES = 9000
 SITES = 900
 MIN_SITES = 40
-FLAT_SHARE = 0.1
 PILE = 0.02
 """Share of the samples within the noise of the darkest or brightest that makes it a place where greys pile up."""
 ABOVE_PILE = 0.1
@@ -57,38 +64,68 @@ class BracketSamples:
     """(samples, pictures), mean levels of small squares, 0 to 255."""
     site: NDArray[np.int64]
     """(samples,) which place of the picture; the channels of one place share it."""
+    channel: NDArray[np.int64]
+    """(samples,) 0, 1, 2."""
     exposure: Array
     """(pictures,) listed light."""
-    low: float
-    """Greys at or below are censored: black, or noise cut off there."""
-    high: float
-    """Greys at or above are censored: clipped, or on the curve's plateau."""
+    lows: Array
+    """(channels,) greys at or below are censored: black, or noise cut off there."""
+    highs: Array
+    """(channels,) greys at or above are censored: clipped, or on the curve's plateau."""
     top: float
     """The brightest grey seen, robustly."""
-    noise: tuple[float, float]
-    """(a, b): variance of a sample a + b grey, levels squared."""
+    noise: GreyNoise
+    """Of a sample."""
     shifts_px: Array
     """(pictures, 2) how far the scene lies to the right and below of where the first picture has it."""
+    ends: ChannelEnds
+    """Black and white of each channel, before the greys were brought to common ones."""
+    fair: NDArray[np.bool_] | None = None
+    """(samples, pictures): where noise does not decide whether a grey lies between the limits; None: not told yet."""
+
+    @property
+    def low(self) -> float:
+        """The darkest grey that is measured in any channel."""
+        return float(self.lows.min())
+
+    @property
+    def high(self) -> float:
+        """The brightest grey that is measured in any channel."""
+        return float(self.highs.max())
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Censoring limits of each sample, (samples, 1) both."""
+        return self.lows[self.channel][:, None], self.highs[self.channel][:, None]
 
     @property
     def measured(self) -> NDArray[np.bool_]:
         """(samples, pictures): not censored."""
-        return (self.grey > self.low) & (self.grey < self.high)
+        low, high = self.limits
+        inside = (self.grey > low) & (self.grey < high)
+        return inside if self.fair is None else inside & self.fair
 
     @property
     def sigma(self) -> Array:
         """(samples, pictures) standard deviation of each grey."""
-        return np.sqrt(self.noise[0] + self.noise[1] * self.grey)
+        return np.sqrt(self.noise.at(self.grey, self.channel))
 
     def take(self, rows: NDArray[Any]) -> BracketSamples:
         """Some of the samples."""
-        return BracketSamples(self.grey[rows], self.site[rows], self.exposure, self.low, self.high, self.top,
-                              self.noise, self.shifts_px)  # fmt: skip
+        fair = None if self.fair is None else self.fair[rows]
+        return replace(self, grey=self.grey[rows], site=self.site[rows], channel=self.channel[rows], fair=fair)
+
+    def without(self, picture: int) -> BracketSamples:
+        """All samples, as if one picture had measured none of them."""
+        fair = np.ones(self.grey.shape, bool) if self.fair is None else self.fair.copy()
+        fair[:, picture] = False
+        return replace(self, fair=fair)
 
     def keep_pictures(self, keep: NDArray[Any]) -> BracketSamples:
         """Some of the pictures."""
-        return BracketSamples(self.grey[:, keep], self.site, self.exposure[keep], self.low, self.high, self.top,
-                              self.noise, self.shifts_px[keep])  # fmt: skip
+        fair = None if self.fair is None else self.fair[:, keep]
+        grey, shifts_px = self.grey[:, keep], self.shifts_px[keep]
+        return replace(self, grey=grey, exposure=self.exposure[keep], shifts_px=shifts_px, fair=fair)
 
 
 def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator) -> BracketSamples:
@@ -103,17 +140,24 @@ def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator)
     centres = _candidates(height, width, half + int(np.ceil(np.abs(shifts_px).max())) + 1, rng)
     channels = 1 if _is_grey(pictures) else 3
     means, variances = _squares(pictures, centres, shifts_px, half, channels)
-    low, high, top, noise = _limits(means, variances, (2 * half + 1) ** 2)
-    measured = (means > low) & (means < high)
+    exposure = np.array([p.exposure for p in pictures], np.float64)
+    ends = channel_ends(means, exposure)
+    if ends.apart:
+        means, variances = ends.levelled(means), variances * (ends.gain**2)[:, None, None]
+    pixels = (2 * half + 1) ** 2
+    by_pixel = pixel_noise(means, variances, pixels)
+    lows, highs, top = _limits(means, by_pixel)
+    measured = (means > lows[:, None, None]) & (means < highs[:, None, None])
     if not measured.any(axis=1).any():
         text = f"all {len(pictures)} pictures are clipped throughout"
         raise CalibrationError(text, hint="take exposures at which the scene is neither black nor white")
-    keep = _flat_sites(means, variances, measured, noise, (2 * half + 1) ** 2)
+    noise = of_means(by_pixel, pixels)
+    keep = _flat_sites(means, variances, measured, noise, pixels)
     chosen = _spread_sites(means[:, :, keep], keep, rng)
     grey = means[:, :, chosen].transpose(2, 0, 1).reshape(-1, len(pictures))
     site = np.repeat(np.arange(len(chosen)), channels)
-    exposure = np.array([p.exposure for p in pictures], np.float64)
-    samples = BracketSamples(grey, site, exposure, low, high, top, noise, shifts_px)
+    channel = np.tile(np.arange(channels), len(chosen))
+    samples = BracketSamples(grey, site, channel, exposure, lows, highs, top, noise, shifts_px, ends)
     seen = samples.measured.sum(axis=1) >= 2
     if len(np.unique(site[seen])) < MIN_SITES:
         text = f"only {len(np.unique(site[seen]))} flat places are unclipped in two pictures, {MIN_SITES} are needed"
@@ -156,28 +200,20 @@ def _squares(
     return means, variances
 
 
-def _limits(means: Array, variances: Array, pixels: int) -> tuple[float, float, float, tuple[float, float]]:
-    """Censoring limits, the brightest grey, and the noise of a square's mean, from the flattest squares by grey."""
-    inside = (means > 8) & (means < 247)
-    a, b = 1.0, 0.0
-    if inside.sum() > 200:
-        greys, spread = means[inside], variances[inside]
-        # of squares that hold nothing but noise, this share has a smaller variance than chance x the true one
-        chance = float(chi2.ppf(FLAT_SHARE, pixels - 1)) / (pixels - 1)
-        bins = np.digitize(greys, np.linspace(8, 247, 13))
-        groups = [bins == i for i in np.unique(bins) if (bins == i).sum() >= 15]
-        points = [(greys[g].mean(), np.quantile(spread[g], FLAT_SHARE) / chance) for g in groups]
-        x, y = np.array(points).T if len(points) > 1 else (np.array([0.0, 255.0]), np.array([1.0, 1.0]))
-        b = float(np.clip(np.polyfit(x, y, 1)[0], 0.0, 1.0)) if len(x) > 2 else 0.0
-        a = float(np.clip(np.median(y - b * x), 0.05, 400.0))
-    margin = float(np.clip(3.0 * np.sqrt(a + 128 * b), 2.0, 12.0))
+def _limits(means: Array, noise: GreyNoise) -> tuple[Array, Array, float]:
+    """Censoring limits of each channel, and the brightest grey seen.
+
+    means: (channels, pictures, places); noise: of a pixel.  Where noise is cut off at black, the mean of what is left
+    is too bright: greys within CUT_SIGMA of it say nothing.
+    """
     bottom, top = (float(v) for v in np.quantile(means, [0.001, 0.999]))
-    low = bottom + margin if np.mean(means < bottom + margin) > PILE else bottom
+    dark, bright = (CUT_SIGMA * np.sqrt(noise.variance[:, end]) for end in (0, -1))
+    dark, bright = np.clip(dark, 2.0, 24.0), np.clip(bright, 2.0, 12.0)
+    margin = float(np.clip(CUT_SIGMA * np.sqrt(np.median(noise.variance)), 2.0, 12.0))
+    lows = np.array([bottom + m if np.mean(means < bottom + m) > PILE else bottom for m in dark])
     top = min(top, _plateau(means, margin))
-    high = top - margin if np.mean(means > top - margin) > PILE else top
-    # the floor keeps rounding of the levels, which neighbours share, from counting as precision
-    noise = (a / pixels + 0.15**2, b / pixels)
-    return max(low, margin), min(high, 255.0 - margin), top, noise
+    highs = np.array([top - m if np.mean(means > top - m) > PILE else top for m in bright])
+    return np.maximum(lows, dark), np.minimum(highs, 255.0 - bright), top
 
 
 def _plateau(means: Array, margin: float) -> float:
@@ -196,10 +232,10 @@ def _plateau(means: Array, margin: float) -> float:
 
 
 def _flat_sites(
-    means: Array, variances: Array, measured: NDArray[np.bool_], noise: tuple[float, float], pixels: int
+    means: Array, variances: Array, measured: NDArray[np.bool_], noise: GreyNoise, pixels: int
 ) -> NDArray[np.int64]:
     """Indices of the flatter half of the places, judged where they are not clipped, against the noise there."""
-    expected = pixels * (noise[0] + noise[1] * means)
+    expected = pixels * noise.at(means, np.arange(len(means)))
     excess = np.where(measured, variances / expected, 0.0).max(axis=(0, 1))
     seen = np.flatnonzero((measured.sum(axis=1) >= 2).any(axis=0))
     if not len(seen):

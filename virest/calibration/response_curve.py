@@ -24,6 +24,7 @@ from virest.calibration.bracket_samples import MIN_SHARED, BracketPicture, Brack
 from virest.calibration.curve_certainty import CurvePosterior, curve_posterior
 from virest.calibration.curve_families import Family, LogLookup, log_lookup, make_family
 from virest.calibration.exposure_check import CONTRADICTS_EV, MIN_PICTURES, FirstCurve, fit_first_curve, outlying
+from virest.calibration.grey_levels import FAIR_SIGMA, fairly_inside, scatter_by_grey
 from virest.camera.response import KINDS, ResponseCurve
 from virest.errors import CalibrationError, SettingsError
 
@@ -130,12 +131,18 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     notes = [f"{p.file} was shifted by {np.hypot(*s):.1f} px and aligned" for p, s in
              zip(pictures, samples.shifts_px - np.median(samples.shifts_px, axis=0), strict=True)
              if np.hypot(*s) > 0.5]  # fmt: skip
-    seen = _connected(pictures, samples)
-    notes += [f"{p.file} is clipped throughout and was left out" for p, s in zip(pictures, seen, strict=True) if not s]
-    samples = samples.keep_pictures(seen)
-    samples = samples.take(samples.measured.sum(axis=1) >= 2)
+    notes += [samples.ends.describe()] * samples.ends.apart
+    seen, samples = _keep_connected(pictures, np.ones(len(pictures), bool), samples)
     first = fit_first_curve(samples)
     _require_possible(first, samples)
+    samples = _fairly_seen(_with_scatter(samples, first), first)
+    seen, samples = _keep_connected(pictures, seen, samples)
+    notes += [
+        f"{p.file} is clipped or too dark throughout and was left out"
+        for p, s in zip(pictures, seen, strict=True)
+        if not s
+    ]
+    first = fit_first_curve(samples)
     still = _still_rows(samples, first)
     samples = samples.take(still)
     verdict = _fit_kinds(kind, samples, first, np.ones(len(first.suspect), bool))
@@ -212,6 +219,17 @@ def _require_bracket(pictures: Sequence[BracketPicture]) -> None:
         raise CalibrationError(text, hint="take the scene at exposures from dark to bright, 1 EV apart")
 
 
+def _keep_connected(
+    pictures: Sequence[BracketPicture], kept: NDArray[np.bool_], samples: BracketSamples
+) -> tuple[NDArray[np.bool_], BracketSamples]:
+    """Which of all pictures are kept, of those kept already, and their samples."""
+    seen = _connected([p for p, k in zip(pictures, kept, strict=True) if k], samples)
+    kept = kept.copy()
+    kept[kept] = seen
+    samples = samples.keep_pictures(seen)
+    return kept, samples.take(samples.measured.sum(axis=1) >= 2)
+
+
 def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> NDArray[np.bool_]:
     """Which pictures are not clipped throughout. Raises CalibrationError where the rest fall into unrelated parts."""
     measured = samples.measured.astype(np.int64)
@@ -251,10 +269,7 @@ def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]
     A scene that moves is wrong at most exposures; what a movie's codec gets wrong at one exposure, it does at all
     places: so the refusal goes by the rms over the exposures, and single misses are judged by what is usual.
     """
-    lookup = LogLookup(first.log_light, first.grey, np.gradient(first.grey, first.log_light))
-    log_t = np.log(samples.exposure) + LN2 * first.correction_ev
-    log_light = _project(lookup, samples, log_t)
-    miss = np.where(samples.measured, np.abs(lookup.level(log_light[:, None] + log_t) - samples.grey), 0.0)
+    miss = np.where(samples.measured, np.abs(_first_residual(samples, first)), 0.0)
     limit = max(MOVED_LEVELS, 8.0 * float(samples.sigma.max()))
     rms = np.sqrt((miss**2).sum(axis=1) / np.maximum(samples.measured.sum(axis=1), 1))
     moved = rms > limit
@@ -266,6 +281,34 @@ def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]
         )
     worst = miss.max(axis=1)
     return worst <= max(limit, USUAL_MISSES * float(np.median(worst)))
+
+
+def _first_residual(samples: BracketSamples, first: FirstCurve) -> Array:
+    """Grey levels by which measurement and first curve differ, (samples, pictures)."""
+    lookup = LogLookup(first.log_light, first.grey, np.gradient(first.grey, first.log_light))
+    log_t = np.log(samples.exposure) + LN2 * first.correction_ev
+    return samples.grey - lookup.level(_project(lookup, samples, log_t)[:, None] + log_t)
+
+
+def _with_scatter(samples: BracketSamples, first: FirstCurve) -> BracketSamples:
+    """The samples with the noise that their scatter about a first curve shows, where that is more than squares do."""
+    scatter = scatter_by_grey(_first_residual(samples, first), samples.grey, samples.channel, samples.measured)
+    missing = np.full((len(samples.noise.variance) - len(scatter), scatter.shape[1]), np.nan)
+    return replace(samples, noise=samples.noise.at_least(np.concatenate([scatter, missing])))
+
+
+def _fairly_seen(samples: BracketSamples, first: FirstCurve) -> BracketSamples:
+    """The samples with those greys told that only noise puts between the limits, or beyond them."""
+    lookup = LogLookup(first.log_light, first.grey, np.gradient(first.grey, first.log_light))
+    log_t = np.log(samples.exposure) + LN2 * first.correction_ev
+    fair = np.zeros(samples.grey.shape, bool)
+    for channel in np.unique(samples.channel):
+        rows = samples.channel == channel
+        of_channel = samples.take(rows)
+        limits, sigma = of_channel.limits, of_channel.sigma
+        light = np.stack([_project(lookup, of_channel.without(n), log_t) for n in range(len(log_t))], axis=1)
+        fair[rows] = fairly_inside(of_channel.grey, light, limits, sigma)
+    return replace(samples, fair=fair)
 
 
 # ── variable projection ──────────────────────────────────────────────────────────────────────────────────────────
@@ -291,8 +334,12 @@ def _residual(lookup: LogLookup, samples: BracketSamples, correction_ev: Array) 
     log_t = np.log(samples.exposure) + LN2 * correction_ev
     level = lookup.level(_project(lookup, samples, log_t)[:, None] + log_t)
     left = samples.grey - level
-    high = np.where(samples.grey >= samples.high, np.maximum(samples.high - level, 0.0), left)
-    return np.where(samples.grey <= samples.low, np.minimum(samples.low - level, 0.0), high)
+    lowest, highest = samples.limits
+    slack = 0.0 if samples.fair is None else FAIR_SIGMA * samples.sigma
+    high = np.where(samples.grey >= highest, np.maximum(highest - slack - level, 0.0), left)
+    both = np.where(samples.grey <= lowest, np.minimum(lowest + slack - level, 0.0), high)
+    inside = (samples.grey > lowest) & (samples.grey < highest)
+    return np.where(inside & ~samples.measured, 0.0, both)
 
 
 @dataclass(frozen=True, slots=True)
@@ -552,7 +599,7 @@ def _result(
     return CurveFit(
         scale_exposure(final.curve, scale),
         _rms(left[use]),
-        verdict.std_levels,
+        float(np.hypot(verdict.std_levels, samples.ends.spread_levels if samples.ends.apart else 0.0)),
         (float(np.exp(ends[0]) / scale), float(np.exp(ends[1]) / scale)),
         verdicts,
         tuple(notes),
