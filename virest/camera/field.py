@@ -27,12 +27,13 @@ RATES, FORCES = tuple(f"rate_{a}" for a in AXES), tuple(f"accel_{a}" for a in AX
 KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
     "delay": ("s", 1, (("row",),)),
     "displacement": ("px", 2, (("x", "y"),)),
-    "scale": ("1", 1, (("time",), ("focus",))),
+    "scale": ("1", 1, (("time",), ("focus",), ("focal",))),
     "rate": ("rad/s", 3, (("time",), *((name,) for name in (*RATES, *FORCES)))),
 }
 """Unit, number of components and possible covariates of each kind."""
-UNITS = {"row": "1", "x": "px", "y": "px", "time": "s", "focus": "1/m"}
-"""Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout."""
+UNITS = {"row": "1", "x": "px", "y": "px", "time": "s", "focus": "1/m", "focal": "1"}
+"""Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``focal``: logged
+focal length over its median."""
 _FIXED_POINT_STEPS = 5
 """A displacement's slope is a few per cent: each step of its inversion shrinks the error by that factor."""
 
@@ -53,7 +54,7 @@ class Field:
     stamp_0_ns: int | None = None
     """First stamp of the only capture that the field holds for; None: it belongs to the phone."""
     log: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Times (IMU clock) and values of a logged covariate in the capture at hand; in no file."""
+    """Times (camera clock) and values of a logged covariate in the capture at hand; in no file."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -88,7 +89,7 @@ class Field:
         return np.asarray((second[..., None] * across).sum(axis=-2))
 
     def at_time(self, time_s: Any) -> Array:
-        """Values (..., components) of a field over time, or over what is logged, at times (...), IMU clock."""
+        """Values (..., components) of a field over time, or over what is logged, at times (...) of its own clock."""
         time_s = np.asarray(time_s, float)
         return self.at(time_s if self.log is None else np.interp(time_s, *self.log))
 

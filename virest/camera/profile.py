@@ -671,8 +671,8 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         extensions["gain"] = list(ext.gain)
     if ext.defocus_sigma_px:
         extensions["defocus"] = {"sigma_px": ext.defocus_sigma_px}
-    if profile.fields:
-        extensions["field"] = [_field_block(entry) for entry in profile.fields]
+    if own := [entry for entry in profile.fields if entry.covariates != ("focal",)]:
+        extensions["field"] = [_field_block(entry) for entry in own]  # what the capture's log says stays there
     stretches: dict[str, Any] = {}
     if profile.imu_untrusted_s:
         stretches["imu_untrusted_s"] = [list(stretch) for stretch in profile.imu_untrusted_s]

@@ -28,6 +28,7 @@ from virest.capture.join import (
     pts_tolerance_ns,
 )
 from virest.capture.location import locate
+from virest.capture.logged_focal import focal_scales
 from virest.capture.profile_source import default_profile, resolve_profile
 from virest.capture.records import NO_STAMP, STALL, STARTUP, Capture, CaptureMetadata, Frame, Note
 from virest.capture.rosbag import ENDINGS as BAG_ENDINGS
@@ -376,6 +377,7 @@ def _frames(
 ) -> tuple[Frame, ...]:
     readout_s = metadata.readout_time_s or 0.0
     exposures_s = _exposures_s(files, joined, time_s, notes)
+    scales = _focal_scales(files, joined, time_s, notes)
     imu_period_s = median_period_s(imu.time_s)
     frames = []
     for i, row in enumerate(joined.metadata_rows.tolist()):
@@ -400,6 +402,7 @@ def _frames(
                 exposure_s=exposure_s,
                 iso=_value(files.metadata.iso, row) if files.metadata else None,
                 focus_dioptres=_value(files.metadata.focus_dioptres, row) if files.metadata else None,
+                focal_scale=None if scales is None else float(scales[i]),
                 skip_reason="; ".join(text for _, text in reasons) or None,
                 skip_codes=tuple(code for code, _ in reasons),
             )
@@ -422,6 +425,23 @@ def _exposures_s(files: Source, joined: _Joined, time_s: NDArray[np.float64], no
         text = f"{len(missing)} of {len(known)} frames have no exposure time, their neighbours' serve: {shown}"
         notes.append(Note("warning", "exposure-interpolated", text))
     return [float(value) for value in np.interp(time_s, time_s[known], logged[known])]
+
+
+def _focal_scales(
+    files: Source, joined: _Joined, time_s: NDArray[np.float64], notes: list[Note]
+) -> NDArray[np.float64] | None:
+    """Focal length of each frame over the median, where it is logged and changes."""
+    if files.metadata is None:
+        return None
+    rows, half_diagonal = joined.metadata_rows, 0.5 * float(np.hypot(files.movie.width, files.movie.height))
+    scales = focal_scales(np.where(rows >= 0, files.metadata.fx_px[rows], np.nan), time_s, half_diagonal)
+    if scales is not None:
+        text = (
+            f"the focal length in {files.names.metadata} changes from {scales.min() - 1:+.2%} to "
+            f"{scales.max() - 1:+.2%} of its median (the lens focuses): it is followed frame by frame"
+        )
+        notes.append(Note("info", "focal-varies", text))
+    return scales
 
 
 def _value(column: NDArray[np.float64], row: int) -> float | None:

@@ -6,12 +6,15 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from virest.camera.field import Field
 from virest.camera.kalibr import is_kalibr, parse_camchain
 from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, load_yaml_mapping, parse_profile
 from virest.camera.shutter import Shutter
 from virest.capture.files import is_present
 from virest.capture.location import locate
+from virest.capture.logged_focal import corners
 from virest.capture.records import Capture
 from virest.errors import SettingsError
 
@@ -87,6 +90,27 @@ def for_capture(profile: CameraProfile, capture: Capture) -> CameraProfile:
     return profile.with_fields(fields)
 
 
+def with_logged_focal(profile: CameraProfile, capture: Capture) -> CameraProfile:
+    """The profile with the focal length that the recorder logs frame by frame, as a field over it.
+
+    A profile that says itself how its focal length changes, by a drift or a field, is left as it is.
+    """
+    known = [frame for frame in capture.frames if frame.focal_scale is not None]
+    said = profile.extensions.focal_drift_per_s or any(field.kind == "scale" for field in profile.fields)
+    if not known or said:
+        return profile
+    # a frame's length holds for its middle, and is taken as straight from frame to frame
+    middle_s = [f.time_s + 0.5 * ((f.exposure_s or 0.0) + profile.shutter.readout_time_s) for f in known]
+    scales = np.array([f.focal_scale for f in known], np.float64)
+    times, values = corners(np.array(middle_s), scales)
+    ends = (float(scales.min()), float(scales.max()))
+    log_of_capture = (tuple(times.tolist()), tuple(values.tolist()))
+    field = Field(
+        "scale", ("focal",), (ends,), tuple((e - 1.0,) for e in ends), (), capture.stamp_0_ns, log_of_capture
+    )
+    return profile.with_fields([*profile.fields, field])
+
+
 def read_any_profile(path: Path) -> CameraProfile:
     """Read a profile file by its kind: our own, or a Kalibr camera chain."""
     content = load_yaml_mapping(path)
@@ -103,7 +127,7 @@ def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[Camer
     if path is None and is_present(capture.folder / PROFILE_NAME):
         path = capture.folder / PROFILE_NAME
     if path is None:
-        return default_profile(capture), "the capture's metadata and documented defaults"
+        return with_logged_focal(default_profile(capture), capture), "the capture's metadata and documented defaults"
     profile = read_any_profile(locate(path))
     if (profile.width, profile.height) != (capture.width, capture.height):
         raise SettingsError(
@@ -111,4 +135,4 @@ def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[Camer
             f"{capture.width}x{capture.height}",
             hint="a profile holds for one stored size; scale its intrinsics, or pass the one of this mode",
         )
-    return for_capture(fill_from_metadata(profile, capture), capture), str(path)
+    return with_logged_focal(for_capture(fill_from_metadata(profile, capture), capture), capture), str(path)

@@ -35,6 +35,8 @@ class Frame:
     """The same as stable names: ``start-up``, ``no-imu``, ``imu-gap``, ``no-stamp``, ``stall``."""
     focus_dioptres: float | None = None
     """Focus distance as logged, 1/m; None: unknown."""
+    focal_scale: float | None = None
+    """Focal length as logged over the recording's median; None: not logged, or it does not change."""
 
     @property
     def only_startup(self) -> bool:

@@ -109,7 +109,7 @@ def moving_lens(
     if profile.intrinsics is None:
         raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
     extensions = profile.extensions
-    zoom = tuple(field for field in extensions.field if field.kind == "scale")
+    zoom = tuple(_on_imu_clock(field, profile) for field in extensions.field if field.kind == "scale")
     if not extensions.stabilisation_fraction:
         return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, zoom=zoom)
     path = None if like is None else like.path
@@ -126,6 +126,11 @@ def moving_lens(
         forgotten = np.exp(-2 * np.pi * cutoff_hz * (time_s - time_s[0]))
         shift = shift + fraction * forgotten[:, None] * np.array([about_y, -about_x])
     return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path, swing, zoom)
+
+
+def _on_imu_clock(field: Field, profile: CameraProfile) -> Field:
+    """A field over what the camera logs, its times brought to the IMU's clock; others have none or that one already."""
+    return field if field.log is None else field.later(-(profile.time_offset_s or 0.0))
 
 
 def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:
