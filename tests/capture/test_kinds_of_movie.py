@@ -1,7 +1,8 @@
-"""Movies of other kinds: HDR, chroma's place, 4K, 240 frames a second, half an hour."""
+"""Movies of other kinds: HDR, chroma's place, 4K, 240 frames a second, half an hour, turned, an iPhone's."""
 
 from __future__ import annotations
 
+import struct
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_frames, read_gray, to_rgb
 from virest.errors import VideoError
 
@@ -84,3 +86,80 @@ def test_times_of_240_frames_a_second_and_of_half_an_hour_are_exact(tmp_path: Pa
     assert number == 73
     assert luma is not None
     assert luma.mean() == pytest.approx(20 + 2 * 73, abs=2)
+
+
+QUARTER_TURN = (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
+"""The display matrix that phones write for an upright recording of a sensor that lies on its side."""
+
+
+def turn(movie: Path, matrix: tuple[int, ...] = QUARTER_TURN) -> Path:
+    """Write a display matrix into the track header (version 0: 40 bytes after its type and flags)."""
+    data = bytearray(movie.read_bytes())
+    at = data.index(b"tkhd") + 4
+    assert data[at] == 0
+    data[at + 40 : at + 76] = struct.pack(">9i", *matrix)
+    movie.write_bytes(bytes(data))
+    return movie
+
+
+def striped(width: int = 64, height: int = 48) -> np.ndarray:
+    """A picture that no turn leaves as it is: dark on its left, a bright corner above."""
+    picture = np.full((height, width, 3), 160, np.uint8)
+    picture[:, : width // 2] = 60
+    picture[: height // 4, : width // 4] = 220
+    return picture
+
+
+@pytest.mark.parametrize("name", ["movie.mp4", "IMG_0042.MOV"])
+def test_a_rotation_tag_turns_no_pixel(tmp_path: Path, name: str) -> None:
+    """Rows stay the sensor's rows: the size and the pixels are those that are stored, the turn is known for films."""
+    movie = turn(write(tmp_path / name, [striped()] * 3, range(0, 9000, 3000)))
+    with av.open(str(movie)) as container:
+        assert abs(next(container.decode(video=0)).rotation) == 90  # the tag is one that others follow
+    index = probe_movie(movie)
+    assert (index.width, index.height) == (64, 48)
+    ((_, picture),) = read_frames(movie, index, 1, 1)
+    assert picture is not None
+    assert np.abs(picture.astype(int) - striped()).mean() < 3
+    ((_, luma),) = read_gray(movie, index, [2])
+    assert luma is not None
+    assert luma.shape == (48, 64)
+
+
+def test_bt2020_pictures_of_ordinary_brightness_have_their_own_matrix(tmp_path: Path) -> None:
+    """Luma of BT.2020 weighs red by 0.2627: with another matrix a red wall would come back in another red."""
+    red = np.full((48, 64, 3), (200, 30, 60), np.uint8)
+    frame = av.VideoFrame.from_ndarray(red, format="rgb24").reformat(format="yuv420p", dst_colorspace=9)
+    frame.colorspace = 9
+    assert np.abs(to_rgb(frame).astype(int) - red).max() <= 3
+    frame.colorspace = 5
+    assert np.abs(to_rgb(frame).astype(int) - red).max() > 8
+
+
+def test_pictures_of_10_bits_and_ordinary_brightness_are_read(tmp_path: Path) -> None:
+    """Without an HDR curve 10 bits are 8 finer ones."""
+    ramp = np.repeat(np.linspace(20, 230, 64)[None, :, None], 48, axis=0).repeat(3, axis=2).astype(np.uint8)
+    frame = av.VideoFrame.from_ndarray(ramp, format="rgb24").reformat(format="yuv420p10le")
+    assert np.abs(to_rgb(frame).astype(int) - ramp).max() <= 4
+
+
+def test_an_iphone_s_folder_with_a_turned_movie_keeps_its_landscape(tmp_path: Path) -> None:
+    """The intrinsics of the unturned buffer hold: width is the long side, and fx, cx are those logged."""
+    count, width, height = 12, 96, 64
+    stamps = [1_000_000_000_000 + k * 33_333_333 for k in range(count)]
+    ticks = [round(k * 33_333_333 * 9e-5) for k in range(count)]
+    turn(write(tmp_path / "IMG_0042.MOV", [striped(width, height)] * count, ticks))
+    rows = [f"{t}, 82.50, 82.50, 47.75, 31.50, 8000000" for t in stamps]
+    head = "Timestamp[nanosec], fx[px], fy[px], cx[px], cy[px], exposure duration[nanosec]"
+    (tmp_path / "movie_metadata.csv").write_text("\n".join([head, *rows]) + "\n")
+    samples = range(stamps[0] - 100_000_000, stamps[-1] + 200_000_000, 10_000_000)
+    gyro = [f"{t}, 0.010000, 0.200000, -0.100000, 0.100000, 9.700000, 0.300000" for t in samples]
+    head = "Timestamp[nanosec], gx[rad/s], gy[rad/s], gz[rad/s], ax[m/s^2], ay[m/s^2], az[m/s^2]"
+    (tmp_path / "gyro_accel.csv").write_text("\n".join([head, *gyro]) + "\n")
+    capture = read_capture(tmp_path)
+    profile, _ = resolve_profile(capture)
+    assert capture.kind == "MARSLogger for iOS"
+    assert (capture.width, capture.height) == (width, height)
+    assert profile.intrinsics is not None
+    assert (profile.intrinsics.fx_px, profile.intrinsics.cx_px) == (82.5, 47.75)
+    assert profile.shutter.readout_direction == "top_to_bottom"

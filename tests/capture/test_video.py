@@ -167,15 +167,6 @@ def test_odd_sizes_keep_their_shape():
     assert to_gray(frame).shape == (15, 33)
 
 
-def test_display_rotation_is_ignored(tmp_path):
-    """Pictures come as stored."""
-    write_movie(tmp_path / "movie.mp4", moving_pictures(3), STEPS[:3])
-    index = probe_movie(tmp_path / "movie.mp4")
-    (_, picture), *_ = read_frames(tmp_path / "movie.mp4", index, 0, 0)
-    assert picture is not None
-    assert picture.shape == (96, 64, 3)
-
-
 @pytest.mark.parametrize("content", [b"", b"not a movie", b"#EXTM3U\nhttp://localhost/x\n", bytes(5000)])
 def test_what_is_no_movie_is_refused(tmp_path, content):
     """Empty files, text, playlists and zeros get one clear line."""
