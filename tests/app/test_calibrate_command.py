@@ -217,6 +217,25 @@ def test_a_focal_length_that_makes_up_for_a_gyroscope_s_scale_is_said(shaken: Pa
             assert float(notes[0].split("gyro-scale (")[1].split("%")[0]) == pytest.approx(-1.96, abs=0.4)
 
 
+def test_a_value_that_no_phone_has_is_no_finding(shaken: Path, tmp_path: Path) -> None:
+    """Rates logged 1.3 times too large are well determined, and still no gyroscope's scale: nothing is taken over."""
+    table = shaken / "gyro_accel.csv"
+    head, *rows = table.read_text().splitlines()
+    fields = [row.split(",") for row in rows]
+    scaled = [[f[0], *(f"{1.3 * float(value):.9g}" for value in f[1:4]), *f[4:]] for f in fields]
+    table.write_text("\n".join([head, *(",".join(row) for row in scaled)]) + "\n")
+    output = CalibrationOutput(tmp_path / "camera.yaml")
+    facts, text = run_calibration(plan_calibration(shaken, None, ("gyro-scale",)), output)
+    value = value_of(facts, "gyro_scale")
+    assert not value["determined"]
+    assert value["std"] < 0.02
+    assert "gyro_scale" in facts["not_determined"]
+    assert read_profile(tmp_path / "camera.yaml").gyro_scale == (1.0, 1.0, 1.0)
+    assert any("gyro_scale would be 1." in note and "no finding" in note for note in facts["notes"])
+    assert "gyro_scale, which no camera has so" in facts["verdict"]
+    assert "no camera has it" in text
+
+
 def test_what_another_sensor_s_imu_yaml_says_is_compared(
     done: tuple[Path, dict[str, Any], str], shaken: Path, tmp_path: Path
 ) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from virest.calibration.physical_limits import impossible, is_depth
+from virest.calibration.physical_limits import impossible, is_depth, limit_reasons
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
@@ -47,3 +47,16 @@ def test_lenses_have_angles_of_view(focal_px: float) -> None:
 def test_scenes_lie_before_the_lens() -> None:
     """A depth ends neither in the lens nor at the end of the fit's range."""
     assert [is_depth(depth) for depth in (0.02, 0.5, 1e4)] == [False, True, False]
+
+
+def test_reasons_say_what_was_found_and_what_can_be() -> None:
+    """One for each value at or beyond its limits, none for a phone."""
+    assert not limit_reasons(PHONE, PERIOD_S, EXPOSURE_S)
+    lens = Intrinsics(640, 480, 190, 190, 319, 239)
+    shutter = replace(PHONE.shutter, readout_time_s=2.9e-4)
+    odd = replace(PHONE, intrinsics=lens, shutter=shutter, gyro_scale=(1.0, 0.7, 1.0), clock_skew=-0.03)
+    reasons = limit_reasons(odd, PERIOD_S, EXPOSURE_S)
+    assert set(reasons) == {"focal_length", "readout_time", "gyro_scale", "clock_skew"}
+    assert "190 px" in reasons["focal_length"]
+    assert "0.29 ms" in reasons["readout_time"]
+    assert "0.700" in reasons["gyro_scale"]

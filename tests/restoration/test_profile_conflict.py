@@ -39,6 +39,26 @@ def test_a_focal_length_stated_wrong_is_put_right(factor: float) -> None:
     assert found.after_px < 1.2 * found.noise_px < found.before_px
 
 
+def test_a_gyroscope_s_scale_is_not_taken_for_a_focal_length() -> None:
+    """Turns about the optical axis move points by no focal length: the gyroscope is found, and the lens stays."""
+    recording = recorded(replace(HAND, gyro_scale=1.05))
+    found = settled(recording, replace(recording.profile, gyro_scale=(1.0, 1.0, 1.0)))
+    assert found.contradicted
+    assert found.profile.gyro_scale == pytest.approx((1.05,) * 3, rel=2e-3)
+    assert focal_px(found.profile) == pytest.approx(520.0, rel=1e-9)
+    assert len(found.taken) == 1
+    assert "gyroscope scale" in found.taken[0]
+    assert "does not tell" not in found.taken[0]
+
+
+def test_without_turns_about_the_optical_axis_both_are_named() -> None:
+    """Yaw and pitch alone tell the product of focal length and scale."""
+    recording = recorded(replace(HAND, gyro_scale=1.05, about=(0.0, 1.0, 1.0), points=30))
+    found = settled(recording, replace(recording.profile, gyro_scale=(1.0, 1.0, 1.0)))
+    assert found.contradicted
+    assert any("does not tell" in text for text in found.taken)
+
+
 @pytest.mark.parametrize("fraction", [0.2])
 def test_a_stabiliser_that_no_profile_names_is_found(fraction: float) -> None:
     """By its fraction and cutoff, and nothing else is taken for it."""

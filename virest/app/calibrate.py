@@ -13,7 +13,7 @@ import numpy as np
 
 from virest.app.console import table
 from virest.app.outputs import output_error, write_whole
-from virest.calibration.geometry import FRAME_LAG, CalibratedValue, GeometryCalibration, calibrate_geometry
+from virest.calibration.geometry import FRAME_LAG, NO_FINDING, CalibratedValue, GeometryCalibration, calibrate_geometry
 from virest.calibration.held_fixed import OPTIONAL
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
 from virest.camera.profile import CameraProfile, format_profile, load_yaml_mapping, profile_mapping
@@ -233,15 +233,19 @@ def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise |
         "noise_px": found.noise_px,
         "imu": _imu_facts(noise),
         "notes": [*found.notes, *_own_notes(plan, found, noise)],
-        "verdict": _verdict(undetermined),
+        "verdict": _verdict(undetermined, [value["name"] for value in values if value["note"] == NO_FINDING]),
         "profile": profile_mapping(found.profile),
     }
 
 
-def _verdict(undetermined: list[str]) -> str:
+def _verdict(undetermined: list[str], odd: list[str]) -> str:
+    """In one line; odd: of those not determined, the ones whose values no camera has."""
     if not undetermined:
         return "calibrated"
-    return f"calibrated but for {', '.join(undetermined)}, which this motion does not determine"
+    open_yet = [name for name in undetermined if name not in odd]
+    parts = [f"{', '.join(open_yet)}, which this motion does not determine"] if open_yet else []
+    parts += [f"{', '.join(odd)}, which no camera has so"] if odd else []
+    return f"calibrated but for {'; and '.join(parts)}"
 
 
 def _value_facts(value: CalibratedValue) -> Json:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.calibration.held_fixed import OPTIONAL, HeldValue, held_notes, held_values
+from virest.calibration.physical_limits import limit_reasons
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -65,6 +66,7 @@ DRIFT_SIGMA, LEAST_DRIFT_S = 4.5, 1e-3
 """Clocks are said to drift apart above this many deviations (false alarms: 7e-6) and this much over the capture."""
 FRAME_LAG = "frame-lag"
 """The start-up's lag, which ``--with`` adds too."""
+NO_FINDING = "no camera has it"
 MAX_STD = {
     "time_offset": 0.002,
     "readout_time": 0.002,
@@ -355,22 +357,38 @@ def _conclude(
 ) -> GeometryCalibration:
     noise = float(np.median(observed.noise_px))
     variances = _variances(fit, noise, _drift_rad(fit, imu))
-    determined = {term.name: _is_determined(fit, term.name, variances[term.name]) for term in fit.terms}
+    beyond = _beyond_limits(fit, observed)
+    determined = {
+        term.name: term.name not in beyond and _is_determined(fit, term.name, variances[term.name])
+        for term in fit.terms
+    }
     profile = right_way_round(_held_back(fit, given, start, determined))
     if not rough.direction_known and not determined["readout_time"]:
         profile = _with_given_readout(profile, given)
     values = tuple(_value(term.name, given, profile, fit.profile, variances, determined) for term in fit.terms)
     values = tuple(_rough(value, fit) if value.name == "time_offset_s" else value for value in values)
+    kept = {_FIELDS[name][0] for name in beyond}
+    values = tuple(replace(value, note=NO_FINDING) if value.name in kept else value for value in values)
     direction_known = rough.direction_known and determined["readout_time"]
     values = (*values[:2], _direction_value(given, profile, direction_known), *values[2:])
     profile = _with_estimates(profile, values)
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
     notes = _notes(coarse, fit, moving, astray, observed, determined)
+    notes = (*notes, *(f"{_FIELDS[name][0]} would be {said}: that is no finding, and it is left as it was; "
+                       "virest diagnose may find what it stands for" for name, said in beyond.items()))  # fmt: skip
     return GeometryCalibration(
         profile, values, _correlations(fit, variances), _translation(fit), residual_px(fit),
         tracking_noise_px(observed, fit), residual_px(rough.before), coarse.explained, moving,
         len(observed.pairs), observed.tracks, notes, fit,
     )  # fmt: skip
+
+
+def _beyond_limits(fit: TrackFit, observed: ObservedTracks) -> dict[str, str]:
+    """Of the fitted terms, those whose values no camera has, and why."""
+    stamps = observed.stamp_s[np.isfinite(observed.stamp_s)]
+    period_s, fitted = float(np.median(np.diff(stamps))), right_way_round(fit.profile)
+    reasons = limit_reasons(fitted, period_s, float(np.median(observed.exposure_s)))
+    return {term.name: reasons[term.name] for term in fit.terms if term.name in reasons}
 
 
 def _is_determined(fit: TrackFit, name: str, variance: Array) -> bool:

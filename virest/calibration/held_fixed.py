@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.calibration.physical_limits import CLOCK_SKEW
 from virest.capture.imu import ImuSamples
 from virest.motion import profile_terms as terms_of
 from virest.motion.track_fit import TrackFit, fit_tracks
@@ -33,8 +34,8 @@ BELIEVABLE = {
     "focal": 0.2,
     "distortion": 0.3,
     "principal-point": 100.0,
-    "gyro-scale": 0.15,
-    "clock-skew": 0.02,
+    "gyro-scale": terms_of.GYRO_SCALE_OFF,
+    "clock-skew": CLOCK_SKEW,
     "exposure-scale": 1.0,
 }
 """A larger change stands in for something else, such as a stabiliser or stamps of another meaning."""

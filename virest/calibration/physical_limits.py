@@ -6,6 +6,7 @@ A fit that ends at such a limit, or beyond it, describes no camera; it compensat
 from __future__ import annotations
 
 from virest.camera.profile import CameraProfile
+from virest.motion.profile_terms import GYRO_SCALE_OFF
 
 LEAST_READOUT_S = 1e-3
 """The fastest rolling shutters (stacked sensors, 960 frames/s) read a frame in about 1 ms; a global shutter has 0."""
@@ -19,6 +20,8 @@ SCALE_OF_EXPOSURE = (0.05, 20.0)
 """The true exposure over the logged one."""
 OFFSET_S = 2.0
 """A larger offset is another recording, or another clock."""
+CLOCK_SKEW = 0.02
+"""Crystals keep 1e-4, recorders that write another clock's rate 0.5 %."""
 
 
 def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> frozenset[str]:
@@ -43,6 +46,31 @@ def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> fr
     if abs(profile.time_offset_s or 0.0) >= OFFSET_S:
         found.add("time_offset")
     return frozenset(found)
+
+
+def limit_reasons(profile: CameraProfile, period_s: float, exposure_s: float) -> dict[str, str]:
+    """Why values of a fitted profile are no findings, by the name of their effect: what they are, and what can be."""
+    shutter, lens = profile.shutter, profile.intrinsics
+    least_px, most_px = (part * max(profile.width, profile.height) for part in FOCAL_OF_LONG_SIDE)
+    said = {
+        "readout_time": (
+            f"{1e3 * shutter.readout_time_s:.2f} ms, where rolling shutters take {1e3 * LEAST_READOUT_S:g} to "
+            f"{1e3 * period_s:.1f} ms"
+        ),
+        "exposure_time": (
+            f"{shutter.exposure_scale:.3g} times the logged exposure, {1e3 * exposure_s:.2f} ms, "
+            f"in a frame of {1e3 * period_s:.1f} ms"
+        ),
+        "focal_length": f"{lens.fx_px if lens else 0:.0f} px, where lenses have {least_px:.0f} to {most_px:.0f} px",
+        "time_offset": f"{profile.time_offset_s or 0.0:+.2f} s, where one recording has less than {OFFSET_S:g} s",
+    }
+    found = {name: said[name] for name in impossible(profile, period_s, exposure_s)}
+    worst = max(profile.gyro_scale, key=lambda scale: abs(scale - 1))
+    if abs(worst - 1) >= GYRO_SCALE_OFF:
+        found["gyro_scale"] = f"{worst:.3f}, where gyroscopes are right to within {GYRO_SCALE_OFF:.0%}"
+    if abs(profile.clock_skew) >= CLOCK_SKEW:
+        found["clock_skew"] = f"{profile.clock_skew:+.4f}, where clocks differ by less than {CLOCK_SKEW:.0%}"
+    return found
 
 
 def is_depth(depth_m: float) -> bool:

@@ -105,9 +105,7 @@ def with_logged_focal(profile: CameraProfile, capture: Capture) -> CameraProfile
     times, values = corners(np.array(middle_s), scales)
     ends = (float(scales.min()), float(scales.max()))
     log_of_capture = (tuple(times.tolist()), tuple(values.tolist()))
-    field = Field(
-        "scale", ("focal",), (ends,), tuple((e - 1.0,) for e in ends), (), capture.stamp_0_ns, log_of_capture
-    )
+    field = Field("scale", ("focal",), (ends,), tuple((e - 1.0,) for e in ends), (), capture.stamp_0_ns, log_of_capture)
     return profile.with_fields([*profile.fields, field])
 
 

@@ -16,6 +16,8 @@ from virest.motion.trajectory import rotation_from_vector
 
 Array = NDArray[np.float64]
 INF = float("inf")
+GYRO_SCALE_OFF = 0.15
+"""Makers trim gyroscopes to 3 % (BMI160, LSM6DSO, ICM-20602: sensitivity tolerance); five times that is a fault."""
 
 
 def _lens(profile: CameraProfile) -> Intrinsics:

@@ -18,8 +18,23 @@ from virest.report.figures import as_file, canvas, literal
 Array = NDArray[np.float64]
 SAMPLES, ARROWS, BINS, MIN_IN_BIN = 200, 13, 20, 8
 UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.0, "%"), "rate": (1.0, "rad/s")}
-NAMES = {"row": "fraction of the readout", "time": "time", "focus": "focus distance", "focal": "logged focal length", "x": "x", "y": "y"}
-RESIDUALS_OVER = {"row": "row", "time": "time", "rate": "rate", "x": "radius", "focus": "time", "focal": "time", "acceleration": "time"}
+NAMES = {
+    "row": "fraction of the readout",
+    "time": "time",
+    "focus": "focus distance",
+    "focal": "logged focal length",
+    "x": "x",
+    "y": "y",
+}
+RESIDUALS_OVER = {
+    "row": "row",
+    "time": "time",
+    "rate": "rate",
+    "x": "radius",
+    "focus": "time",
+    "focal": "time",
+    "acceleration": "time",
+}
 RESIDUAL_AXES = {"row": "fraction of the readout", "time": "time, s", "rate": "rate, rad/s", "radius": "radius, px"}
 COMPONENTS = ("x", "y", "z")
 

@@ -21,6 +21,8 @@ FOCAL_REACH, FOCAL_STEPS = 0.95, 20
 """Logarithms of the focal scales tried: factors of 0.39 to 2.6."""
 FRACTIONS, CUTOFF_STEPS = (0.25, 0.5, 0.8), (-1.2, 0.0, 1.2)
 """Stabilisers tried; cutoffs as logarithms of factors on the profile's."""
+GYRO_REACH, GYRO_STEPS = 0.14, 8
+"""Logarithms of the gyroscope scales tried: what a gyroscope may be off by."""
 MOST_STABILISED = 0.95
 """A lens that takes all of the shake is none: such pictures were cropped and turned by software."""
 CUTOFF_HZ = (0.03, 15.0)
@@ -88,6 +90,20 @@ def _with_stabiliser(profile: CameraProfile, found: CameraProfile, std: Array) -
     return taken.with_estimate("stabilisation_cutoff_hz", cutoff_hz, cutoff_hz * float(std[1]), SOURCE)
 
 
+def _gyro_scales(_: TrackTable) -> Array:
+    return np.linspace(-GYRO_REACH, GYRO_REACH, GYRO_STEPS)[:, None]
+
+
+def _gyro_ratio(given: CameraProfile, found: CameraProfile) -> float:
+    return found.gyro_scale[0] / given.gyro_scale[0]
+
+
+def _with_gyro_scale(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+    scale = found.gyro_scale
+    spread = [value * float(std[0]) for value in scale]
+    return profile.with_estimate("gyro_scale", list(scale), spread, SOURCE, gyro_scale=scale)
+
+
 def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
     ext = found.extensions
     return (
@@ -95,9 +111,12 @@ def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
     )
 
 
+FOCAL_LENGTH, GYROSCOPE = "focal length", "gyroscope scale"
+TWINS = {FOCAL_LENGTH: GYROSCOPE, GYROSCOPE: FOCAL_LENGTH}
+"""Turns about the picture's axes tell only their product; turns about the optical axis tell the gyroscope's alone."""
 CAUSES = (
     Cause(
-        "focal length",
+        FOCAL_LENGTH,
         replace(terms_of.FOCAL, prior_std=(0.6,)),
         _focal_scales,
         lambda given, found: 0.35 < _focal_px(found) / _focal_px(given) < 2.9,
@@ -106,6 +125,18 @@ CAUSES = (
         lambda given, found, std: (
             f"focal length of {_focal_px(found):.1f} ± {_focal_px(found) * std[0]:.1f} px taken, "
             f"where the profile has {_focal_px(given):.1f} px"
+        ),
+    ),
+    Cause(
+        GYROSCOPE,
+        terms_of.GYRO_SCALE,
+        _gyro_scales,
+        lambda given, found: abs(found.gyro_scale[0] - 1) < terms_of.GYRO_SCALE_OFF,
+        lambda given, found: float(np.log(_gyro_ratio(given, found))),
+        _with_gyro_scale,
+        lambda given, found, std: (
+            f"gyroscope scale of {found.gyro_scale[0]:.4f} ± {found.gyro_scale[0] * std[0]:.4f} taken, "
+            f"where the profile has {given.gyro_scale[0]:g}"
         ),
     ),
     Cause(

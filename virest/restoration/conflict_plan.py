@@ -89,7 +89,8 @@ def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
 def _unexplained(found: Settled) -> str:
     return (
         f"tracked points lie {found.before_px:.2f} px from where the profile puts them (tracking noise "
-        f"{found.noise_px:.2f} px), and no focal length, clock skew or stabiliser explains that: virest diagnose"
+        f"{found.noise_px:.2f} px), and no focal length, gyroscope scale, clock skew or stabiliser explains that: "
+        "virest diagnose"
     )
 
 

@@ -24,7 +24,7 @@ from virest.motion.scene_motion import DirectedMotion, Motion
 from virest.motion.track_fit import RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.motion.track_model import TrackTable, ground
 from virest.motion.tracking_bias import bias_std
-from virest.restoration.conflict_causes import CAUSES, Cause
+from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +39,8 @@ HELD_OUT_P = 0.05
 VALUE_P = 1e-5
 """Of a value being nought, with tracking's own bias in its deviation: with nine trials at most, a false cause in fewer
 than one capture of ten thousand."""
+TOLD_SIGMA = 3.0
+"""A cause is told from its twin where it stands beside it by so many deviations."""
 MAX_CAUSES = 3
 JUDGED = 2
 """Causes judged on held-out blocks each time, those first that fit best."""
@@ -117,6 +119,7 @@ def settle_conflict(
     for cause, std in zip(causes, stds, strict=True):
         resolved = cause.adopted(resolved, fit.profile, std)
     said = tuple(cause.said(profile, fit.profile, std) for cause, std in zip(causes, stds, strict=True))
+    said = tuple(text + search.rival(fit, causes, cause) for text, cause in zip(said, causes, strict=True))
     offset = _offset(fit, readout_s, noise_px)
     focal = None if focal_known else _focal(fit, noise_px)
     after_px = fit.scale * noise_px
@@ -204,6 +207,17 @@ class _Search:
                 break
             here, fit = entered
         return fit, here.causes
+
+    def rival(self, fit: TrackFit, causes: tuple[Cause, ...], cause: Cause) -> str:
+        """What to add of a cause that points do not tell from its twin, fitted beside it; nothing where they do."""
+        twin = next((other for other in CAUSES if other.name == TWINS.get(cause.name)), None)
+        fitted = {term.name for term in (*self.nuisances, *(other.term for other in causes))}
+        if twin is None or twin.term.name in fitted:
+            return ""
+        both = self.fit(_Start(fit.profile, (*causes, twin), fit.scene))
+        change = cause.change(self.given, both.profile)
+        std = _std(both, cause, float(np.median(self.table.noise_px)))[0]
+        return "" if abs(change) > TOLD_SIGMA * std else f" (or a {twin.name}, which this motion does not tell from it)"
 
     def _next(self, here: _Start, fit: TrackFit) -> tuple[_Start, TrackFit] | None:
         """The cause that best predicts held-out blocks, if it does so beyond chance and has a value of its own."""
