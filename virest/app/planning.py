@@ -26,6 +26,7 @@ from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, VirestError
+from virest.motion.recorder_stall import at_shown_times, fit_stall, stall_window
 from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.planning import plan_restoration
@@ -33,6 +34,8 @@ from virest.restoration.settings import RestorationSettings
 
 log = logging.getLogger(__name__)
 
+MOST_STALLS = 6
+"""Stalls whose frames are told, the first ones: the cost does not grow with the movie."""
 SHOWN_CHARACTERS = 200
 """Of a name that is longer, in messages."""
 
@@ -112,6 +115,7 @@ def plan_capture(path: str, name: str, options: ProcessOptions) -> Planned:
         if check_run(job.run, job.request, options.mode) != "finished" or options.mode != "resume":
             index = probe_movie(job.capture.movie)
             plan = _plan(job, index, options.settings)
+            job, plan = _with_stalls_followed(job, index, plan)
             job = dataclasses.replace(job, selected=_selected(job.capture, plan.profile, options))
             planned = Planned(job, index, plan)
     except VirestError as error:
@@ -273,3 +277,35 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
     if plan.copy_reason:
         log.warning("%s: all frames are copied: %s", job.name, plan.copy_reason)
     return plan
+
+
+def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) -> tuple[Job, RestorationPlan]:
+    """Frames of an encoder's stalls at the times of what they show, where points tell; else they stay left out.
+
+    Their translations were worked out for the times of their stamps, and go.
+    """
+    capture, found = job.capture, []
+    if plan.copy_reason is not None:
+        return job, plan
+    for stall in capture.stalls[:MOST_STALLS]:
+        pictures = read_gray(capture.movie, index, stall_window(capture, stall))
+        told = fit_stall(capture, plan.profile, stall, {n: p for n, p in pictures if p is not None})
+        if told is None:
+            log.info("%s: points do not tell when frames %d-%d were taken", job.name, *stall)
+            continue
+        found.append(told)
+        late_s = capture.frames[told.shows[0]].time_s - capture.frames[told.first].time_s
+        text = (
+            f"the encoder's stall is followed: frames {told.first} to {told.last}, up to {1e3 * late_s:.0f} ms later "
+            f"than stamped, are taken at their true times (by points within {1e3 * told.rest_s[0]:+.1f} "
+            f"± {1e3 * told.rest_s[1]:.1f} ms)"
+        )
+        log.warning("%s: %s", job.name, text)
+        plan = dataclasses.replace(plan, warnings=(*plan.warnings, text))
+    if not found:
+        return job, plan
+    moved = {slot for one in found for slot in range(one.first, one.last + 1)}
+    if plan.translations is not None:
+        kept = {number: motion for number, motion in plan.translations.items() if number not in moved}
+        plan = dataclasses.replace(plan, translations=kept)
+    return dataclasses.replace(job, capture=at_shown_times(capture, found)), plan
