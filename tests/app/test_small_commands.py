@@ -41,6 +41,7 @@ def test_the_doctor_says_what_is_here(virest_here, monkeypatch: pytest.MonkeyPat
     facts = json.loads(done.stdout)
     assert facts["missing"] == []
     assert "h264" in facts["decoders"]
+    assert facts["transforms"].startswith("OpenCV")
     monkeypatch.setattr(doctor, "NEEDED", (*doctor.NEEDED, "no-such-package"))
     _, text, code = doctor.examine()
     assert code == 1
@@ -50,9 +51,9 @@ def test_the_doctor_says_what_is_here(virest_here, monkeypatch: pytest.MonkeyPat
 def test_the_doctor_names_what_is_slow() -> None:
     """Few cores, little memory, a slow core: each with its reason."""
     facts = {"cores": 8, "memory_bytes": 1.5e9, "free_bytes_here": 1e9, "fft_s": 0.05, "vector_instructions": False,
-             "decoders": ["h264"]}  # fmt: skip
+             "decoders": ["h264"], "transforms": doctor.OWN_TRANSFORMS}  # fmt: skip
     notes = " ".join(doctor._notes(facts))
-    for word in ("--jobs 4", "vector instructions", "5.0 times", "GB free", "HEVC"):
+    for word in ("--jobs 4", "vector instructions", "5.0 times", "GB free", "HEVC", "IPP"):
         assert word in notes
     assert "one core" in doctor._notes({"cores": 1, "memory_bytes": None, "free_bytes_here": 1e12})[0]
 

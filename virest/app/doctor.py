@@ -23,6 +23,8 @@ EXTRAS = {
     "telemetry": ("telemetry-parser",),
     "rosbags": ("rosbags",),
 }
+OWN_TRANSFORMS = "OpenCV's own code"
+"""Four times as long for a tile of 128 to 512 px as with IPP, on one core of a server (x86-64, AVX-512)."""
 DECODERS, ENCODER = ("h264", "hevc", "vp9", "av1"), "libx264"
 PER_WORKER_BYTES = 300e6
 """Peak of a worker at 720x1280 (`python -m virest.app.bench --only memory`)."""
@@ -88,6 +90,7 @@ def _abilities() -> Json:
         "decoders": [name for name in DECODERS if name in av.codecs_available],
         "encoder": ENCODER if ENCODER in av.codecs_available else None,
         "vector_instructions": bool(cv2.useOptimized()),
+        "transforms": f"OpenCV with {cv2.ipp.getIppVersion()}" if cv2.ipp.useIPP() else OWN_TRANSFORMS,
         "fft_s": round(min(times), 5),
     }
 
@@ -105,6 +108,11 @@ def _notes(facts: Json) -> list[str]:
         )
     if not facts.get("vector_instructions", True):
         notes.append("OpenCV runs without vector instructions: deblurring takes several times as long; reinstall it")
+    if facts.get("transforms") == OWN_TRANSFORMS:
+        notes.append(
+            "OpenCV transforms without Intel's IPP (not in its build for this processor, or switched off): a tile's "
+            "Fourier transform takes about four times as long, deblurring accordingly"
+        )
     if facts.get("fft_s", 0.0) > 2 * USUAL_FFT_S:
         times = facts["fft_s"] / USUAL_FFT_S
         notes.append(f"a Fourier transform takes {times:.1f} times the usual time: slow core, or others at work on it")
@@ -130,6 +138,7 @@ def _describe(facts: Json) -> str:
     if "decoders" in facts:
         lines.append(f"codecs    reads {', '.join(facts['decoders'])}; writes {facts['encoder'] or 'no H.264'}")
         lines.append(f"speed     Fourier transform of 720x1280 in {1e3 * facts['fft_s']:.1f} ms on one core")
+        lines.append(f"          transforms by {facts['transforms']}")
     lines += [f"note: {note}" for note in facts["notes"]]
     missing = ", ".join(facts["missing"])
     return "\n".join([*lines, f"missing: {missing}" if missing else "everything that virest needs is here"])

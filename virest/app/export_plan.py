@@ -18,6 +18,7 @@ from virest.camera.kalibr import ImuNoise, measure_imu_noise
 from virest.camera.profile import CameraProfile, Extensions, parse_profile
 from virest.capture.files import label, scan_text
 from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile
+from virest.capture.records import STALL
 from virest.errors import CaptureError, OutputError
 from virest.restoration.capture import at_true_times
 
@@ -217,7 +218,10 @@ def _choose(
     frames = at_true_times(capture.frames, profile, capture.repeats)
     chosen = [frames[i] for i in sorted(range(len(frames))[options.frames])]
     if pictures is not None:
-        return [frame for frame in chosen if frame.index in pictures]
+        stalled = [frame for frame in chosen if frame.index in pictures and STALL in frame.skip_codes]
+        if stalled:  # restored at times that the run found and the capture does not know
+            left_out["of an encoder's stall"] = len(stalled)
+        return [frame for frame in chosen if frame.index in pictures and frame not in stalled]
     for frame in chosen:
         if frame.skip_reason is not None:
             reason = f"skipped: {', '.join(frame.skip_codes)}"

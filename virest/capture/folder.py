@@ -346,7 +346,10 @@ def _later_repeats(files: Source, look: int, motion_px: NDArray[np.float64]) -> 
 def _stall_note(stalls: tuple[tuple[int, int], ...], repeats: tuple[int, ...]) -> Note:
     runs = ", ".join(f"{first}–{last}" for first, last in stalls[:8]) + (" …" if len(stalls) > 8 else "")
     seen = f"; frames {', '.join(map(str, repeats))} repeat their predecessor" if repeats else ""
-    text = f"the encoder stalled: frames {runs} may show pictures later than their stamps and are left out{seen}"
+    text = (
+        f"the encoder stalled: frames {runs} may show pictures later than their stamps and are left out, unless tracked "
+        f"points tell when they were taken{seen}"
+    )
     return Note("warning", "encoder-stall", text)
 
 
