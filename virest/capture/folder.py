@@ -347,8 +347,8 @@ def _stall_note(stalls: tuple[tuple[int, int], ...], repeats: tuple[int, ...]) -
     runs = ", ".join(f"{first}–{last}" for first, last in stalls[:8]) + (" …" if len(stalls) > 8 else "")
     seen = f"; frames {', '.join(map(str, repeats))} repeat their predecessor" if repeats else ""
     text = (
-        f"the encoder stalled: frames {runs} may show pictures later than their stamps and are left out, unless tracked "
-        f"points tell when they were taken{seen}"
+        f"the encoder stalled: frames {runs} may show pictures later than their stamps and are left out, unless "
+        f"tracked points tell when they were taken{seen}"
     )
     return Note("warning", "encoder-stall", text)
 
