@@ -31,7 +31,7 @@ def realdata() -> Path:
 def virest() -> RunVirest:
     """The program as its users run it: ``virest("process", folder)`` gives returncode, stdout, stderr."""
 
-    def run(*arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 120, **environment: str):
+    def run(*arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 1200, **environment: str):
         return subprocess.run(
             [sys.executable, "-m", "virest", *map(str, arguments)],
             cwd=cwd, input=stdin, capture_output=True, text=True, timeout=timeout, check=False,

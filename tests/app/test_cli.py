@@ -499,50 +499,65 @@ def test_inspect_prints_what_it_can(virest: Virest, tiny: Path, *, as_json: bool
 
 # ── being stopped ────────────────────────────────────────────────────────────────────────────────────────────────
 
-SLOW = ("--preset", "best")
+ITERATIONS = 150
+"""A fifth of a second for each frame of ``swing``: a run is still at work when it is stopped."""
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> tuple[object, ...]:
+    """Arguments that make a run slow."""
+    file = tmp_path / "slow.yaml"
+    file.write_text(f"virest_settings: 1\niterations: {ITERATIONS}\nneighbours: 0\n")
+    return ("--settings", file)
 
 
 @pytest.mark.scenario
 @pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
-    virest: Virest, start: Callable[..., Any], tiny: Path, tmp_path: Path, jobs: int, number: signal.Signals
+    virest: Virest,
+    start: Callable[..., Any],
+    swing: Path,
+    slow: tuple[object, ...],
+    tmp_path: Path,
+    jobs: int,
+    number: signal.Signals,
 ) -> None:
     """Exit 130 (143 for SIGTERM), one line, no parts, no lock; --resume ends with the files of an undisturbed run."""
-    arguments = ("process", tiny, *SLOW, "--jobs", jobs, "--out")
+    arguments = ("process", swing, *slow, "--jobs", jobs, "--out")
     with start(*arguments, tmp_path / "out") as process:
-        wait_for(lambda: len(below(tmp_path / "out/tiny/frames")) > 2, process)
+        wait_for(lambda: len(below(tmp_path / "out/swing/frames")) > 2, process)
         os.killpg(process.pid, number)
-        output, errors = process.communicate(timeout=30)
+        output, errors = process.communicate(timeout=300)
     assert process.returncode == (130 if number == signal.SIGINT else 143), errors
     assert output == ""
     assert "Traceback" not in errors
     assert not [name for name in below(tmp_path / "out") if name.endswith((".part", ".lock", "run.json"))]
     assert virest(*arguments, tmp_path / "out", "--resume").returncode == 0
     assert virest(*arguments, tmp_path / "undisturbed").returncode == 0
-    assert content(tmp_path / "out/tiny") == content(tmp_path / "undisturbed/tiny")
+    assert content(tmp_path / "out/swing") == content(tmp_path / "undisturbed/swing")
 
 
 @pytest.mark.scenario
 def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
-    virest: Virest, start: Callable[..., Any], tiny: Path, tmp_path: Path
+    virest: Virest, start: Callable[..., Any], swing: Path, slow: tuple[object, ...], tmp_path: Path
 ) -> None:
     """SIGKILL at any time; a finished segment is not done again; workers do not outlive their parent."""
-    arguments = ("process", tiny, *SLOW, "--jobs", 2, "--out")
-    run = tmp_path / "out/tiny"
+    arguments = ("process", swing, *slow, "--jobs", 2, "--out")
+    run = tmp_path / "out/swing"
     with start(*arguments, tmp_path / "out") as process:
         wait_for(lambda: any(name.startswith(".segments/") for name in below(run)), process)
         process.kill()
-        process.communicate(timeout=30)  # returns when the last worker has let go of the pipes
+        process.communicate(timeout=300)  # returns when the last worker has let go of the pipes
     log = next((run / ".segments").glob("*.jsonl"))
     first = json.loads(log.read_text().splitlines()[0])["output"]
     written_ns = (run / first).stat().st_mtime_ns
-    (run / "frames/000023.png.0123abcd.part").write_bytes(b"half")
+    (run / "frames/000009.png.0123abcd.part").write_bytes(b"half")
     assert_refused(virest(*arguments, tmp_path / "out"), 8, "unfinished", "--resume")
     assert virest(*arguments, tmp_path / "out", "--resume").returncode == 0
     assert (run / first).stat().st_mtime_ns == written_ns
     assert virest(*arguments, tmp_path / "undisturbed").returncode == 0
-    assert content(run) == content(tmp_path / "undisturbed/tiny")
+    assert content(run) == content(tmp_path / "undisturbed/swing")
 
 
 @pytest.mark.scenario
@@ -558,10 +573,10 @@ def test_the_bytes_do_not_depend_on_the_number_of_jobs(virest: Virest, tiny: Pat
 @pytest.mark.scenario
 def test_a_reader_that_goes_away_ends_the_run_quietly(start: Callable[..., Any], tiny: Path, tmp_path: Path) -> None:
     """`virest process … --json | head -1`: no traceback, no half-written file."""
-    with start("process", tiny, *SLOW, "--jobs", 1, "--json", "-q", "--out", tmp_path / "out") as process:
+    with start("process", tiny, "--jobs", 1, "--json", "-q", "--out", tmp_path / "out") as process:
         assert json.loads(process.stdout.readline())["frame"] == 0
         process.stdout.close()
         errors = process.stderr.read()
-        process.wait(timeout=60)
+        process.wait(timeout=300)
     assert (process.returncode, errors) == (141, "")
     assert not [name for name in below(tmp_path / "out") if name.endswith((".part", ".lock"))]

@@ -78,7 +78,7 @@ def test_a_killed_worker_costs_its_segments_only(
     with start(turning, tmp_path / "out", cluster.address) as process:
         wait_until(lambda: finished_segments(tmp_path / "out/turning") > 0, process)
         os.kill(cluster.workers[0].pid, signal.SIGKILL)
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     assert content(tmp_path / "out/turning") == undisturbed
     assert undisturbed["run.json"]["counts"]["restored"] > 30
@@ -93,7 +93,7 @@ def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
     with start(turning, tmp_path / "out", cluster.address) as process:
         wait_until(lambda: finished_segments(run) > 0, process)
         cluster.scheduler.kill()
-        output, errors = process.communicate(timeout=120)
+        output, errors = process.communicate(timeout=600)
     lines = [line for line in errors.splitlines() if "error" in line.lower()]
     assert process.returncode == 7, errors
     assert "Traceback" not in errors

@@ -25,7 +25,7 @@ from virest.camera.response import ResponseCurve
 def virest(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run the program."""
     command = [sys.executable, "-m", "virest", *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600, check=False)
 
 
 def write_bracket(folder: Path, curve: ResponseCurve, wrong: dict[int, float] | None = None) -> Path:

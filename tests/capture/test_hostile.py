@@ -209,5 +209,5 @@ def test_pipes_anywhere_in_a_folder_do_not_hang(writer) -> None:
         "try:\n    read_capture(pathlib.Path(sys.argv[1]))\nexcept VirestError as error:\n    print(error)"
     )
     command = [sys.executable, "-c", program, str(writer.folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     assert (done.returncode, done.stderr) == (0, "")

@@ -46,7 +46,7 @@ def simulate(virest: Virest, folder: Path, *arguments: object) -> Path:
 
 def process(virest: Virest, capture: Path, out: Path, *arguments: object) -> Result:
     """Run ``virest process``; it has to end with 0."""
-    done = virest("process", capture, "--out", out, "--jobs", 1, *arguments, timeout=300)
+    done = virest("process", capture, "--out", out, "--jobs", 1, *arguments, timeout=1800)
     assert done.returncode == 0, done.stderr
     folder = out / capture.name
     lines = [json.loads(line) for line in (folder / "parameters.jsonl").read_text(encoding="utf-8").splitlines()]

@@ -54,7 +54,7 @@ def calibrate(virest: Any, capture: Path, folder: Path, *arguments: object) -> d
     """Run ``virest calibrate --json``; it has to end with 0."""
     folder.mkdir(exist_ok=True)
     out = folder / "calibrated.yaml"
-    done = virest("calibrate", capture, "--json", "--out", out, *arguments, timeout=300)
+    done = virest("calibrate", capture, "--json", "--out", out, *arguments, timeout=1800)
     assert done.returncode == 0, done.stderr
     facts: dict[str, Any] = json.loads(done.stdout)
     return facts
@@ -223,7 +223,7 @@ def test_a_steady_pan_determines_nothing(virest: Any, turned: Path, tmp_path: Pa
 
 def test_pictures_that_the_camera_stabilised_are_refused(virest: Any, realdata: Path, tmp_path: Path) -> None:
     """An action camera with its stabiliser on: exit 6, no file."""
-    done = virest("calibrate", realdata / "gopro_hero7", "--json", cwd=tmp_path, timeout=300)
+    done = virest("calibrate", realdata / "gopro_hero7", "--json", cwd=tmp_path, timeout=1800)
     assert_refused_or_open(done, tmp_path)
 
 

@@ -77,7 +77,7 @@ def test_a_slow_clock_behind_a_stabiliser_is_named(virest, realdata: Path, tmp_p
     Held-out points do not tell its stabiliser from a principal point elsewhere; they are better off with the
     stabiliser, so that is told and the other named beside it.  Much is left, as hand and scene are near.
     """
-    done = virest("diagnose", realdata / "nexus5_162941", "--json", "--out", tmp_path, timeout=900)
+    done = virest("diagnose", realdata / "nexus5_162941", "--json", "--out", tmp_path, timeout=1800)
     assert done.returncode == 0, done.stderr
     diagnosis = json.loads(done.stdout)
     found = {cause["name"]: cause["parameters"] for cause in diagnosis["causes"]}
