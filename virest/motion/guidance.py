@@ -2,6 +2,9 @@
 
 The map is that of :mod:`virest.motion.track_model` for a camera that turns, with each row at its own time.  It is
 worked out at Chebyshev nodes and is a polynomial between them: exact to 0.01 px at any rate a hand reaches.
+
+Where one frame is more blurred than the other, the sharper one is blurred by what it lacks: a uniform path d has the
+covariance d dᵀ / 12, and the positive part of the difference of the two frames' is added as a Gaussian.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ NODES = 8
 ROW_STEPS = 3
 """Row times depend on where a point lands; each step shrinks the error about tenfold at 250 px a frame."""
 INVERSE_STEPS, INVERSE_PX = 12, 1e-3
+LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 0.5, 0.2, 2.5
+"""Blur of a smaller deviation is left out; across its path a Gaussian is a pixel wide; it ends at 2.5 deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,22 @@ class GyroGuide:
             table = replace(table, second_px=prediction.second_px)
         shift = (table.second_px - at).reshape(NODES, NODES, 2) / factor
         weights = _weights()
-        return MapBetween(np.einsum("ki,lj,ijc->klc", weights, weights, shift), (height, width))
+        lacks = self._blur(first, second, at[:: NODES + 1]) / factor**2
+        return MapBetween(
+            np.einsum("ki,lj,ijc->klc", weights, weights, shift),
+            (height, width),
+            _positive_part(lacks[1] - lacks[0]),
+            _positive_part(lacks[0] - lacks[1]),
+        )
+
+    def _blur(self, first: int, second: int, at_px: Array) -> Array:
+        """Covariances (2, 2, 2) of both frames' blur, px², from the chords of the exposures' paths at points (n, 2)."""
+        pairs = [TrackPair(frame, frame, at_px, at_px) for frame in (first, second)]
+        table = track_table(pairs, self.stamp_s, self.exposure_s, np.ones(2))
+        half_s = 0.5 * np.asarray(self.known.profile.shutter.true_exposure_s(table.first_exposure_s))
+        table = replace(table, first_stamp_s=table.first_stamp_s - half_s, second_stamp_s=table.second_stamp_s + half_s)
+        path_px = (predict(self.known, table, None).second_px - table.first_px).reshape(2, -1, 2)
+        return np.einsum("fni,fnj->fij", path_px, path_px) / (12 * len(at_px))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +84,9 @@ class MapBetween:
     coefficients: Array
     """(NODES, NODES, 2) of the shift in Chebyshev polynomials of y and x, pixels."""
     shape: tuple[int, int]
+    first_lacks: Array
+    """(2, 2) covariance of the blur that the first picture lacks beside the second, px²."""
+    second_lacks: Array
 
     def first_of(self, points_px: Array) -> Array:
         """Where points (n, 2) of the second picture are in the first."""
@@ -84,14 +107,19 @@ class MapBetween:
         return found
 
     def carried(self, first: Picture) -> Picture:
-        """The first picture as the second one should show it."""
+        """The first picture as the second one should show it, as blurred as the second where that is more."""
         height, width = self.shape
         down, across = (_all_places(length) for length in self.shape)
         values = self.coefficients.astype(np.float32)
         grid_x, grid_y = ((down @ values[..., c]) @ across.T for c in (0, 1))
         grid_x += np.arange(width, dtype=np.float32)
         grid_y += np.arange(height, dtype=np.float32)[:, None]
-        return np.asarray(cv2.remap(first, grid_x, grid_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        shown = cv2.remap(first, grid_x, grid_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return _blurred(np.asarray(shown, np.uint8), self.first_lacks)
+
+    def evened(self, second: Picture) -> Picture:
+        """The second picture, as blurred as the first where that is more."""
+        return _blurred(second, self.second_lacks)
 
 
 def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
@@ -99,6 +127,22 @@ def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
     stamp_s, exposure_s, _ = frame_times(capture)
     stamp_s[[frame.skip_reason is not None for frame in capture.frames]] = np.nan
     return GyroGuide(ground(capture.imu, profile, translation=False), stamp_s, exposure_s)
+
+
+def _positive_part(covariance: Array) -> Array:
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
+
+
+def _blurred(picture: Picture, covariance: Array) -> Picture:
+    """A picture through a Gaussian of a covariance (2, 2), px²; as it is where that is next to nothing."""
+    values, axes = np.linalg.eigh(covariance)
+    if values[-1] < LEAST_BLUR_PX**2:
+        return picture
+    reach = int(np.ceil(GAUSSIAN_REACH * np.sqrt(values[-1])))
+    place = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), -1) @ axes
+    kernel = np.exp(-0.5 * (place**2 / np.maximum(values, NARROWEST_PX**2)).sum(axis=-1))
+    return np.asarray(cv2.filter2D(picture, -1, kernel / kernel.sum()), np.uint8)
 
 
 def _nodes() -> Array:

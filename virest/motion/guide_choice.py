@@ -128,8 +128,8 @@ class _Scores:
         side = self.values.shape[-1]
         place = np.rint(shift_px / self.scale).astype(np.int32) + (side - 1) // 2
         place = np.clip(place, 0, side - 1)
-        pair, tile = np.indices(self.values.shape[:2], np.int32, sparse=True)
-        flat = ((pair * self.values.shape[1] + tile) * side + place[..., 1]) * side + place[..., 0]
+        surface = np.arange(self.values.shape[0] * self.values.shape[1]).reshape(self.values.shape[:2])
+        flat = (surface * side + place[..., 1]) * side + place[..., 0]
         return np.asarray(self.values.ravel()[flat].mean(axis=-1))
 
     def of_tiles(self, chosen: slice) -> _Scores:
@@ -157,10 +157,11 @@ def _matched(pictures: Iterable[tuple[int, Picture | None]], profile: CameraProf
         before = (index, small)
     if not found:
         return None
-    first, second, values = ([one[k] for one in found] for k in range(3))
+    first, second = np.array([one[:2] for one in found], np.intp).T
+    values = np.stack([one[2] for one in found])
     middle = (TILE_PX - 1) / 2
     centres = (np.array(tiles, float) + middle + 0.5) * scale - 0.5
-    return _Scores(np.array(first), np.array(second), np.stack(values), centres, scale)
+    return _Scores(first, second, values, centres, scale)
 
 
 def _surface(first: Picture, second: Picture, x: int, y: int) -> NDArray[np.float32]:

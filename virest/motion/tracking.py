@@ -60,7 +60,10 @@ class Between(Protocol):
         """Where points (n, 2) of the first picture are in the second."""
 
     def carried(self, first: Picture) -> Picture:
-        """The first picture as the second one should show it."""
+        """The first picture as the second one should show it, as blurred as the second where that is more."""
+
+    def evened(self, second: Picture) -> Picture:
+        """The second picture, as blurred as the first where that is more."""
 
 
 class Guide(Protocol):
@@ -216,13 +219,8 @@ def _track(
         ahead, good, distance = _there_and_back(first, second, start, settings, settings.pyramid_levels)
     else:
         ahead, good, distance = _guided(first, second, start, settings, between)
-    return TrackPair(
-        index,
-        index + 1,
-        _stored(start[good], factor),
-        _stored(ahead[good], factor),
-        distance[good].astype(float) * factor,
-    )
+    returned_px = distance[good].astype(float) * factor
+    return TrackPair(index, index + 1, _stored(start[good], factor), _stored(ahead[good], factor), returned_px)
 
 
 def _guided(
@@ -233,16 +231,18 @@ def _guided(
     The first picture is compared as the guide carries it into the second, turned and sheared.  A point found far from
     where it was put does not count where the carried picture shows the same there: texture that repeats.
     """
-    carried, put = between.carried(first), between.second_of(start.astype(float)).astype(np.float32)
+    put = between.second_of(start.astype(float)).astype(np.float32)
+    carried, evened = between.carried(first), between.evened(second)
     ahead, good, distance = put.copy(), np.zeros(len(put), bool), np.zeros(len(put), np.float32)
-    for before, begun, levels in ((carried, put, settings.guided_levels), (first, start, settings.pyramid_levels)):
+    guided, plain = (carried, evened, put, settings.guided_levels), (first, second, start, settings.pyramid_levels)
+    for before, after, begun, levels in (guided, plain):
         missing = np.flatnonzero(_inside(put, second, settings) & ~good)
         if len(missing):
             ahead[missing], good[missing], distance[missing] = _there_and_back(
-                before, second, begun[missing], settings, levels
+                before, after, begun[missing], settings, levels
             )
     far = np.flatnonzero(good & (np.linalg.norm(ahead - put, axis=-1) > settings.repeats_from_px))
-    good[far[_repeats(carried, second, put[far], ahead[far], settings)]] = False
+    good[far[_repeats(carried, evened, put[far], ahead[far], settings)]] = False
     return ahead, good, distance
 
 
