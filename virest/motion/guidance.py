@@ -28,8 +28,8 @@ NODES = 8
 ROW_STEPS = 3
 """Row times depend on where a point lands; each step shrinks the error about tenfold at 250 px a frame."""
 INVERSE_STEPS, INVERSE_PX = 12, 1e-3
-LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 0.5, 0.2, 2.5
-"""Blur of a smaller deviation is left out; across its path a Gaussian is a pixel wide; it ends at 2.5 deviations."""
+LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 1.0, 0.2, 2.0
+"""Blur of a smaller deviation is left out; across its path a Gaussian is a pixel wide; it ends at 2 deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +139,8 @@ def _blurred(picture: Picture, covariance: Array) -> Picture:
     values, axes = np.linalg.eigh(covariance)
     if values[-1] < LEAST_BLUR_PX**2:
         return picture
-    reach = int(np.ceil(GAUSSIAN_REACH * np.sqrt(values[-1])))
-    place = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), -1) @ axes
+    reach = np.ceil(GAUSSIAN_REACH * np.sqrt(np.maximum(np.diag(covariance), NARROWEST_PX**2)))
+    place = np.stack(np.meshgrid(*(np.arange(-length, length + 1) for length in reach)), -1) @ axes
     kernel = np.exp(-0.5 * (place**2 / np.maximum(values, NARROWEST_PX**2)).sum(axis=-1))
     return np.asarray(cv2.filter2D(picture, -1, kernel / kernel.sum()), np.uint8)
 
