@@ -9,6 +9,7 @@ covariance d dᵀ / 12, and the positive part of the difference of the two frame
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -30,6 +31,7 @@ ROW_STEPS = 3
 INVERSE_STEPS, INVERSE_PX = 12, 1e-3
 LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 1.0, 0.2, 2.0
 """Blur of a smaller deviation is left out; across its path a Gaussian is a pixel wide; it ends at 2 deviations."""
+NOTHING = np.zeros((2, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,23 +51,22 @@ class GyroGuide:
         """
         if not np.isfinite(self.stamp_s[[first, second]]).all():
             return None
-        height, width = shape
-        x, y = (0.5 * (length - 1) * (1 + _nodes()) for length in (width, height))
-        at = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) * factor + (factor - 1) / 2
-        table = track_table([TrackPair(second, first, at, at)], self.stamp_s, self.exposure_s, np.ones(1))
+        at_px = _nodes_px(shape, factor)
+        blur = self._blur(first, second, at_px[:: NODES + 1]) / factor**2
+        return replace(
+            map_between(lambda points_px: self._moved(second, first, points_px), shape, factor),
+            first_lacks=_positive_part(blur[1] - blur[0]),
+            second_lacks=_positive_part(blur[0] - blur[1]),
+        )
+
+    def _moved(self, frame: int, other: int, points_px: Array) -> Array:
+        """Where points (n, 2) of one frame are in another."""
+        table = track_table([TrackPair(frame, other, points_px, points_px)], self.stamp_s, self.exposure_s, np.ones(1))
         prediction = None
         for _ in range(ROW_STEPS):
             prediction = predict(self.known, table, None, like=prediction)
             table = replace(table, second_px=prediction.second_px)
-        shift = (table.second_px - at).reshape(NODES, NODES, 2) / factor
-        weights = _weights()
-        lacks = self._blur(first, second, at[:: NODES + 1]) / factor**2
-        return MapBetween(
-            np.einsum("ki,lj,ijc->klc", weights, weights, shift),
-            (height, width),
-            _positive_part(lacks[1] - lacks[0]),
-            _positive_part(lacks[0] - lacks[1]),
-        )
+        return table.second_px
 
     def _blur(self, first: int, second: int, at_px: Array) -> Array:
         """Covariances (2, 2, 2) of both frames' blur, px², from the chords of the exposures' paths at points (n, 2)."""
@@ -84,9 +85,9 @@ class MapBetween:
     coefficients: Array
     """(NODES, NODES, 2) of the shift in Chebyshev polynomials of y and x, pixels."""
     shape: tuple[int, int]
-    first_lacks: Array
+    first_lacks: Array = NOTHING
     """(2, 2) covariance of the blur that the first picture lacks beside the second, px²."""
-    second_lacks: Array
+    second_lacks: Array = NOTHING
 
     def first_of(self, points_px: Array) -> Array:
         """Where points (n, 2) of the second picture are in the first."""
@@ -127,6 +128,20 @@ def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
     stamp_s, exposure_s, _ = frame_times(capture)
     stamp_s[[frame.skip_reason is not None for frame in capture.frames]] = np.nan
     return GyroGuide(ground(capture.imu, profile, translation=False), stamp_s, exposure_s)
+
+
+def map_between(first_of: Callable[[Array], Array], shape: tuple[int, int], factor: int) -> MapBetween:
+    """The map of pictures (height, width), shrunk ``factor`` times, that takes stored pixels (n, 2) to the first's."""
+    at_px = _nodes_px(shape, factor)
+    shift = (first_of(at_px) - at_px).reshape(NODES, NODES, 2) / factor
+    return MapBetween(np.einsum("ki,lj,ijc->klc", _weights(), _weights(), shift), shape)
+
+
+def _nodes_px(shape: tuple[int, int], factor: int) -> Array:
+    """Nodes (NODES², 2) over a shrunk picture, stored pixels, row by row."""
+    height, width = shape
+    x, y = (0.5 * (length - 1) * (1 + _nodes()) for length in (width, height))
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) * factor + (factor - 1) / 2
 
 
 def _positive_part(covariance: Array) -> Array:
