@@ -31,7 +31,6 @@ ROW_STEPS = 3
 INVERSE_STEPS, INVERSE_PX = 12, 1e-3
 LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 1.0, 0.2, 2.0
 """Blur of a smaller deviation is left out; across its path a Gaussian is a pixel wide; it ends at 2 deviations."""
-NOTHING = np.zeros((2, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +84,9 @@ class MapBetween:
     coefficients: Array
     """(NODES, NODES, 2) of the shift in Chebyshev polynomials of y and x, pixels."""
     shape: tuple[int, int]
-    first_lacks: Array = NOTHING
-    """(2, 2) covariance of the blur that the first picture lacks beside the second, px²."""
-    second_lacks: Array = NOTHING
+    first_lacks: Array | None = None
+    """(2, 2) covariance of the blur that the first picture lacks beside the second, px²; None: nothing."""
+    second_lacks: Array | None = None
 
     def first_of(self, points_px: Array) -> Array:
         """Where points (n, 2) of the second picture are in the first."""
@@ -149,8 +148,10 @@ def _positive_part(covariance: Array) -> Array:
     return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
 
 
-def _blurred(picture: Picture, covariance: Array) -> Picture:
+def _blurred(picture: Picture, covariance: Array | None) -> Picture:
     """A picture through a Gaussian of a covariance (2, 2), px²; as it is where that is next to nothing."""
+    if covariance is None:
+        return picture
     values, axes = np.linalg.eigh(covariance)
     if values[-1] < LEAST_BLUR_PX**2:
         return picture
