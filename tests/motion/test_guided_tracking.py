@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from synthetic_motion import hand_motion
-from turning_pictures import R_CAM_IMU, Recording, blobs, chessboard, grating, shaken
+from turning_pictures import R_CAM_IMU, Phone, Recording, blobs, chessboard, grating, shaken
 
 from virest.camera.profile import CameraProfile
 from virest.motion.guidance import gyro_guide
@@ -75,6 +75,15 @@ def test_texture_that_repeats_is_followed(drawing: NDArray[np.uint8]) -> None:
     assert len(off) > 80 * (len(recording.pictures) - 1)
     assert np.median(off) < 0.1
     assert (off_px(recording, track_pairs(recording.gray(recording.frames))) > 3).mean() > 0.5
+
+
+def test_a_fast_pan_before_a_chessboard_is_followed() -> None:
+    """A turn of 4 rad/s, 60 to 100 px a frame, is nearly the same in every frame and in many an axis map."""
+    recording = Phone(chessboard(SQUARE_PX), hand_motion(3, 1.0, pan_rad_s=(0.0, 4.0, 0.0)), frames=10).record()
+    guide = find_guide(recording.capture, recording.phone.profile, recording.gray, recording.frames)
+    assert guide is not None
+    off = off_px(recording, track_pairs(recording.gray(recording.frames), guide=guide))
+    assert (off > 3).mean() < 0.02
 
 
 def test_an_unknown_offset_and_strange_axes_are_found(board: Recording) -> None:

@@ -37,8 +37,8 @@ Reader = Callable[[Sequence[int]], Iterable[tuple[int, Picture | None]]]
 SAMPLE_FRAMES, RUN_FRAMES = 32, 8
 """Four runs of frames where the gyroscope is liveliest."""
 MIN_PAIRS = 8
-LONG_SIDE_PX, TILE_PX, REACH_PX = 192, 33, 32
-"""Of the shrunk pictures: a sixth of the longer side a frame is within reach, 320 px of 1920."""
+LONG_SIDE_PX, TILE_PX, REACH_PX = 192, 33, 48
+"""Of the shrunk pictures: a quarter of the longer side a frame is within reach, 480 px of 1920."""
 TILES = 3
 """Each way."""
 FLAT_LEVELS = 1.5
