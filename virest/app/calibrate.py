@@ -21,9 +21,9 @@ from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import CalibrationError, OutputError
+from virest.motion.guide_choice import track_guided
 from virest.motion.lively_frames import lively_frames
 from virest.motion.shared_out import Each, one_by_one
-from virest.motion.tracking import track_frames
 from virest.report.words import residual_words
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
@@ -159,7 +159,8 @@ def find_calibration(
     """Track and fit; the mapping for ``--json``, and what it was made from.  Raises CalibrationError."""
     step = progress or (lambda _: None)
     movie = plan.capture.movie
-    pairs = track_frames(GrayReader(movie, probe_movie(movie)), plan.frames, each, step)
+    gray = GrayReader(movie, probe_movie(movie))
+    pairs = track_guided(plan.capture, plan.profile, gray, plan.frames, each, step)
     found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1))
     _require_offset(found)
     noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)

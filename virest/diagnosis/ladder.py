@@ -33,13 +33,14 @@ from virest.diagnosis.points import (
 )
 from virest.diagnosis.remaining import points_left, remaining_structure, residuals
 from virest.errors import CaptureError
+from virest.motion.guide_choice import find_guide, track_guided
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import observe_tracks
 from virest.motion.recorder_lag import lag_schedules
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_model import predict
-from virest.motion.tracking import TrackPair, track_frames, track_pairs
+from virest.motion.tracking import TrackPair, track_pairs
 
 Progress = Callable[[str, float], None]
 MOST_TRAVEL_PX = 0.35
@@ -85,7 +86,7 @@ def _tracked(
 ) -> tuple[TrackedPoints, list[str]]:
     """Points of the frames that are followed, those of the start-up too; pairs with a frame kept back are left out."""
     indices = frames_to_follow(capture, profile)
-    observed = observe_tracks(capture, _seen(track_frames(gray, indices, each), kept_back), profile)
+    observed = observe_tracks(capture, _seen(track_guided(capture, profile, gray, indices, each), kept_back), profile)
     start, null_terms, notes, far, follows = with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
@@ -155,7 +156,8 @@ class _Story:
         if points_left(self.geometric).significant and pulses(self.light.profile):
             even = evened(gray, frames, self.light.profile)
             followed = set(frames_to_follow(self.capture, given)) & {frame.index for frame in frames}
-            pairs = _seen(track_pairs(even(sorted(followed))), self.kept_back)
+            guide = find_guide(self.capture, given, gray, sorted(followed))
+            pairs = _seen(track_pairs(even(sorted(followed)), guide=guide), self.kept_back)
             again = observe_tracks(self.capture, pairs, given)
             start = self.points.start
             self.points = replace(

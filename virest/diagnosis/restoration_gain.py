@@ -31,10 +31,12 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
 from virest.degradation.row_motion import frame_times_s
 from virest.motion.alignment import choose_pairs
+from virest.motion.guidance import GyroGuide, MapBetween, map_between
+from virest.motion.guide_choice import find_guide
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.shared_out import Each, one_by_one
-from virest.motion.tracking import TrackPair, track_pairs
+from virest.motion.tracking import Guide, TrackPair, track_pairs
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
@@ -96,23 +98,31 @@ class _Restoration:
     restored: dict[int, RestoredFrame]
     trajectory: Trajectory | None
     lens: MovingLens | None
+    guide: GyroGuide | None
+    """Of the recorded frames, where the pictures follow the gyroscope."""
 
     def pair(self, first: int) -> _Pair | None:
         """Frames ``first`` and the next; None where one of them was not to be had."""
         a, b = (self.restored.get(first + step) for step in (0, 1))
         if a is None or b is None or a.picture is None or b.picture is None:
             return None
-        return _tracked(first, (a.picture, b.picture), (a.valid_px, b.valid_px))
+        return _tracked(first, (a.picture, b.picture), (a.valid_px, b.valid_px), self)
 
-    def predicted(self, points_px: Array, first: int) -> Array:
-        """Where points (n, 2) of the restored frame ``first`` lie in the next one, by the model."""
+    def seen_before(self, first: int, second: int, shape: tuple[int, int], factor: int) -> MapBetween | None:
+        """As a guide through restored frames, where the gyroscope is one through the recorded."""
+        if self.guide is None:
+            return None
+        return map_between(lambda points_px: self.predicted(points_px, second, first), shape, factor)
+
+    def predicted(self, points_px: Array, frame: int, other: int) -> Array:
+        """Where points (n, 2) of one restored frame lie in another one, by the model."""
         assert self.trajectory is not None
         assert self.lens is not None
-        from_s, to_s = (self._reference_s(first + step) for step in (0, 1))
+        from_s, to_s = self._reference_s(frame), self._reference_s(other)
         rays = self.lens.rays(points_px, from_s)
         turn = self.trajectory.orientation(to_s).T @ self.trajectory.orientation(from_s)
         moved = rays @ turn.T
-        translation = (self.plan.translations or {}).get(first)
+        translation = (self.plan.translations or {}).get(frame)
         if translation is not None:
             nearness = translation.inverse_depth(rays)
             shift = turn @ translation.position_m(np.array(to_s - from_s))
@@ -155,7 +165,7 @@ def measure_restoration_gain(
         if len(pairs) < len(both):
             continue
         shared = _shared([pair.valid_px for pair in pairs.values()])
-        raw = _tracked(first, (recorded[first], recorded[first + 1]), (whole, whole))
+        raw = _tracked(first, (recorded[first], recorded[first + 1]), (whole, whole), after.guide)
         for name, pair in {"recorded": raw, **pairs}.items():
             sharp[name].append(shared_gradient(pair.pictures, shared, pair.tracks))
         for name, restoration in (("before", before), ("after", after)):
@@ -270,7 +280,8 @@ def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: R
     known = plan.profile.intrinsics is not None
     trajectory = integrate_gyro(capture.imu, plan.profile) if known else None
     lens = moving_lens(trajectory, plan.profile) if trajectory is not None else None
-    return _Restoration(plan, frames, {}, trajectory, lens)
+    guide = find_guide(capture, plan.profile, gray, [frame.index for frame in capture.frames])
+    return _Restoration(plan, frames, {}, trajectory, lens, guide)
 
 
 def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> RestorationPlan:
@@ -287,9 +298,11 @@ def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: Rest
     return dataclasses.replace(plan, copy_reason=None, contradicted=None, missing_turn=None, confirmed=None)
 
 
-def _tracked(first: int, pictures: tuple[Picture, Picture], valid_px: tuple[Rectangle, Rectangle]) -> _Pair:
+def _tracked(
+    first: int, pictures: tuple[Picture, Picture], valid_px: tuple[Rectangle, Rectangle], guide: Guide | None
+) -> _Pair:
     luma = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
-    found = track_pairs([(first, luma[0]), (first + 1, luma[1])])
+    found = track_pairs([(first, luma[0]), (first + 1, luma[1])], guide=guide)
     if not found:
         return _Pair(pictures, valid_px, None)
     pair = found[0]
@@ -340,7 +353,7 @@ def _slope(picture: NDArray[np.float32], across: int, down: int) -> NDArray[np.f
 def _distances(restoration: _Restoration, pair: _Pair, first: int) -> Array:
     if restoration.lens is None or pair.tracks is None:
         return np.empty(0)
-    put = restoration.predicted(pair.tracks.points_first_px, first)
+    put = restoration.predicted(pair.tracks.points_first_px, first, first + 1)
     return np.asarray(np.linalg.norm(pair.tracks.points_second_px - put, axis=1))
 
 

@@ -131,15 +131,21 @@ class ObservedTracks:
 
 def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> ObservedTracks:
     """Keep the pairs with enough points and known stamps; the exposure of frames without one is the typical one."""
-    stamp_s = np.array([frame.time_s for frame in capture.frames], float)
-    exposure_s = np.array([np.nan if f.exposure_s is None else f.exposure_s for f in capture.frames], float)
-    known = bool(np.isfinite(exposure_s).mean() > 0.5)
-    exposure_s = np.where(np.isfinite(exposure_s), exposure_s, np.nanmedian(exposure_s) if known else 0.0)
+    stamp_s, exposure_s, known = frame_times(capture)
     kept = tuple(
         pair for pair in pairs if len(pair) >= MIN_TRACKS and np.isfinite(stamp_s[[pair.first, pair.second]]).all()
     )
     lens = profile.intrinsics or guessed_lens(profile)
     return ObservedTracks(kept, stamp_s, exposure_s, known, step_noise_px(kept), lens)
+
+
+def frame_times(capture: Capture) -> tuple[Array, Array, bool]:
+    """Stamps and logged exposures (frames,) by movie index, and whether exposures are known: else they are 0."""
+    stamp_s = np.array([frame.time_s for frame in capture.frames], float)
+    exposure_s = np.array([np.nan if f.exposure_s is None else f.exposure_s for f in capture.frames], float)
+    known = bool(np.isfinite(exposure_s).mean() > 0.5)
+    exposure_s = np.where(np.isfinite(exposure_s), exposure_s, np.nanmedian(exposure_s) if known else 0.0)
+    return stamp_s, exposure_s, known
 
 
 def guessed_lens(profile: CameraProfile) -> Intrinsics:

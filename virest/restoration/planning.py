@@ -26,6 +26,7 @@ from virest.motion.alignment import (
     estimate_time_offset,
 )
 from virest.motion.coarse_alignment import align_coarsely
+from virest.motion.guide_choice import find_guide
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import GUESSED_FOCAL, observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
@@ -86,8 +87,10 @@ def _planned(
     path_px = _rough_paths_px(capture, profile, chosen)
     looked_at = telling(list(path_px), np.array(list(path_px.values()))) if settings.deblur != "none" else ()
     surveyed, lumas = survey_runs(path_px, path_px), dict[int, NDArray[np.uint8]]()
-    pictures = kept_lumas(read_gray(sorted(chosen.union(runs))), {n for run in surveyed for n in run}, lumas)
-    all_pairs = track_pairs(kept_powers(pictures, looked_at, curve, powers))
+    wanted = sorted(chosen.union(runs))
+    guide = find_guide(capture, profile, read_gray, wanted)
+    pictures = kept_lumas(read_gray(wanted), {n for run in surveyed for n in run}, lumas)
+    all_pairs = track_pairs(kept_powers(pictures, looked_at, curve, powers), guide=guide)
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
         plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))

@@ -23,7 +23,7 @@ from virest.calibration.geometry import CalibratedValue, GeometryCalibration, ca
 from virest.camera.profile import CameraProfile, read_profile
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import VirestError
-from virest.motion.tracking import track_frames
+from virest.motion.guide_choice import track_guided
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -63,7 +63,7 @@ def calibrated_rows(work: Path, seed: int) -> list[Row]:
     try:
         plan = plan_calibration(folder, None, EXTRA)
         movie = plan.capture.movie
-        pairs = track_frames(GrayReader(movie, probe_movie(movie)), plan.frames)
+        pairs = track_guided(plan.capture, plan.profile, GrayReader(movie, probe_movie(movie)), plan.frames)
         found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
     except VirestError:
         return []

@@ -13,12 +13,12 @@ from virest.app.bench.workload import Scale
 from virest.app.calibrate import plan_calibration
 from virest.app.diagnose import open_source
 from virest.calibration.geometry import calibrate_geometry
-from virest.capture.video import probe_movie, read_gray
+from virest.capture.video import GrayReader, probe_movie
 from virest.diagnosis.findings import Diagnosis
 from virest.diagnosis.geometric_ladder import shown
 from virest.diagnosis.ladder import diagnose_capture
 from virest.errors import VirestError
-from virest.motion.tracking import track_pairs
+from virest.motion.guide_choice import track_guided
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ def _calibrated(folder: Path, extra: tuple[str, ...]) -> list[Row]:
     try:
         plan = plan_calibration(folder, None, extra)
         movie = plan.capture.movie
-        pairs = track_pairs(read_gray(movie, probe_movie(movie), plan.frames))
+        pairs = track_guided(plan.capture, plan.profile, GrayReader(movie, probe_movie(movie)), plan.frames)
         found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
     except VirestError as error:
         log.info("%s", error)
