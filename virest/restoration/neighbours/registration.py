@@ -41,6 +41,8 @@ LEAST_COHERENCE = 0.5
 HUBER = 1.5
 """Standard deviations beyond which a tile's weight falls (95 % efficiency at normal errors is 1.345)."""
 ROBUST_STEPS = 8
+WORST_CONDITION = 1e12
+"""Of the normal equations: beyond it nothing of a turn about some axis is seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,12 +380,12 @@ def _turn(
     speed = -shift[used] * times / apart_s[:, None]  # b(x) = a(x + d): the neighbour saw x + d where x was predicted
     jacobian = turn_jacobian_px(view.frame, centres_px)
     weight = precision[used] / precision[used].max()
-    robust = np.ones_like(weight)
+    robust, squares = np.ones_like(weight), np.einsum("nki,nkj->nij", jacobian, jacobian)
+    if np.linalg.cond(np.einsum("n,nij->ij", weight, squares)) > WORST_CONDITION:
+        return None
     for _ in range(ROBUST_STEPS):
         both = weight * robust
-        normal = np.einsum("n,nki,nkj->ij", both, jacobian, jacobian)
-        if np.linalg.cond(normal) > 1e12:
-            return None
+        normal = np.einsum("n,nij->ij", both, squares)
         rate = np.linalg.solve(normal, np.einsum("n,nki,nk->i", both, jacobian, speed))
         left = speed - jacobian @ rate
         distance = np.linalg.norm(left, axis=1)
