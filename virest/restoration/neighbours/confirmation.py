@@ -69,7 +69,7 @@ def tellers(ideal: float, changed: float, left: float) -> NDArray[np.float64]:
 
 def _gain_db(part: float) -> float:
     """Gain in dB where so much of the error is taken away."""
-    return float(-10 * np.log10(max(1 - part, 1e-3)))
+    return 10 * float(np.log10(1 / max(1 - part, 1e-3)))
 
 
 def confirmed_gain(found: Sequence[tuple[float, float, float]]) -> ConfirmedGain | None:
