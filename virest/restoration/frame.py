@@ -228,7 +228,9 @@ def _deblurred(
     luma_model = luma.doubted_by(spread)
     share = 1.0 if anchor != 0.5 else trusted_share(luma_model)
     promised_db = luma_model.expected_gain_db
-    expected_db = promised_db if confirmed is None else confirmed.expected_db(promised_db)
+    expected_db = promised_db
+    if confirmed is not None:  # neighbours have told whether what lies at few places was detail
+        expected_db = confirmed.expected_db(replace(luma_model, places=None).expected_gain_db)
     why_not = too_little_to_gain(luma_model, expected_db)
     if why_not:
         return picture, {"method": "none"}, (why_not,)

@@ -16,7 +16,7 @@ from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.neighbours.refinement import RefinedMotion
-from virest.restoration.neighbours.sights import Sight
+from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 from virest.restoration.neighbours.survey import survey_gain, survey_turns
 from virest.restoration.settings import PRESETS
 from virest.restoration.trial import tried
@@ -41,7 +41,8 @@ def with_neighbours_asked(
         end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
         outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
-    missing = survey_turns(runs, sights, trajectory, lens)
+    neighbours = FrameNeighbours(trajectory, lens, None)
+    missing = survey_turns(runs, sights, neighbours)
     if missing is not None:
         said = (
             f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
@@ -57,4 +58,4 @@ def with_neighbours_asked(
     ) -> tuple[Image, Image] | None:
         return tried(luma, motion, quick, refined)
 
-    return replace(plan, confirmed=survey_gain(runs, sights, missing, trajectory, lens, quickly))
+    return replace(plan, confirmed=survey_gain(runs, sights, neighbours.knowing(missing), trajectory, lens, quickly))

@@ -133,33 +133,36 @@ def _evidence(motion: RowMotion, tiles: TilePowers) -> Array | None:
     field, seen = smooth_field(motion)(tiles.centres_px[chosen]), tiles.power[chosen]
     if field.radius_px >= SIDE // 2:
         return None
+    scaled = [field.scaled(scale) for scale in SCALES.tolist()]
+    fitting = [k for k, one in enumerate(scaled) if one.radius_px < SIDE // 2]
     found = np.zeros((len(SCALES), RINGS))
-    for row, scale in zip(found, SCALES.tolist(), strict=True):
-        scaled = field.scaled(scale)
-        if scaled.radius_px < SIDE // 2:
-            row[:] = _ring_evidence(np.stack([passed_power(kernel) for kernel in scaled.arrays()]), seen)
+    cells = [RingCells(np.stack([passed_power(kernel) for kernel in scaled[k].arrays()])) for k in fitting]
+    if cells:
+        found[fitting] = _ring_evidence(cells, seen)
     return found
 
 
-def _ring_evidence(passed: NDArray[np.float32], seen: NDArray[np.float32]) -> Array:
-    """(RINGS,) logarithm of the likelihood of |K|² S + N, with the best S and N, over that of an even N."""
-    cells = RingCells(passed)
-    count, k, g = cells.count, cells.passed, cells.means(seen)
+def _ring_evidence(cells: Sequence[RingCells], seen: NDArray[np.float32]) -> Array:
+    """(scales, RINGS) logarithm of the likelihood of |K|² S + N, with the best S and N, over that of an even N.
+
+    cells: of the |K|² of each scale.
+    """
+    count, k, g = (np.stack(parts) for parts in zip(*((c.count, c.passed, c.means(seen)) for c in cells), strict=True))
     in_ring = np.maximum(count.sum(-1), 1)
     even = np.maximum((count * g).sum(-1) / in_ring, ROUNDING_POWER)
     mean_k = (count * k).sum(-1) / in_ring
     signal, noise = 0.9 * even / np.maximum(mean_k, 0.05), 0.1 * even
     products = np.stack([np.ones_like(k), k, k * k, g, k * g], -1)
     for _ in range(_FIT_STEPS):
-        expected = np.maximum(noise[:, None] + signal[:, None] * k, ROUNDING_POWER)
-        w, wk, wkk, wg, wkg = np.moveaxis(((count / expected**2)[:, None] @ products)[:, 0], -1, 0)
+        expected = np.maximum(noise[..., None] + signal[..., None] * k, ROUNDING_POWER)
+        w, wk, wkk, wg, wkg = np.moveaxis(((count / expected**2)[..., None, :] @ products)[..., 0, :], -1, 0)
         determinant = np.maximum(w * wkk - wk * wk, _TINY)
         signal, noise = (w * wkg - wk * wg) / determinant, (wkk * wg - wk * wkg) / determinant
         signal = np.where(noise < 0, wkg / np.maximum(wkk, _TINY), signal)
         noise = np.where(signal < 0, even, np.maximum(noise, 0))
         signal = np.maximum(signal, 0)
-    expected = np.maximum(noise[:, None] + signal[:, None] * k, ROUNDING_POWER)
-    flat = even[:, None]
+    expected = np.maximum(noise[..., None] + signal[..., None] * k, ROUNDING_POWER)
+    flat = even[..., None]
     found = (count * (np.log(flat / expected) + g / flat - g / expected)).sum(-1)
     return np.asarray(np.maximum(found, 0.0))
 

@@ -23,7 +23,7 @@ def test_the_share_is_one_for_the_best_filter_and_less_for_one_that_does_too_muc
     """What the best filter leaves is unrelated to what it changed; too little noise assumed takes the share down."""
     lacked, changed = _filtered(strength)
     fall = (lacked**2).mean() - ((lacked - changed) ** 2).mean()
-    found = confirmed_gain([(fall, (changed**2).mean(), 0.01)] * 2)
+    found = confirmed_gain([(fall, (changed**2).mean(), 0.02, 0.01)] * 2)
     assert found is not None
     assert low < found.share < high
 
@@ -32,7 +32,7 @@ def test_the_part_taken_leaves_the_least_error():
     """Of a change that is too large, no other part leaves less of the error."""
     lacked, changed = _filtered(0.1)
     fall = (lacked**2).mean() - ((lacked - changed) ** 2).mean()
-    found = confirmed_gain([(fall, (changed**2).mean(), 0.01)] * 2)
+    found = confirmed_gain([(fall, (changed**2).mean(), 0.02, 0.01)] * 2)
     assert found is not None
     errors = {part: ((lacked - part * changed) ** 2).mean() for part in np.linspace(0, 1, 101)}
     assert found.taken(0.0) == pytest.approx(min(errors, key=errors.__getitem__), abs=0.011)
@@ -41,15 +41,15 @@ def test_the_part_taken_leaves_the_least_error():
 
 def test_a_change_for_the_worse_promises_nothing():
     """A share below nothing promises a loss before anything is restored."""
-    harmful = confirmed_gain([(-1.0, 2.0, 0.1), (-0.5, 1.0, 0.1)])
+    harmful = confirmed_gain([(-1.0, 2.0, 0.1, 0.2), (-0.5, 1.0, 0.1, 0.2)])
     assert harmful is not None
     assert harmful.expected_db(3.0) < 0
 
 
 def test_too_few_pairs_or_no_change_confirm_nothing():
     """One pair has no scatter; no change has no share."""
-    assert confirmed_gain([(1.0, 1.0, 0.1)]) is None
-    assert confirmed_gain([(0.0, 0.0, 0.1)] * 3) is None
+    assert confirmed_gain([(1.0, 1.0, 0.2, 0.1)]) is None
+    assert confirmed_gain([(0.0, 0.0, 0.1, 0.1)] * 3) is None
 
 
 def test_a_larger_change_promises_more_and_a_larger_rest_less():
@@ -58,3 +58,13 @@ def test_a_larger_change_promises_more_and_a_larger_rest_less():
     little, much, doubtful = (found.of_change_db(c, ideal) for c, ideal in ((5.0, 30.0), (50.0, 30.0), (50.0, 300.0)))
     assert 0 < little[0] < doubtful[0] < much[0]
     assert all(deviation > 0 for _, deviation in (little, much, doubtful))
+
+
+def test_neighbours_that_lack_something_else_confirm_nothing():
+    """A change that goes along with what is lacked, and leaves nearly all of that, is not borne out."""
+    unlike = confirmed_gain([(0.5, 0.1, 0.405, 0.4)] * 4)
+    alike = confirmed_gain([(0.5, 0.1, 0.5, 0.4)] * 4)
+    assert unlike is not None
+    assert unlike.share == 0.0
+    assert alike is not None
+    assert alike.share == pytest.approx(5.0)

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 LEAST_PAIRS = 2
 """A single one has no scatter."""
+LEAST_SEEN_DB = 0.1
+"""Neighbours must be predicted better by so much; a frame is not deblurred for less either."""
 LEFT_OVER = (3.25, 0.60, 0.12, 0.38)
 """ln of the squared error that is left in a restored picture, grey levels squared: a constant, and how much it grows
 with the logarithms of what the spectra leave, of the squared change, and of the part that neighbours see left.
@@ -69,19 +71,22 @@ def tellers(ideal: float, changed: float, left: float) -> NDArray[np.float64]:
 
 def _gain_db(part: float) -> float:
     """Gain in dB where so much of the error is taken away."""
-    return float(-10 * np.log10(max(1 - part, 1e-3)))
+    return 10 * float(np.log10(1 / max(1 - part, 1e-3)))
 
 
-def confirmed_gain(found: Sequence[tuple[float, float, float]]) -> ConfirmedGain | None:
-    """The share by pairs of (fall of the squared error, squared change, part left); None where they are too few.
+def confirmed_gain(found: Sequence[tuple[float, float, float, float]]) -> ConfirmedGain | None:
+    """The share by pairs of (fall of the squared error, squared change, part lacked, part left); None: too few.
 
-    A ratio of sums: pairs that changed little tell little.
+    A ratio of sums: pairs that changed little tell little.  Nothing is confirmed where most restored frames predict
+    their neighbours hardly better than recorded ones do: what these lack is then something else than sharpness.
     """
     if len(found) < LEAST_PAIRS:
         return None
-    gained, changed, left = np.array(found).T
+    gained, changed, lacked, left = np.array(found).T
     if changed.sum() <= 0:
         return None
     share, weight = gained.sum() / changed.sum(), changed / changed.sum()
     scatter = float(np.sqrt(weight @ (gained / changed - share) ** 2))
+    if np.median(10 * np.log10(lacked / left)) < LEAST_SEEN_DB:
+        share = min(share, 0.0)
     return ConfirmedGain(float(share), scatter, float(np.mean(left)), len(found))

@@ -41,6 +41,8 @@ LEAST_COHERENCE = 0.5
 HUBER = 1.5
 """Standard deviations beyond which a tile's weight falls (95 % efficiency at normal errors is 1.345)."""
 ROBUST_STEPS = 8
+WORST_CONDITION = 1e12
+"""Of the normal equations: beyond it nothing of a turn about some axis is seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,13 +201,13 @@ def tile_agreement(
 
 def judged_change(
     view: NeighbourView, recorded: Image, restored: Image, second: Image
-) -> tuple[float, float, float] | None:
-    """What restoring a frame gains by a neighbour's account, what it changed, and what it left.
+) -> tuple[float, float, float, float] | None:
+    """What restoring a frame gains by a neighbour's account, what it changed, and what was and is left.
 
     With D what restoring changed, M what the recorded frame lacks of the neighbour, both blurred as that one was, and G
-    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in light over its mean, and |M − D|² / |G|².  What
-    only shifts a tile is no error of the blur.  All pictures are reduced; None where a path does not fit into a tile or
-    the frames show different things.
+    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in light over its mean, and |M|² and |M − D|² over
+    |G|².  What only shifts a tile is no error of the blur: both pictures are shifted alike.  All are reduced; None
+    where a path does not fit into a tile or the frames show different things.
     """
     times = view.frame.profile.height / recorded.shape[0]
     tops_lefts = _tiles(*recorded.shape)
@@ -213,18 +215,16 @@ def judged_change(
     if kernels is None:
         return None
     there = _seen(view, second, tops_lefts, np.zeros(2), times)
-    b, onto = _spectra(there), []
-    used = np.maximum(_cut(recorded, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT
-    for picture in (recorded, restored):
-        a = _spectra(_cut(picture, tops_lefts)) * kernels
-        shift, precision = _tile_shifts(a, b, np.zeros(2))
-        used &= precision > 0
-        onto.append(_shifted(a, shift))
+    b, tiles = _spectra(there), [_cut(picture, tops_lefts) for picture in (recorded, restored)]
+    onto = [_spectra(tile) * kernels for tile in tiles]
+    shift, precision = _tile_shifts(onto[0] + onto[1], b, np.zeros(2))
+    onto = [_shifted(a, shift) for a in onto]
+    used = (precision > 0) & (np.maximum(tiles[0], there).max(axis=(1, 2)) < CLIPPED_LIGHT)
     if np.count_nonzero(used) < LEAST_TILES:
         return None
     spectra = b, b - onto[0], b - onto[1], onto[1] - onto[0]
     shown, lacked, left, changed = (float(_power(one[used]).mean()) for one in spectra)
-    return lacked - left, changed, left / shown
+    return lacked - left, changed, lacked / shown, left / shown
 
 
 def _shifted(spectra: NDArray[np.complex64], shift: Array) -> NDArray[np.complex64]:
@@ -378,12 +378,12 @@ def _turn(
     speed = -shift[used] * times / apart_s[:, None]  # b(x) = a(x + d): the neighbour saw x + d where x was predicted
     jacobian = turn_jacobian_px(view.frame, centres_px)
     weight = precision[used] / precision[used].max()
-    robust = np.ones_like(weight)
+    robust, squares = np.ones_like(weight), np.einsum("nki,nkj->nij", jacobian, jacobian)
+    if np.linalg.cond(np.einsum("n,nij->ij", weight, squares)) > WORST_CONDITION:
+        return None
     for _ in range(ROBUST_STEPS):
         both = weight * robust
-        normal = np.einsum("n,nki,nkj->ij", both, jacobian, jacobian)
-        if np.linalg.cond(normal) > 1e12:
-            return None
+        normal = np.einsum("n,nij->ij", both, squares)
         rate = np.linalg.solve(normal, np.einsum("n,nki,nk->i", both, jacobian, speed))
         left = speed - jacobian @ rate
         distance = np.linalg.norm(left, axis=1)

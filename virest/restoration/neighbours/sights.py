@@ -90,7 +90,7 @@ class FrameNeighbours:
         self._forget_before(here.frame.index - max(len(before), 1))
         if self._missing is None:
             return None
-        turns = [self._turn(before[-1], here) if before else None, self._turn(here, after[0]) if after else None]
+        turns = [self.turn(before[-1], here) if before else None, self.turn(here, after[0]) if after else None]
         return self._missing.refined(here.motion, *turns)
 
     def pictures(
@@ -108,7 +108,7 @@ class FrameNeighbours:
         """
         assert here.motion is not None
         height, curve = here.motion.profile.height, here.motion.profile.response or ResponseCurve("srgb")
-        tiles = frame_tiles(self._light_of(here), height, field, everywhere=True)
+        tiles = frame_tiles(self.light(here), height, field, everywhere=True)
         turn, found = None if refined is None else refined.turn, []
         usable = [other for other in around if other.usable and other.frame.index != here.frame.index]
         if len(usable) > most:
@@ -118,7 +118,7 @@ class FrameNeighbours:
             view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, turn=turn)
             along = view.field()
             assert tiles is not None
-            agreement = tile_agreement(view, tiles, along, self._light_of(other))
+            agreement = tile_agreement(view, tiles, along, self.light(other))
             if agreement is None:
                 continue
             level = 255 * float(curve.encode(np.array(agreement.light)))
@@ -127,17 +127,27 @@ class FrameNeighbours:
             found.append(neighbour_picture(view, along, other.frame.index, *self._full_of(other), agreement, error))
         return tuple(one for one in found if one is not None and one.weights.any())
 
-    def _turn(self, first: Sight, second: Sight) -> PairTurn | None:
+    def knowing(self, missing: MissingTurn | None) -> FrameNeighbours:
+        """The same, and what was found already, with what the capture lacks."""
+        found = FrameNeighbours(self._trajectory, self._lens, missing)
+        found._light, found._turns = self._light, self._turns
+        return found
+
+    def turn(self, first: Sight, second: Sight) -> PairTurn | None:
+        """The turn rate missing between a frame and the next; None: it is not the next, or one tells nothing."""
         number = first.frame.index
         if second.frame.index != number + 1:
             return None
+        if not first.usable or not second.usable:
+            return None
         if number not in self._turns:
             self._turns[number] = turn_between(
-                first, second, self._light_of(first), self._light_of(second), self._trajectory, self._lens
+                first, second, self.light(first), self.light(second), self._trajectory, self._lens
             )
         return self._turns[number]
 
-    def _light_of(self, sight: Sight) -> Image:
+    def light(self, sight: Sight) -> Image:
+        """A usable frame's luma in linear light, reduced."""
         if sight.frame.index not in self._light:
             self._light[sight.frame.index] = light_of(sight)
         return self._light[sight.frame.index]

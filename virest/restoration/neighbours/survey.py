@@ -15,8 +15,8 @@ from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion, missing_turn
-from virest.restoration.neighbours.registration import PairTurn, judged_change
-from virest.restoration.neighbours.sights import FrameNeighbours, Sight, light_of, turn_between
+from virest.restoration.neighbours.registration import judged_change
+from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 
 RUN_FRAMES = 4
 """Three pairs: what linear interpolation leaves of the middle one shows."""
@@ -56,25 +56,21 @@ def kept_lumas(
 
 
 def survey_turns(
-    runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], trajectory: Trajectory, lens: MovingLens
+    runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours
 ) -> MissingTurn | None:
     """What the predicted turns lack by these runs of frames; None: nothing of significance, or it cannot be told."""
-    light = {number: light_of(sight) for number, sight in sights.items() if sight.usable}
     motions: list[RowMotion] = [s.motion for s in sights.values() if s.usable and s.motion is not None]
-
-    def between(first: int, second: int) -> PairTurn | None:
-        if first not in light or second not in light:
-            return None
-        return turn_between(sights[first], sights[second], light[first], light[second], trajectory, lens)
-
-    turns = [[between(a, b) for a, b in pairwise(run)] for run in runs]
+    turns = [
+        [neighbours.turn(sights[a], sights[b]) if a in sights and b in sights else None for a, b in pairwise(run)]
+        for run in runs
+    ]
     return missing_turn(turns, motions)
 
 
 def survey_gain(
     runs: Sequence[Sequence[int]],
     sights: Mapping[int, Sight],
-    missing: MissingTurn | None,
+    neighbours: FrameNeighbours,
     trajectory: Trajectory,
     lens: MovingLens,
     tried: Callable[[Picture, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
@@ -85,12 +81,11 @@ def survey_gain(
     left alone.  The first inner frame of each run is restored and held against both its neighbours.
     """
     found = []
-    turns = FrameNeighbours(trajectory, lens, missing) if missing is not None else None
     for run in runs:
         around = [sights[n] for n in run if n in sights and sights[n].usable]
         for before, here, after in zip(around, around[1:], around[2:], strict=False):
             assert here.motion is not None
-            refined = turns.refined((before,), here, (after,)) if turns is not None else None
+            refined = neighbours.refined((before,), here, (after,))
             motion = here.motion if refined is None else refined.motion
             pictures = tried(here.picture, motion, refined)
             if pictures is None:
@@ -98,7 +93,7 @@ def survey_gain(
             for other in (before, after):
                 assert other.motion is not None
                 view = neighbour_view(motion, other.motion, trajectory, lens)
-                judged = judged_change(view, *pictures, light_of(other))
+                judged = judged_change(view, *pictures, neighbours.light(other))
                 if judged is not None:
                     found.append(judged)
             break

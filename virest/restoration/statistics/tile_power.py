@@ -72,12 +72,15 @@ def passed_power(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     """|K|² as seen through the tile's window."""
     padded = np.zeros((SIDE, SIDE), np.float32)
     padded[: kernel.shape[0], : kernel.shape[1]] = kernel
-    return cv2.blur(_power(padded), (3, 3), borderType=cv2.BORDER_REPLICATE)
+    return cv2.blur(_power(padded, kernel.shape[0]), (3, 3), borderType=cv2.BORDER_REPLICATE)
 
 
-def _power(tile: NDArray[np.float32]) -> NDArray[np.float32]:
-    """|F|² at the horizontal frequencies 1 ... side / 2 − 1 of the transform, (side, side / 2 − 1)."""
-    packed = cv2.dft(tile)[:, 1:-1]
+def _power(tile: NDArray[np.float32], rows: int = 0) -> NDArray[np.float32]:
+    """|F|² at the horizontal frequencies 1 ... side / 2 − 1 of the transform, (side, side / 2 − 1).
+
+    rows: from there on all is 0; 0: nowhere.
+    """
+    packed = cv2.dft(tile, nonzeroRows=rows)[:, 1:-1]
     squares = packed * packed
     return squares[:, ::2] + squares[:, 1::2]
 
