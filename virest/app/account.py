@@ -11,7 +11,7 @@ from typing import Any
 
 from virest import __version__
 from virest.app import console
-from virest.app.finish import Finished
+from virest.app.finish import Finished, pictures_profile
 from virest.app.outputs import file_facts, parse_lines, resolved
 from virest.app.planning import Job, ProcessOptions
 from virest.camera.profile import profile_mapping
@@ -21,8 +21,8 @@ from virest.restoration.capture import RestorationPlan
 
 PARTLY_FAILED = 9
 STATUSES = ("restored", "copied", "skipped", "failed")
-STEPS = ("deblurred", "straightened")
-"""What is counted beside the four statuses, of restored frames."""
+STEPS = ("deblurred", "straightened", "undistorted")
+"""What is counted beside the four statuses; a copied frame may be undistorted."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 MOST_FILES, MOST_BYTES = 32, 1 << 30
 """Of a capture that cannot be read: what is looked at for run.json."""
@@ -61,7 +61,8 @@ def run_account(
         "folder": str(job.capture.folder.absolute()),
         "movie": str(job.capture.movie.absolute()),
         "command": job.request["command"],
-        "profile": profile_mapping(finished.profile(plan.profile)),
+        "profile": profile_mapping(finished.profile(pictures_profile(plan))),
+        "recorded_intrinsics": profile_mapping(plan.profile)["intrinsics"] if plan.settings.undistort else None,
         "crop_px": None if finished.crop_px is None else list(finished.crop_px),
         "film": None if finished.film is None else str(finished.film),
         "profile_source": job.profile_source,

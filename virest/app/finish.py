@@ -14,16 +14,22 @@ from numpy.typing import NDArray
 
 from virest.app.film import display_turn, side_by_side, write_film
 from virest.app.outputs import RunFolder, parse_lines, write_picture
+from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.location import is_remote, read_each
 from virest.capture.video import MovieIndex, read_frames
 from virest.errors import OutputError
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.shutter import warp
+from virest.restoration.undistortion import undistortion_map
 
 Json = dict[str, Any]
 Picture = NDArray[np.uint8]
 Crop = tuple[int, int, int, int]
 LEAST_CROP_PX = 16
 NAME_FIELD = "{capture}"
+LENS_ESTIMATES = ("k1", "k2", "p1", "p2", "k3", "k4")
+"""Of a profile: they say nothing of a picture without distortion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,15 @@ class Finished:
         return profile if self.crop_px is None else cropped_profile(profile, self.crop_px)
 
 
+def pictures_profile(plan: RestorationPlan) -> CameraProfile:
+    """The camera of a run's pictures before any crop: a pinhole where the lens's distortion is undone."""
+    profile = plan.profile
+    if profile.intrinsics is None or not plan.settings.undistort:
+        return profile
+    estimates = {name: value for name, value in profile.estimates.items() if name not in LENS_ESTIMATES}
+    return dataclasses.replace(profile, intrinsics=profile.intrinsics.pinhole, estimates=estimates)
+
+
 def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
     """The camera whose pictures are the rectangle (x0, y0, x1, y1) of this one's; row times stay with ``crop_px``."""
     x0, y0, x1, y1 = crop_px
@@ -93,9 +108,18 @@ def require_finishable(wishes: FinishWishes, name: str, run: Path, *, overwrite:
 
 
 def finish_pictures(
-    run: RunFolder, logs: Iterable[Path], movie: Path, index: MovieIndex, wishes: FinishWishes, name: str
+    run: RunFolder,
+    logs: Iterable[Path],
+    movie: Path,
+    index: MovieIndex,
+    wishes: FinishWishes,
+    name: str,
+    lens: Intrinsics | None = None,
 ) -> Finished:
-    """Crop the frames, write the film, and take the frames away, as wished.  Doing it again does no harm."""
+    """Crop the frames, write the film, and take the frames away, as wished.  Doing it again does no harm.
+
+    lens: whose distortion the run's pictures are without; recorded ones that stand in for them lose it too.
+    """
     lines = [line for log in read_each(logs) for line in parse_lines(log)]
     crop_px = common_rectangle(lines) if wishes.crop else None
     if crop_px is not None:
@@ -107,7 +131,7 @@ def finish_pictures(
     if film is not None and lines:
         turn = display_turn(movie)
         first_ns = lines[0]["timestamp_ns"]
-        frames = _film_frames(run, lines, movie, index, crop_px, turn if wishes.side_by_side else None)
+        frames = _film_frames(run, lines, movie, index, crop_px, turn if wishes.side_by_side else None, lens)
         write_film(film, ((ns - first_ns, picture) for ns, picture in frames), _rate(lines), turn)
     if not wishes.keep_frames:
         for line in lines:
@@ -143,9 +167,15 @@ def _read_png(path: Path) -> Picture | None:
 
 
 def _film_frames(
-    run: RunFolder, lines: list[Json], movie: Path, index: MovieIndex, crop_px: Crop | None, beside: Any
+    run: RunFolder,
+    lines: list[Json],
+    movie: Path,
+    index: MovieIndex,
+    crop_px: Crop | None,
+    beside: Any,
+    lens: Intrinsics | None,
 ) -> Iterator[tuple[int, Picture]]:
-    """Stamp and picture of each frame; one without a restored picture is shown as recorded."""
+    """Stamp and picture of each frame; one without a restored picture is shown as recorded, but for the distortion."""
     wanted = {line["frame"]: line for line in lines}
     numbers = sorted(wanted)
     stored = all(run.picture(number).is_file() for number in numbers)
@@ -160,8 +190,10 @@ def _film_frames(
         if number not in wanted or decoded is None:
             continue
         recorded = decoded[y0:y1, x0:x1]
-        restored = _read_png(run.picture(number))
-        shown = recorded if restored is None else restored
+        shown = _read_png(run.picture(number))
+        if shown is None:
+            source = None if lens is None else undistortion_map(lens)
+            shown = recorded if source is None else warp(decoded, source)[y0:y1, x0:x1]
         yield wanted[number]["timestamp_ns"], shown if beside is None else side_by_side(recorded, shown, beside)
 
 

@@ -317,7 +317,7 @@ def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, flo
         "deblur": {"method": "none"},
     }
     line |= restored.parameters
-    line["done"] = steps_done(line)
+    line["done"] = [*steps_done(line), *(["undistorted"] if restored.undistorted and line["output"] else [])]
     return {**line, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
 
 

@@ -20,6 +20,7 @@ from virest import __version__
 from virest.app.finish import FinishWishes
 from virest.app.jobs import PictureWishes, prepare_worker
 from virest.app.outputs import Mode, RunFolder, check_run, file_facts, plain
+from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile, profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile, unpack_hint
 from virest.capture.location import locate
@@ -31,6 +32,7 @@ from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import RestorationSettings
+from virest.restoration.undistortion import require_undistortable
 
 log = logging.getLogger(__name__)
 
@@ -274,6 +276,8 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
         log.info("%s: %s", job.name, note)
     for warning in plan.warnings:
         log.warning("%s: %s", job.name, warning)
+    if settings.undistort:
+        _check_lens(job.name, plan.profile.intrinsics)
     if plan.copy_reason:
         log.warning("%s: all frames are copied: %s", job.name, plan.copy_reason)
     return plan
@@ -309,3 +313,12 @@ def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) ->
         kept = {number: motion for number, motion in plan.translations.items() if number not in moved}
         plan = dataclasses.replace(plan, translations=kept)
     return dataclasses.replace(job, capture=at_shown_times(capture, found)), plan
+
+
+def _check_lens(name: str, lens: Intrinsics | None) -> None:
+    """Say where there is no distortion to be undone.  Raises SettingsError where it cannot be."""
+    if lens is not None and lens.is_distorted:
+        require_undistortable(lens)
+        return
+    why = "the focal length is unknown" if lens is None else "the profile's lens has no distortion"
+    log.warning("%s: --undistort changes nothing: %s; virest calibrate --with distortion may find it", name, why)

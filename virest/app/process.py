@@ -224,7 +224,8 @@ def _run(
     wall_s, restoring_s = time.perf_counter() - began, time.perf_counter() - restoring
     finished = Finished()
     if options.finish.any:
-        finished = finish_pictures(job.run, logs, job.capture.movie, index, options.finish, job.name)
+        lens = plan.profile.intrinsics if plan.settings.undistort else None
+        finished = finish_pictures(job.run, logs, job.capture.movie, index, options.finish, job.name, lens)
     account = run_account(job, plan, totals, wall_s, finished)
     finish_run(job.run, logs, account, finished.changed if options.finish.any else None)
     if options.json_lines and not at_once:

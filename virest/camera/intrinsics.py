@@ -65,6 +65,11 @@ class Intrinsics:
         """Whether distortion changes any pixel: the equidistant fisheye does even with zero coefficients."""
         return self.model == "fisheye" or any(self.coefficients) or self.displaced is not None
 
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The camera of the same focal lengths and principal point without distortion."""
+        return replace(self, model="none", coefficients=(), displaced=None)
+
     def scaled_focal(self, scale: float) -> Intrinsics:
         """The same lens with both focal lengths multiplied by ``scale``."""
         return replace(self, fx_px=self.fx_px * scale, fy_px=self.fy_px * scale)

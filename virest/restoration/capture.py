@@ -97,7 +97,7 @@ def restore_frames(
     profile = plan.profile
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
     lens = moving_lens(trajectory, profile) if trajectory is not None else None
-    translations, neighbours = plan.translations or {}, None
+    translations, neighbours, undistort = plan.translations or {}, None, plan.settings.undistort
     if trajectory is not None and lens is not None and plan.reach:
         neighbours = FrameNeighbours(trajectory, lens, plan.missing_turn)
 
@@ -117,7 +117,7 @@ def restore_frames(
         if only is not None and frame.index not in only:
             continue
         if motion is None or trajectory is None:
-            yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN)
+            yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN, undistort=undistort)
             continue
         if here.outside:
             yield RestoredFrame(frame, "skipped", None, (here.outside,), parameters=unknown_parameters(profile))
@@ -125,7 +125,7 @@ def restore_frames(
         reason = plan.copy_reason or untrusted_reason(motion)
         if reason:
             said = degradation_parameters(motion, trajectory, plan.settings)
-            yield copied_frame(frame, picture, profile, reason, said)
+            yield copied_frame(frame, picture, profile, reason, said, undistort=undistort)
             continue
         seen = None
         if plan.contradicted is not None:

@@ -36,6 +36,7 @@ from virest.restoration.shutter import perspective_map, rounded, rowwise_map, va
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
+from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
 """Straightening that moves no point further than this is left out: so much a gyroscope at rest seems to turn, too."""
@@ -79,6 +80,8 @@ class RestoredFrame:
     """Time spent: estimate, deblur, shutter."""
     source_px: NDArray[np.float32] | None = None
     """(height, width, 2) where in the recorded picture each pixel came from; None: from its own place."""
+    undistorted: bool = False
+    """Whether the picture is a pinhole's: the lens's distortion was undone."""
 
 
 def restore_frame(
@@ -129,21 +132,27 @@ def restore_frame(
     source = _source_map(motion, settings, anchor, parameters["deblur"]["method"]) if straighten else None
     if seen is not None and source is not None and straightening_loses(motion, seen, anchor):
         source, why_not = None, (*why_not, OTHER_ROWS)
+    parameters["shutter"]["method"] = settings.shutter if source is not None else "none"
+    status = "copied" if restored is picture and source is None else "restored"
+    if source is None:
+        source = _lens_map(motion.profile, settings.undistort)
     valid_px = (0, 0, width, height)
     if source is not None:
         valid_px = valid_rectangle(source)
         if not any(valid_px):
-            return copied_frame(frame, picture, motion.profile, NOTHING_LEFT, parameters)
+            return copied_frame(
+                frame, picture, motion.profile, NOTHING_LEFT, parameters, undistort=settings.undistort
+            )  # fmt: skip
         restored = warp(restored, source)
     elif restored.dtype != np.uint8:
         restored = rounded(restored)
     clock.lap("shutter")
-    parameters["shutter"]["method"] = settings.shutter if source is not None else "none"
-    status = "copied" if restored is picture else "restored"
     warnings = (*_limits(motion), *why_not)
+    undistorted = settings.undistort and motion.optics.lens.is_distorted
     return RestoredFrame(
-        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source
-    )
+        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source,
+        undistorted,
+    )  # fmt: skip
 
 
 def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
@@ -175,13 +184,28 @@ def copied_frame(
     profile: CameraProfile,
     reason: str,
     parameters: dict[str, Any] | None = None,
+    *,
+    undistort: bool = False,
 ) -> RestoredFrame:
-    """The decoded pixels unchanged, and why."""
+    """The decoded pixels unchanged, and why.  undistort: but for the lens's distortion, as in a run's other pictures.
+
+    The lens is then the profile's, at stamp_0.
+    """
     height, width = picture.shape[:2]
+    valid_px, source = (0, 0, width, height), _lens_map(profile, undistort)
+    if source is not None:
+        picture, valid_px = warp(picture, source), valid_rectangle(source)
     exposure_s = profile.shutter.true_exposure_s(frame.exposure_s) if frame.exposure_s else None
     details = {**unknown_parameters(profile), **(parameters or {}), "deblur": {"method": "none"}}
     details["shutter"] = {**details["shutter"], "method": "none"}
-    return RestoredFrame(frame, "copied", picture, (reason,), (0, 0, width, height), exposure_s, details)
+    return RestoredFrame(
+        frame, "copied", picture, (reason,), valid_px, exposure_s, details, {}, source, source is not None
+    )
+
+
+def _lens_map(profile: CameraProfile, undistort: bool) -> NDArray[np.float32] | None:
+    """Where the lens shows what its pinhole shows, for pictures that nothing else moves; None: nothing is asked for."""
+    return undistortion_map(profile.intrinsics) if undistort and profile.intrinsics is not None else None
 
 
 def _source_map(
@@ -192,7 +216,8 @@ def _source_map(
     moved_px = np.abs(straightened_points(motion, corners, anchor) - corners).max()
     if deblurred == "none" and (moved_px < MIN_WARP_PX or not motion.profile.readout_known):
         return None
-    return perspective_map(motion, anchor) if settings.shutter == "perspective" else rowwise_map(motion, anchor)
+    mapped = perspective_map if settings.shutter == "perspective" else rowwise_map
+    return mapped(motion, anchor, undistort=settings.undistort and motion.optics.lens.is_distorted)
 
 
 def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: float) -> tuple[str, tuple[str, ...]]:

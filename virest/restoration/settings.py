@@ -46,6 +46,8 @@ class RestorationSettings:
     """A frame may be restored together with any of this many frames on each side."""
     most_joined: int = 6
     """It is restored with at most this many of them, those that make up for what its own path cancels."""
+    undistort: bool = False
+    """Pictures of a pinhole with the profile's focal lengths and principal point: the lens's distortion is undone."""
     keep_start_up: bool = False
     """Process the frames of the recorder's start-up too, although their content is later than their stamps."""
 

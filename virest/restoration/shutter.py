@@ -7,22 +7,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.degradation.row_motion import RowMotion
-from virest.degradation.warp import corner_points, dense_map, straightened_points
+from virest.degradation.warp import (
+    PIXELS_WITHIN_PX,
+    corner_points,
+    dense_map,
+    grid_filled,
+    seen_by_rows,
+    straightened_points,
+)
 from virest.restoration.bands import bands
+from virest.restoration.undistortion import distorted_points
+
+USUAL_SPACING_PX, LEAST_SPACING_PX = 16, 4
+"""Grid of a map; where it holds a lens's distortion, finer for wide lenses."""
+LINES_OFF_PX = 0.01
+"""Straight lines over a grid's cells may leave the map by so much."""
 
 
-def rowwise_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
-    """Where each pixel of the straightened picture was recorded, (height, width, 2): every row at its own time."""
-    return dense_map(motion, anchor)
+def rowwise_map(motion: RowMotion, anchor: float, *, undistort: bool = False) -> NDArray[np.float32]:
+    """Where each pixel of the straightened picture was recorded, (height, width, 2): every row at its own time.
+
+    undistort: of the straightened picture of a pinhole, so that one warp reads what both steps move.
+    """
+    if not undistort:
+        return dense_map(motion, anchor)
+
+    def recorded(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        shown = distorted_points(motion.optics, points, motion.reference_s)
+        return seen_by_rows(motion, shown, motion.reference_s, anchor, None, PIXELS_WITHIN_PX)
+
+    return grid_filled(motion, recorded, _lens_spacing_px(motion))
 
 
-def perspective_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
+def _lens_spacing_px(motion: RowMotion) -> int:
+    """Grid over which a distortion bends by :data:`LINES_OFF_PX`: its slope changes by up to about 1 over f pixels."""
+    focal_px = min(motion.optics.lens.fx_px, motion.optics.lens.fy_px)
+    return int(np.clip(np.sqrt(8 * LINES_OFF_PX * focal_px), LEAST_SPACING_PX, USUAL_SPACING_PX))
+
+
+def perspective_map(motion: RowMotion, anchor: float, *, undistort: bool = False) -> NDArray[np.float32]:
     """The same by the paper's four corners (eqs 23-28): one homography between recorded and straightened corners."""
     width, height = motion.profile.width, motion.profile.height
     recorded = corner_points(width, height)
     straightened = straightened_points(motion, recorded, anchor)
     homography = cv2.getPerspectiveTransform(straightened.astype(np.float32), recorded.astype(np.float32))
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    if undistort:
+        spacing_px = _lens_spacing_px(motion)
+        shown = grid_filled(motion, lambda p: distorted_points(motion.optics, p, motion.reference_s), spacing_px)
+        x, y = np.moveaxis(shown.astype(np.float64), -1, 0)
     denominator = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
     source_x = (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]) / denominator
     source_y = (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]) / denominator

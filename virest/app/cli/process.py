@@ -78,6 +78,9 @@ def process(
     crop: Annotated[
         bool, typer.Option("--crop", help="Cut all frames to the area that holds recorded data in each of them.")
     ] = False,
+    undistort: Annotated[
+        bool, typer.Option("--undistort", help="Undo the lens's distortion too: pictures of a pinhole camera.")
+    ] = False,
     skip_copied: Annotated[
         bool, typer.Option("--skip-copied", help="Write no PNG for frames that are only copied.")
     ] = False,
@@ -134,6 +137,7 @@ def process(
         shutter=shutter,
         reference=reference,
         keep_start_up=keep_start_up or None,
+        undistort=undistort or None,
         neighbours=parse_neighbours(neighbours),
     )
     options = ProcessOptions(
