@@ -6,7 +6,7 @@ import errno
 import signal
 import sys
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -54,8 +54,22 @@ class _Terminated(KeyboardInterrupt):
     """The process was asked to end (SIGTERM, SIGHUP): leave as tidily as after Ctrl-C."""
 
 
+def _show_manual(wanted: bool) -> None:
+    """Print the manual page and leave: `--man`."""
+    if wanted:
+        from virest.app.man import man_page
+
+        console.emit(man_page(program()).rstrip("\n"))
+        raise typer.Exit
+
+
+Manual = Annotated[
+    bool, typer.Option("--man", help="Print the manual page, virest.1.", is_eager=True, callback=_show_manual)
+]
+
+
 @app.callback()
-def _virest(version: Version = False) -> None:
+def _virest(version: Version = False, manual: Manual = False) -> None:
     pass
 
 
