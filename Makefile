@@ -3,7 +3,7 @@
 #   make test     all tests: the fast ones first, then the scenarios
 #   make bench    quality and speed tables; ARGS="--only speed --quick" for a part of them
 #   make lint     ruff and mypy
-#   make docs     the documentation as a site in site/; make figures draws its pictures anew
+#   make docs     the documentation as a site in site/, with the manual page virest.1; make figures draws its pictures anew
 #   make sample   write sample_data/ anew
 
 SHELL := /bin/bash
@@ -40,6 +40,7 @@ lint: $(READY)
 docs: $(READY)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	$(BIN)/virest --man > site/virest.1
 
 figures: $(READY)
 	$(BIN)/python -m virest.app.pictures docs/images
