@@ -10,9 +10,12 @@ import av
 import cv2
 import numpy as np
 import pytest
+from laws import RADTAN, phone
 
 from virest.app.film import UPRIGHT, display_turn, side_by_side, write_film
+from virest.app.finish import cropped_profile
 from virest.app.names import batch_names, shard_of
+from virest.camera.field import Field
 from virest.errors import OutputError
 
 FAST = ("--preset", "fast", "--jobs", "1")
@@ -121,6 +124,18 @@ def test_masks_and_crop_tell_recorded_from_repeated(swing: Path, virest_here, tm
     assert exported.returncode == 0, exported.stderr
     report = virest_here("report", cropped)
     assert report.returncode == 0, report.stderr
+
+
+def test_a_crop_takes_the_lens_along() -> None:
+    """A ray is seen at the same place of the picture's part, distortion and displacement included."""
+    bent = Field("displacement", ("x", "y"), ((0.0, 70.0, 199.0), (0.0, 135.0)), ((1.0, 2.0), (0.5, -1.0)) * 3)
+    profile = phone(lens=RADTAN).with_fields([bent])
+    part = cropped_profile(profile, (12, 8, 180, 130))
+    rays = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.0]])
+    assert profile.intrinsics is not None
+    assert part.intrinsics is not None
+    np.testing.assert_allclose(part.intrinsics.project(rays), profile.intrinsics.project(rays) - (12, 8), atol=1e-9)
+    assert (part.width, part.height) == (168, 122)
 
 
 def test_copied_frames_need_no_picture(tiny: Path, virest_here, tmp_path: Path) -> None:

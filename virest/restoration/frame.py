@@ -192,14 +192,15 @@ def copied_frame(
     The lens is then the profile's, at stamp_0.
     """
     height, width = picture.shape[:2]
-    valid_px, source = (0, 0, width, height), _lens_map(profile, undistort)
+    clock, valid_px, source = _Clock(), (0, 0, width, height), _lens_map(profile, undistort)
     if source is not None:
         picture, valid_px = warp(picture, source), valid_rectangle(source)
+        clock.lap("shutter")
     exposure_s = profile.shutter.true_exposure_s(frame.exposure_s) if frame.exposure_s else None
     details = {**unknown_parameters(profile), **(parameters or {}), "deblur": {"method": "none"}}
     details["shutter"] = {**details["shutter"], "method": "none"}
     return RestoredFrame(
-        frame, "copied", picture, (reason,), valid_px, exposure_s, details, {}, source, source is not None
+        frame, "copied", picture, (reason,), valid_px, exposure_s, details, clock.seconds, source, source is not None
     )
 
 
