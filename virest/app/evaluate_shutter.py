@@ -22,6 +22,7 @@ from virest.evaluation.board_scenes import BoardSetting, board_session
 from virest.evaluation.boards import Board, find_board, matched, plane_lattice
 from virest.evaluation.fidelity import difference_map, fidelity, psnr_of
 from virest.evaluation.schubert2018 import fit_velocity, velocity_map
+from virest.motion.row_clock import ROW_MIDDLE, RowClock
 from virest.motion.tracking import track_pairs
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import warp
@@ -181,7 +182,11 @@ def _by_constant_velocity(capture: TrueCapture) -> Callable[[int, Picture], Pict
     profile, shutter_ = capture.profile, capture.profile.shutter
     width, height = profile.width, profile.height
     exposure_s = {f.index: shutter_.true_exposure_s(f.exposure_s or 0.0) for f in capture.capture.frames}
-    middle_s = {f.index: f.time_s + 0.5 * exposure_s[f.index] for f in capture.capture.frames}
+    clock = RowClock(profile)
+    middle_s = {
+        f.index: float(clock.time_s(f.time_s, f.exposure_s or 0.0, exposure_share=ROW_MIDDLE))
+        for f in capture.capture.frames
+    }
     near = {f.index + step for f in capture.frames for step in (-1, 0, 1)} & set(middle_s)
     pairs = track_pairs(capture.luma(sorted(near)))
 

@@ -20,6 +20,7 @@ from virest.capture.files import label, scan_text
 from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile
 from virest.capture.records import STALL
 from virest.errors import CaptureError, OutputError
+from virest.motion.row_clock import RowClock
 from virest.restoration.capture import at_true_times
 
 if TYPE_CHECKING:
@@ -237,11 +238,9 @@ def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> 
     exposures_s = np.array([np.nan if frame.exposure_s is None else frame.exposure_s for frame in frames])
     usual_s = float(np.nanmedian(exposures_s)) if np.isfinite(exposures_s).any() else 0.0
     exposures_s = np.where(np.isfinite(exposures_s), exposures_s, usual_s)
-    start_s = profile.shutter.first_row_start_s(np.zeros(len(frames)), exposures_s)
-    if reference == "exposure-start":
-        return np.asarray(start_s, np.float64)
-    half_s = 0.5 * (profile.shutter.readout_time_s + profile.shutter.true_exposure_s(exposures_s))
-    return np.asarray(start_s + half_s, np.float64)
+    clock, stamps_s = RowClock(profile), np.zeros(len(frames))
+    instant = clock.time_s if reference == "exposure-start" else clock.middle_s
+    return np.asarray(clock.camera_time_s(instant(stamps_s, exposures_s)), np.float64)
 
 
 def _stamped(

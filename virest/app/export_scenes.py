@@ -117,8 +117,8 @@ def _pose(
 ) -> FramePose:
     camera = plan.camera
     rate = 1.0 + camera.clock_skew
-    first_s, last_s = motion.start_s, motion.start_s + motion.readout_time_s + motion.exposure_s
-    instant_s = motion.start_s if plan.restored_start else 0.5 * (first_s + last_s)
+    first_s, last_s = motion.start_s, motion.end_s
+    instant_s = motion.start_s if plan.restored_start else motion.middle_s
     zero_s = source.time_s * rate + (camera.time_offset_s or 0.0)
 
     def at(time_s: float) -> tuple[Array, Array | None]:

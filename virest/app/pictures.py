@@ -9,7 +9,7 @@ import argparse
 import io
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -26,6 +26,7 @@ from virest.degradation.blur import tile_grid
 from virest.degradation.kernels import blur_chords, kernel_field
 from virest.degradation.row_motion import row_motion
 from virest.motion.integration import integrate_gyro
+from virest.motion.row_clock import ROW_MIDDLE, row_time_s
 from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_figure
 
 Picture = NDArray[np.uint8]
@@ -150,9 +151,9 @@ def _blur_paths(shot: _Shot) -> bytes:
 def _rows(shot: _Shot) -> bytes:
     shutter, height = shot.profile.shutter, shot.profile.height
     exposure_s = shot.capture.frames[shot.frame].exposure_s or 0.0
-    plain = replace(shutter, readout_direction="top_to_bottom")
-    row_start_s = plain.readout_time_s * np.arange(height) / height
-    return rows_figure(row_start_s, exposure_s, plain.readout_time_s / 2 + exposure_s / 2)
+    row_start_s = row_time_s(0.0, shutter.readout_time_s, np.arange(height) / height)
+    middle_s = row_time_s(0.0, shutter.readout_time_s, 0.5, exposure_s, ROW_MIDDLE)
+    return rows_figure(row_start_s, exposure_s, middle_s)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -14,6 +14,7 @@ from virest.app import api
 from virest.app.outputs import write_whole
 from virest.capture.folder import Frame
 from virest.errors import CaptureError, OutputError
+from virest.motion.row_clock import RowClock
 from virest.report.concepts import preview_figure
 from virest.restoration.frame import RestoredFrame
 
@@ -67,7 +68,7 @@ def _turned_rad(capture: api.Capture, frame: Frame) -> float:
     profile = capture.profile
     readout_s = profile.shutter.readout_time_s if profile.readout_known else 0.0
     exposure_s = (frame.exposure_s or 0.0) * profile.shutter.exposure_scale
-    middle_s = frame.time_s + (profile.time_offset_s or 0.0) + readout_s / 2 + exposure_s / 2
+    middle_s = RowClock(profile).middle_s(frame.time_s, frame.exposure_s or 0.0)
     imu = capture.imu
     rate = np.array([np.interp(middle_s, imu.time_s, imu.gyro_rad_s[:, axis]) for axis in range(3)])
     turning: NDArray[np.float64] = profile.rotation_cam_imu @ (rate - np.array(profile.gyro_bias_rad_s))

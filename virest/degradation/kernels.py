@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from virest.degradation.light import flicker
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
+from virest.motion.row_clock import ROW_END, ROW_START
 
 Array = NDArray[np.float64]
 SAMPLES_PER_PX = 2.0
@@ -119,7 +120,7 @@ def splined_nodes(motion: RowMotion, nodes: Callable[[Array], Array]) -> Callabl
 def instants(motion: RowMotion, points_px: Array) -> Array:
     """(n, k) evenly spaced instants, ends included, of the exposures of the rows through pixels (n, 2)."""
     count = max(MIN_NODES, int(np.ceil(motion.exposure_s / NODE_STEP_S)) + 1)
-    return np.asarray(motion.row_start_s(points_px)[:, None] + np.linspace(0.0, 1.0, count) * motion.exposure_s)
+    return motion.row_time_s(points_px[:, None], np.linspace(0.0, 1.0, count))
 
 
 def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float, inverse_depth: Any = None) -> Array:
@@ -151,9 +152,8 @@ def _light(motion: RowMotion, centres_px: Array, samples: int) -> Array | None:
     """Flicker (n, samples) over equal pieces of the exposure of the rows through pixels (n, 2); None without."""
     if not motion.profile.extensions.flicker_amplitude:
         return None
-    piece_s = motion.exposure_s / samples
-    middles_s = motion.row_start_s(centres_px)[:, None] + (np.arange(samples) + 0.5) * piece_s
-    return flicker(motion.profile, middles_s, piece_s)
+    middles_s = motion.row_time_s(centres_px[:, None], (np.arange(samples) + 0.5) / samples)
+    return flicker(motion.profile, middles_s, motion.exposure_s / samples)
 
 
 @lru_cache(maxsize=64)
@@ -168,8 +168,8 @@ def blur_chords(motion: RowMotion, points_px: Array, inverse_depth: Any = None) 
 
     Its angle and length are the paper's degradation parameters (eqs 15, 16); see :func:`angle_and_length`.
     """
-    start_s = motion.row_start_s(points_px)
-    return moved_between(motion, points_px, start_s, start_s + motion.exposure_s, inverse_depth) - points_px
+    start_s, end_s = (motion.row_time_s(points_px, share) for share in (ROW_START, ROW_END))
+    return moved_between(motion, points_px, start_s, end_s, inverse_depth) - points_px
 
 
 def angle_and_length(chords_px: Array) -> tuple[Array, Array]:

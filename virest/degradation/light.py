@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import grid_filled, straightened_points
+from virest.motion.row_clock import ROW_MIDDLE
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -82,7 +83,7 @@ def flicker(profile: CameraProfile, middle_s: Any, lasting_s: float = 0.0) -> Ar
 
 def row_light(motion: RowMotion, points_px: Array) -> Array:
     """Mean flicker over the exposure of the rows through pixels (..., 2)."""
-    return flicker(motion.profile, motion.row_start_s(points_px) + 0.5 * motion.exposure_s, motion.exposure_s)
+    return flicker(motion.profile, motion.row_time_s(points_px, ROW_MIDDLE), motion.exposure_s)
 
 
 def vignetting(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:

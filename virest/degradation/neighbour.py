@@ -39,19 +39,17 @@ class NeighbourView:
 
     def places_px(self, points_px: Array) -> Array:
         """Where the neighbour recorded what the frame's anchored picture shows at pixels (..., 2)."""
-        seen_s = self.frame.row_start_s(points_px) + self.anchor * self.frame.exposure_s
+        seen_s = self.frame.row_time_s(points_px, self.anchor)
         return seen_by_rows(self.neighbour, points_px, seen_s, self.anchor, None, PIXELS_WITHIN_PX)
 
     def apart_s(self, points_px: Array) -> Array:
         """(n,) time from the frame's to the neighbour's view of what the frame shows at pixels (n, 2)."""
-        seen_s, places = self.frame.row_start_s(points_px), self.places_px(points_px)
-        later = self.anchor * (self.neighbour.exposure_s - self.frame.exposure_s)
-        return np.asarray(self.neighbour.row_start_s(places) - seen_s + later)
+        seen_s = self.frame.row_time_s(points_px, self.anchor)
+        return self.neighbour.row_time_s(self.places_px(points_px), self.anchor) - seen_s
 
     def middles_s(self) -> tuple[float, float]:
         """Middles of both frames' exposures, IMU clock."""
-        first, second = (m.start_s + 0.5 * (m.readout_time_s + m.exposure_s) for m in (self.frame, self.neighbour))
-        return first, second
+        return self.frame.middle_s, self.neighbour.middle_s
 
     def map_px(self, moved: Callable[[Array], Array] = lambda points_px: points_px) -> NDArray[np.float32]:
         """:meth:`places_px` of every pixel, (height, width, 2), as cv2.remap takes it.

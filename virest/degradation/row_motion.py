@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.relief_surface import Relief
+from virest.motion.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock, row_time_s
 from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
 
 Array = NDArray[np.float64]
@@ -96,10 +97,24 @@ class RowMotion:
             raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
         return self.lens
 
+    @property
+    def middle_s(self) -> float:
+        """Middle of the frame: of the exposure of the row halfway through the readout."""
+        return float(row_time_s(self.start_s, self.readout_time_s, 0.5, self.exposure_s, ROW_MIDDLE))
+
+    @property
+    def end_s(self) -> float:
+        """End of the exposure of the row after the last one."""
+        return float(row_time_s(self.start_s, self.readout_time_s, 1.0, self.exposure_s, ROW_END))
+
+    def row_time_s(self, points_px: Array, exposure_share: Any) -> Array:
+        """When the rows through pixels (..., 2) are exposed to a share of their exposure."""
+        fraction = RowClock(self.profile).readout_fraction(points_px)
+        return np.asarray(row_time_s(self.start_s, self.readout_time_s, fraction, self.exposure_s, exposure_share))
+
     def row_start_s(self, points_px: Array) -> Array:
         """Start of exposure of the rows through pixels (..., 2)."""
-        fraction = self.profile.shutter.readout_fraction(points_px, self.profile.width, self.profile.height)
-        return self.start_s + fraction * self.readout_time_s
+        return self.row_time_s(points_px, ROW_START)
 
     def pose(self, time_s: Any) -> tuple[Array, Array | None]:
         """(R_t_ref (..., 3, 3), t_t_ref (..., 3) or None) at times (...)."""
@@ -175,11 +190,10 @@ def row_motion(
     whole trajectory, where that is at hand; it is worked out otherwise.
     """
     exposure_s = profile.shutter.true_exposure_s(logged_exposure_s or 0.0)
-    readout_s = profile.shutter.readout_time_s
     start_s, reference_s = frame_times_s(profile, stamp_s, logged_exposure_s, reference)
     if lens is None and profile.intrinsics is not None:
         lens = moving_lens(trajectory, profile)
-    span_s = start_s, start_s + readout_s + exposure_s
+    span_s = start_s, float(RowClock(profile).end_s(stamp_s, logged_exposure_s or 0.0))
     return _tabulated(trajectory, span_s, start_s, exposure_s, reference_s, profile, lens, translation)
 
 
@@ -188,8 +202,7 @@ def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, l
 
     lens: of the whole trajectory.  Travel goes on with the frame's own acceleration.
     """
-    ends = [m.start_s + m.readout_time_s + m.exposure_s for m in (motion, other)]
-    span_s = min(motion.start_s, other.start_s), max(ends)
+    span_s = min(motion.start_s, other.start_s), max(motion.end_s, other.end_s)
     return _tabulated(
         trajectory, span_s, motion.start_s, motion.exposure_s, motion.reference_s, motion.profile, lens,
         motion.translation,
@@ -235,8 +248,6 @@ def frame_times_s(
     profile: CameraProfile, stamp_s: float, logged_exposure_s: float | None, reference: str
 ) -> tuple[float, float]:
     """(start of the first row's exposure, reference time) of a frame, IMU clock; arguments as :func:`row_motion`."""
-    logged = logged_exposure_s or 0.0
-    start_s = float(profile.imu_time_s(profile.shutter.first_row_start_s(stamp_s, logged)))
-    if reference != "frame-middle":
-        return start_s, start_s
-    return start_s, start_s + 0.5 * (profile.shutter.readout_time_s + profile.shutter.true_exposure_s(logged))
+    clock, logged = RowClock(profile), logged_exposure_s or 0.0
+    start_s = float(clock.time_s(stamp_s, logged))
+    return start_s, start_s if reference != "frame-middle" else float(clock.middle_s(stamp_s, logged))

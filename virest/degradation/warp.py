@@ -39,7 +39,7 @@ def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0
 
     anchor: the part of its exposure at which each row is taken to be seen; 0 its start (the paper), 0.5 its middle.
     """
-    seen_s = motion.row_start_s(points_px) + anchor * motion.exposure_s
+    seen_s = motion.row_time_s(points_px, anchor)
     return moved_between(motion, points_px, seen_s, motion.reference_s, inverse_depth)
 
 
@@ -64,8 +64,7 @@ def seen_by_rows(
     fixed = _fixed_points(motion, points_px, at_s, inverse_depth)
     for _ in range(FIXED_POINT_STEPS if motion.readout_time_s else 1):
         before = seen
-        row_s = motion.row_start_s(seen) + anchor * motion.exposure_s
-        seen = _shown(motion, *fixed, row_s)
+        seen = _shown(motion, *fixed, motion.row_time_s(seen, anchor))
         if np.abs(seen - before).max(initial=0.0) < within_px:
             break
     return seen

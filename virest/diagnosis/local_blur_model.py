@@ -18,6 +18,7 @@ from virest.degradation.row_motion import row_motion
 from virest.diagnosis.local_blur_edges import STEP_PX, fit_steps
 from virest.diagnosis.local_blur_spectra import MEMORY, SpectrumRatios, spectral_weights
 from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.row_clock import ROW_MIDDLE, ROW_START, RowClock
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -69,18 +70,15 @@ def node_tensors(
     nodes_px: Array, stamp_s: Array, exposure_s: Array, profile: CameraProfile, trajectory: Trajectory
 ) -> Array:
     """Covariance xx, xy, yy (f, n, 3) of the paths at pixels (n, 2) of frames (f,) over their rows' exposures."""
-    shutter, lens = profile.shutter, moving_lens(trajectory, profile)
-    exposure = np.asarray(shutter.true_exposure_s(exposure_s), float)[:, None, None]
-    begin = np.asarray(profile.imu_time_s(shutter.first_row_start_s(stamp_s, exposure_s)), float)[:, None, None]
+    clock, lens = RowClock(profile), moving_lens(trajectory, profile)
+    frames = stamp_s[:, None, None], exposure_s[:, None, None]
     instant, share = np.polynomial.legendre.leggauss(_INSTANTS)
-    fraction = shutter.readout_fraction(nodes_px, profile.width, profile.height)[:, None]
-    time_s = begin + fraction * shutter.readout_time_s + 0.5 * (1 + instant) * exposure
+    time_s = clock.seen_s(nodes_px[:, None], *frames, 0.5 * (1 + instant))
     points = np.broadcast_to(nodes_px[:, None], (*time_s.shape, 2))
     world = _turned(trajectory.orientation(time_s), _rays(lens, points, time_s))
     seen = points
     for _ in range(_ROW_STEPS):
-        fraction = shutter.readout_fraction(seen, profile.width, profile.height)
-        row_s = begin + fraction * shutter.readout_time_s + 0.5 * exposure
+        row_s = clock.seen_s(seen, *frames)
         back = np.swapaxes(trajectory.orientation(row_s), -1, -2)
         seen = lens.project(_turned(back, world), row_s)
     weight = 0.5 * share[:, None]
@@ -133,16 +131,15 @@ def covariates(
 ) -> dict[str, Array]:
     """What a structure in the residuals may run along: row, time, radius, rate, exposure, path length and angle."""
     width, height = profile.width, profile.height
-    start_s, chords = np.empty(len(stamp_s)), np.empty((len(stamp_s), 2))
+    clock, chords = RowClock(profile), np.empty((len(stamp_s), 2))
     for rows in _by_frame(stamp_s):
         motion = row_motion(trajectory, profile, float(stamp_s[rows[0]]), float(exposure_s[rows[0]]))
         chords[rows] = blur_chords(motion, points_px[rows])
-        start_s[rows] = motion.row_start_s(points_px[rows])
     angle, length = angle_and_length(chords)
-    middle_s = start_s + 0.5 * profile.shutter.true_exposure_s(exposure_s)
+    start_s, middle_s = (clock.seen_s(points_px, stamp_s, exposure_s, share) for share in (ROW_START, ROW_MIDDLE))
     off_centre = np.linalg.norm(points_px - np.array([(width - 1) / 2, (height - 1) / 2]), axis=-1)
     return {
-        "row": profile.shutter.readout_fraction(points_px, width, height),
+        "row": clock.readout_fraction(points_px),
         "time": start_s,
         "radius": off_centre / (0.5 * np.hypot(width, height)),
         "rate": np.linalg.norm(trajectory.rate_rad_s(middle_s), axis=-1),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
+from virest.motion.row_clock import ROW_MIDDLE, ROW_START, RowClock
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -81,10 +82,9 @@ class PhotometricObservations:
         """(k,) movie indices that occur, rising."""
         return np.unique(self.frame)
 
-    def row_time_s(self, profile: CameraProfile) -> Array:
-        """Start of exposure of each observation's row, IMU clock from stamp_0, (n,)."""
-        start = profile.imu_time_s(profile.shutter.first_row_start_s(self.stamp_s, self.exposure_s))
-        return np.asarray(start + self.row_fraction * profile.shutter.readout_time_s, float)
+    def row_time_s(self, profile: CameraProfile, exposure_share: float = ROW_START) -> Array:
+        """When each observation's row is exposed to a share of its exposure, IMU clock from stamp_0, (n,)."""
+        return np.asarray(RowClock(profile).time_s(self.stamp_s, self.exposure_s, self.row_fraction, exposure_share))
 
     def subset(self, use: Mask) -> PhotometricObservations:
         """Only the chosen observations."""
@@ -144,7 +144,7 @@ def _mean_flicker(observations: PhotometricObservations, profile: CameraProfile)
     """Mean of 1 + A sin(2π f t + φ) over each exposure: the sine at its middle, weaker by sinc(f · exposure)."""
     ext = profile.extensions
     exposure = profile.shutter.true_exposure_s(observations.exposure_s)
-    middle = observations.row_time_s(profile) + 0.5 * exposure
+    middle = observations.row_time_s(profile, ROW_MIDDLE)
     wave = np.sin(2 * np.pi * ext.flicker_frequency_hz * middle + ext.flicker_phase_rad)
     return np.asarray(1 + ext.flicker_amplitude * np.sinc(ext.flicker_frequency_hz * exposure) * wave)
 

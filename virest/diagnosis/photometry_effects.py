@@ -10,6 +10,7 @@ import numpy as np
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import Array, PhotometricObservations, predict
+from virest.motion.row_clock import ROW_MIDDLE
 
 _SCAN_OBSERVATIONS = 7_000
 """Enough to find a frequency; larger temporaries are fetched from the system anew each time, ten times slower."""
@@ -247,7 +248,7 @@ def scan_flicker(
     thin = max(1, int(np.ceil(len(observations) / _SCAN_OBSERVATIONS)))
     keep = observations.place % thin == 0 if thin > 1 else np.ones(len(observations), bool)
     exposure = np.asarray(profile.shutter.true_exposure_s(observations.exposure_s), float)
-    time_s = (observations.row_time_s(profile) + 0.5 * exposure)[keep]
+    time_s = observations.row_time_s(profile, ROW_MIDDLE)[keep]
     span = max(float(np.ptp(time_s)), 0.1)
     frequency = np.arange(search_hz[0], search_hz[1], _SCAN_STEP_CYCLES / span)
     coefficients, power = _sines(observations.patch[keep], relative[keep], stiffness[keep], time_s, frequency)

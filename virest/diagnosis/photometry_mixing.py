@@ -35,6 +35,7 @@ from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, Indices, Mask
 from virest.diagnosis.photometry_fit import HeldOut
 from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
+from virest.motion.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.trajectory import Trajectory
 
@@ -263,18 +264,18 @@ def _choose_pairs(
 
 def _central_blur_px(frames: Sequence[Frame], trajectory: Trajectory, profile: CameraProfile) -> Array:
     """How far apart the ends of the exposure see the point that its middle has at the picture's centre, (n,)."""
-    lens, shutter = profile.intrinsics, profile.shutter
+    lens = profile.intrinsics
     assert lens is not None, "paths need a focal length"
     centre = np.tile([(profile.width - 1) / 2, (profile.height - 1) / 2], (len(frames), 1))
     logged_s = np.array([frame.exposure_s or 0.0 for frame in frames])
-    exposure_s = np.asarray(shutter.true_exposure_s(logged_s))
-    first_row_s = shutter.first_row_start_s(np.array([frame.time_s for frame in frames]), logged_s)
-    waited_s = shutter.readout_fraction(centre, profile.width, profile.height) * shutter.readout_time_s
-    middle_s = profile.imu_time_s(first_row_s) + waited_s + 0.5 * exposure_s
+    stamp_s = np.array([frame.time_s for frame in frames])
+    start_s, middle_s, end_s = (
+        RowClock(profile).seen_s(centre, stamp_s, logged_s, share) for share in (ROW_START, ROW_MIDDLE, ROW_END)
+    )
     world = trajectory.orientation(middle_s) @ lens.rays(centre)[..., None]
     first, last = (
-        lens.project(np.squeeze(np.swapaxes(trajectory.orientation(middle_s + side * exposure_s), -1, -2) @ world, -1))
-        for side in (-0.5, 0.5)
+        lens.project(np.squeeze(np.swapaxes(trajectory.orientation(time_s), -1, -2) @ world, -1))
+        for time_s in (start_s, end_s)
     )
     return np.asarray(np.linalg.norm(last - first, axis=-1))
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, PhotometricObservations
 from virest.diagnosis.photometry_noise import measured_noise
+from virest.motion.row_clock import ROW_MIDDLE, RowClock
 from virest.motion.tracking import TrackingSettings, find_corners
 from virest.motion.trajectory import Trajectory
 
@@ -273,18 +275,14 @@ def path_over_exposure(
     lens = profile.intrinsics
     assert lens is not None, "paths need a focal length"
     middle = _seen_s(points_px, frame, profile)
-    exposure = float(profile.shutter.true_exposure_s(frame.exposure_s or 0.0))
     world = trajectory.orientation(middle) @ lens.rays(points_px)[..., None]
-    time_s = middle[:, None] + np.linspace(-0.5, 0.5, instants) * exposure
+    time_s = _seen_s(points_px[:, None], frame, profile, np.linspace(0.0, 1.0, instants))
     turned = np.swapaxes(trajectory.orientation(time_s), -1, -2) @ world[:, None]
     return lens.project(np.squeeze(turned, -1)) - points_px[:, None]
 
 
-def _seen_s(points_px: Array, frame: Frame, profile: CameraProfile) -> Array:
-    logged = frame.exposure_s or 0.0
-    start = profile.imu_time_s(profile.shutter.first_row_start_s(frame.time_s, logged))
-    fraction = profile.shutter.readout_fraction(points_px, profile.width, profile.height)
-    return np.asarray(start + fraction * profile.shutter.readout_time_s + 0.5 * profile.shutter.true_exposure_s(logged))
+def _seen_s(points_px: Array, frame: Frame, profile: CameraProfile, exposure_share: Any = ROW_MIDDLE) -> Array:
+    return RowClock(profile).seen_s(points_px, frame.time_s, frame.exposure_s or 0.0, exposure_share)
 
 
 def _deviation(key: _Key, guess: Array, look: _Look, settings: PatchSettings) -> Array | None:
@@ -376,7 +374,7 @@ def _observations(
         patch=patch[order],
         frame=index[row],
         stamp_s=np.array([f.time_s for f in frames])[which],
-        row_fraction=profile.shutter.readout_fraction(points, width, height),
+        row_fraction=RowClock(profile).readout_fraction(points),
         x_px=points[:, 0],
         y_px=points[:, 1],
         radius=np.linalg.norm(points - centre, axis=-1) / (0.5 * np.hypot(width, height)),

@@ -25,6 +25,7 @@ from virest.motion.integration import integrate_gyro
 from virest.motion.lively_frames import lively_frames
 from virest.motion.observed_tracks import CELLS, ObservedTracks
 from virest.motion.recorder_lag import Schedule
+from virest.motion.row_clock import RowClock
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term
 from virest.motion.track_noise import step_noise_px
@@ -162,9 +163,9 @@ def evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Rea
     """The same pictures without flicker and gain, to follow points by."""
     by_index = {frame.index: frame for frame in frames}
     curve = profile.response or ResponseCurve("srgb")
-    height, width, shutter = profile.height, profile.width, profile.shutter
+    height, width, shutter, clock = profile.height, profile.width, profile.shutter, RowClock(profile)
     along = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-    fraction = shutter.readout_fraction(along[:, :1] if not shutter.reads_columns else along[:1], width, height)
+    rows_px = along[:1] if shutter.reads_columns else along[:, :1]
 
     def even(wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
         for index, picture in gray(wanted):
@@ -172,9 +173,9 @@ def evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Rea
             if picture is None or frame is None:
                 yield index, picture
                 continue
-            exposure_s = shutter.true_exposure_s(frame.exposure_s or 0.0)
-            start_s = profile.imu_time_s(shutter.first_row_start_s(frame.time_s, frame.exposure_s or 0.0))
-            light = flicker(profile, start_s + fraction * shutter.readout_time_s + 0.5 * exposure_s, exposure_s)
+            logged_s = frame.exposure_s or 0.0
+            middle_s = clock.seen_s(rows_px, frame.time_s, logged_s)
+            light = flicker(profile, middle_s, shutter.true_exposure_s(logged_s))
             gain = profile.extensions.gain[index] if index < len(profile.extensions.gain) else 1.0
             linear = curve.linear_table()[picture] / (light * gain)
             yield index, np.clip(np.rint(255 * curve.encode(linear)), 0, 255).astype(np.uint8)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.shutter import Shutter
+from virest.motion.row_clock import row_time_s
 from virest.motion.tracking import TrackPair
 
 Array = NDArray[np.float64]
@@ -76,7 +77,7 @@ def velocity_map(
     pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
     speed, seen = velocity.at(pixels), pixels
     for _ in range(FIXED_POINT_STEPS):
-        passed_s = since_reference_s + shutter.readout_time_s * shutter.readout_fraction(seen, width, height)
+        passed_s = row_time_s(since_reference_s, shutter.readout_time_s, shutter.readout_fraction(seen, width, height))
         seen = pixels + speed * passed_s[..., None]
     return seen.astype(np.float32)
 
@@ -94,5 +95,5 @@ def _displacements(
         own, other = other, own
     neighbour = pair.second if frame == pair.first else pair.first
     fraction = [shutter.readout_fraction(points, width, height) for points in (own, other)]
-    passed_s = middle_s[neighbour] - middle_s[frame] + shutter.readout_time_s * (fraction[1] - fraction[0])
+    passed_s = row_time_s(middle_s[neighbour] - middle_s[frame], shutter.readout_time_s, fraction[1] - fraction[0])
     return own, other - own, passed_s

@@ -29,6 +29,7 @@ from virest.motion.point_fit import (
     point_table,
     priors,
 )
+from virest.motion.row_clock import RowClock
 from virest.motion.tracking import TrackPair
 from virest.motion.trajectory import Trajectory
 from virest.motion.turns import OffsetScan, PictureTurns, gyro_turns, picture_turns, scan_offsets
@@ -236,9 +237,9 @@ def _observe(
     known = bool(np.isfinite(exposure_s[[pair.first for pair in kept]]).mean() > 0.5)
     typical = float(np.nanmedian(exposure_s)) if known else 0.0
     exposure_s = np.where(np.isfinite(exposure_s), exposure_s, typical)
-    shutter = profile.shutter
     readout_s = float(priors(profile)[0][4])
-    centre_s = shutter.first_row_start_s(time_s, exposure_s) + 0.5 * (shutter.true_exposure_s(exposure_s) + readout_s)
+    clock = RowClock(replace(profile, shutter=replace(profile.shutter, readout_time_s=readout_s)))
+    centre_s = clock.camera_time_s(clock.middle_s(time_s, exposure_s))
     lens = profile.intrinsics or guessed_lens(profile)
     turns = picture_turns(lens, kept, centre_s[[pair.first for pair in kept]], centre_s[[pair.second for pair in kept]])
     kept = _thinned(kept)

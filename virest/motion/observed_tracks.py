@@ -12,6 +12,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
+from virest.motion.row_clock import RowClock
 from virest.motion.track_model import TrackTable, track_table
 from virest.motion.track_noise import step_noise_px
 from virest.motion.tracking import TrackPair
@@ -51,10 +52,8 @@ class ObservedTracks:
 
     def turns(self, profile: CameraProfile) -> PictureTurns:
         """Rotation of every pair, at the middle of the readout and exposure, camera clock."""
-        shutter = profile.shutter
-        middle = shutter.first_row_start_s(self.stamp_s, self.exposure_s) + 0.5 * (
-            shutter.true_exposure_s(self.exposure_s) + shutter.readout_time_s
-        )
+        clock = RowClock(profile)
+        middle = clock.camera_time_s(clock.middle_s(self.stamp_s, self.exposure_s))
         first, second = ([getattr(pair, name) for pair in self.pairs] for name in ("first", "second"))
         return picture_turns(self.lens, self.pairs, middle[first], middle[second])
 
@@ -66,7 +65,7 @@ class ObservedTracks:
     def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
         """The pairs whose two pictures lie inside the inertial data, with no pause or untrusted stretch between."""
         shutter = profile.shutter
-        start = np.asarray(profile.imu_time_s(shutter.first_row_start_s(self.stamp_s, self.exposure_s)))
+        start = np.asarray(RowClock(profile).time_s(self.stamp_s, self.exposure_s))
         last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s) + MARGIN_S
         begin = np.array([start[pair.first] - MARGIN_S for pair in self.pairs])
         end = np.array([start[pair.second] + last[pair.second] for pair in self.pairs])

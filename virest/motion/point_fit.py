@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
+from virest.motion.row_clock import ROW_MIDDLE, RowClock, row_time_s
 from virest.motion.tracking import TrackPair
 from virest.motion.trajectory import Trajectory, rotation_from_vector
 
@@ -108,8 +109,8 @@ class PointModel:
     def predict(self, values: Array) -> tuple[Array, Array]:
         """Where rotation alone puts the points in the second frames, (n, 2), and their rays there, (n, 3)."""
         points, bias, tilt = self.points, values[1:4], rotation_from_vector(values[7:10])
-        first = points.first_s + points.first_fraction * values[4]
-        second = points.second_s + points.second_fraction * values[4]
+        first = row_time_s(points.first_s, values[4], points.first_fraction)
+        second = row_time_s(points.second_s, values[4], points.second_fraction)
         before, after = (self.trajectory.orientation(self._imu_time(time, values)) for time in (first, second))
         lens = self.lens_at(values)
         # A bias b turns R_2ᵀ R_1 by b Δt; half before and half after leaves an error of third order.
@@ -198,8 +199,8 @@ def point_table(
     pairs: Sequence[TrackPair], frame_time_s: Array, exposure_s: Array, profile: CameraProfile
 ) -> PointTable:
     """Lay out the pairs; frame_time_s, exposure_s (frames,) by movie index, logged exposure 0 where unknown."""
-    shutter, sizes = profile.shutter, [len(pair) for pair in pairs]
-    middle_s = shutter.first_row_start_s(frame_time_s, exposure_s) + 0.5 * shutter.true_exposure_s(exposure_s)
+    clock, sizes = RowClock(profile), [len(pair) for pair in pairs]
+    middle_s = clock.camera_time_s(clock.time_s(frame_time_s, exposure_s, exposure_share=ROW_MIDDLE))
     first_px = np.concatenate([pair.points_first_px for pair in pairs])
     second_px = np.concatenate([pair.points_second_px for pair in pairs])
     first_s = np.repeat(middle_s[[pair.first for pair in pairs]], sizes)
@@ -210,8 +211,8 @@ def point_table(
         second_px,
         first_s,
         second_s,
-        shutter.readout_fraction(first_px, profile.width, profile.height),
-        shutter.readout_fraction(second_px, profile.width, profile.height),
+        clock.readout_fraction(first_px),
+        clock.readout_fraction(second_px),
         float(np.mean(0.5 * (first_s + second_s))),
     )
 

@@ -26,6 +26,7 @@ from virest.capture.imu import ImuSamples
 from virest.motion.displacement import Displacement, force_at_samples, integrate_accelerometer
 from virest.motion.integration import gyro_polynomials, integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.row_clock import RowClock
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.tracking import TrackPair
 from virest.motion.trajectory import Trajectory
@@ -267,13 +268,10 @@ def track_table(
 
 def seen_s(profile: CameraProfile, points_px: Array, stamp_s: Array, exposure_s: Array) -> Array:
     """Middle of the exposure of the points' rows, IMU clock (n,); under pulsing lamps the mean time of the light."""
-    shutter = profile.shutter
-    fraction = shutter.readout_fraction(points_px, profile.width, profile.height)
-    start_s = shutter.first_row_start_s(stamp_s, exposure_s) + fraction * shutter.readout_time_s
-    middle_s = np.asarray(profile.imu_time_s(start_s + 0.5 * shutter.true_exposure_s(exposure_s)))
+    middle_s = RowClock(profile).seen_s(points_px, stamp_s, exposure_s)
     if not profile.extensions.flicker_amplitude:
         return middle_s
-    return middle_s + pulse_delay_s(profile, middle_s, np.asarray(shutter.true_exposure_s(exposure_s)))
+    return middle_s + pulse_delay_s(profile, middle_s, np.asarray(profile.shutter.true_exposure_s(exposure_s)))
 
 
 def pulse_delay_s(profile: CameraProfile, middle_s: Array, exposure_s: Array) -> Array:

@@ -107,8 +107,7 @@ def restore_frames(
         motion = moved_over_frame(
             trajectory, lens, frame, plan.settings.reference, translations.get(frame.index), profile
         )
-        end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
-        outside = outside_reason(motion.start_s, end_s, imu.time_s, plan.imu_gaps_s)
+        outside = outside_reason(motion.start_s, motion.end_s, imu.time_s, plan.imu_gaps_s)
         return Sight(frame, picture, motion, outside[1] if outside else "")
 
     sights = (sight(frame, picture) for frame, picture in frames if picture is not None)
@@ -142,8 +141,7 @@ def restore_frames(
 
 def untrusted_reason(motion: RowMotion) -> str | None:
     """Why a frame whose rows reach into a stretch without a bridge is left alone; None: it does not."""
-    end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
-    parts = (part for part in motion.profile.unbridged_s if motion.start_s < part[1] and end_s > part[0])
+    parts = (p for p in motion.profile.unbridged_s if motion.start_s < p[1] and motion.end_s > p[0])
     return next((f"{UNTRUSTED} from {start:.3f} to {end:.3f} s" for start, end in parts), None)
 
 

@@ -38,8 +38,7 @@ def with_neighbours_asked(
     sights = {}
     for number, luma in lumas.items():
         motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
-        end_s = motion.start_s + motion.readout_time_s + motion.exposure_s
-        outside = outside_reason(motion.start_s, end_s, capture.imu.time_s, capture.imu_gaps_s)
+        outside = outside_reason(motion.start_s, motion.end_s, capture.imu.time_s, capture.imu_gaps_s)
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing = survey_turns(runs, sights, neighbours)

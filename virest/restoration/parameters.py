@@ -12,6 +12,7 @@ from virest.degradation.blur import tile_grid
 from virest.degradation.kernels import angle_and_length, blur_chords
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
+from virest.motion.row_clock import ROW_END, ROW_MIDDLE, ROW_START
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
 from virest.restoration.settings import RestorationSettings
 
@@ -24,8 +25,8 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: 
     profile = motion.profile
     width, height = profile.width, profile.height
     centre = np.array([[(width - 1) / 2, (height - 1) / 2]])
-    row_start_s = float(motion.row_start_s(centre)[0])
-    r_end_start, t_end_start = motion.relative_pose(row_start_s, row_start_s + motion.exposure_s)
+    start_s, middle_s, end_s = (float(motion.row_time_s(centre, h)[0]) for h in (ROW_START, ROW_MIDDLE, ROW_END))
+    r_end_start, t_end_start = motion.relative_pose(start_s, end_s)
     moved_m = None if t_end_start is None or not _in_metres(motion) else (-r_end_start.T @ t_end_start).tolist()
     depth_m, depth_source = _depth(motion)
     grid = tile_grid(height, width, LOG_TILE_PX, LOG_TILE_PX // 4)
@@ -36,8 +37,8 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory, settings: 
         "motion": {
             "delta_position_m": moved_m,
             "delta_q_wxyz": quaternion_wxyz(r_end_start.T).tolist(),
-            "rate_rad_s": trajectory.rate_rad_s(row_start_s + motion.exposure_s / 2).tolist(),
-            "velocity_m_s": _velocity_m_s(motion, row_start_s),
+            "rate_rad_s": trajectory.rate_rad_s(middle_s).tolist(),
+            "velocity_m_s": _velocity_m_s(motion, start_s),
         },
         "depth_m": depth_m,
         "depth_source": depth_source,

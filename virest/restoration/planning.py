@@ -30,6 +30,7 @@ from virest.motion.guide_choice import find_guide
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import GUESSED_FOCAL, observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.row_clock import RowClock
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
@@ -276,10 +277,10 @@ def _motion(
     alignment: VisualInertialAlignment, profile: CameraProfile, frame: Frame, reference: str
 ) -> FrameMotion | str:
     """Motion over the frame's exposure and readout, at the instants that the alignment's own clock gives them."""
+    clock = RowClock(profile)
     start_s, reference_s = frame_times_s(profile, frame.time_s, frame.exposure_s, reference)
-    last_s = start_s + profile.shutter.readout_time_s + profile.shutter.true_exposure_s(frame.exposure_s or 0.0)
-    camera = [(t - (profile.time_offset_s or 0.0)) / (1 + profile.clock_skew) for t in (reference_s, start_s, last_s)]
-    return alignment.frame(*camera)
+    last_s = clock.end_s(frame.time_s, frame.exposure_s or 0.0)
+    return alignment.frame(*(float(clock.camera_time_s(time_s)) for time_s in (reference_s, start_s, last_s)))
 
 
 def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTranslation:
@@ -359,10 +360,7 @@ def resting_points(
     lens: MovingLens, profile: CameraProfile, frame: Frame, points_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Points (n, 2) of a frame, each seen in the middle of its row's exposure, through the lens at rest."""
-    shutter, logged = profile.shutter, frame.exposure_s or 0.0
-    start_s = profile.imu_time_s(shutter.first_row_start_s(frame.time_s, logged))
-    rows_s = shutter.readout_fraction(points_px, profile.width, profile.height) * shutter.readout_time_s
-    time_s = start_s + rows_s + 0.5 * shutter.true_exposure_s(logged)
+    time_s = RowClock(profile).seen_s(points_px, frame.time_s, frame.exposure_s or 0.0)
     return lens.lens.project(lens.rays(points_px, time_s))
 
 

@@ -47,7 +47,7 @@ class MissingTurn:
         """The motion of a frame with the missing turn, by the pairs that end and begin with it, as far as there are."""
         prior = self.rate_rad_s**2 * np.eye(3)
         known = [_shrunk(turn, prior) for turn in (before, after) if turn is not None and self._likely(turn)]
-        middle_s = motion.start_s + 0.5 * (motion.readout_time_s + motion.exposure_s)
+        middle_s = motion.middle_s
         if not known:
             return RefinedMotion(motion, prior, self.scatter_px_s)
         times_s, rates, covariances = (np.array(parts) for parts in zip(*known, strict=True))

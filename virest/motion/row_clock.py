@@ -1,0 +1,72 @@
+"""The row clock: when a row of a frame gathers light (forward_model, section 1).
+
+A row that starts at the fraction s of the readout, 0 for the first row read, is exposed to the share h of its exposure
+at t = t_first_row + s · readout + h · exposure.  t_first_row comes from the frame's stamp, through the clock offset
+and skew; readout and true exposure last as long as the profile says, in seconds of the IMU's clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+
+Array = NDArray[np.float64]
+ROW_START, ROW_MIDDLE, ROW_END = 0.0, 0.5, 1.0
+"""Shares of an exposure."""
+
+
+def row_time_s(
+    first_row_s: Any, readout_time_s: Any, readout_fraction: Any, exposure_s: Any = 0.0, exposure_share: Any = 0.0
+) -> Any:
+    """When rows that start at a fraction of the readout are exposed to a share of their exposure; shapes broadcast.
+
+    first_row_s: start of the first row's exposure.  exposure_s: true, not logged.
+    """
+    return first_row_s + readout_fraction * readout_time_s + exposure_share * exposure_s
+
+
+@dataclass(frozen=True, slots=True)
+class RowClock:
+    """The row clock of a profile; an unknown offset counts as 0, an unknown exposure is given as 0.
+
+    All its methods take arrays and floats that broadcast.  Stamps are on the camera's clock, from stamp_0.
+    """
+
+    profile: CameraProfile
+
+    def readout_fraction(self, points_px: NDArray[Any]) -> Array:
+        """Fraction (...) of the readout at which the rows through pixels (..., 2) start; rows may be read unevenly."""
+        return self.profile.shutter.readout_fraction(points_px, self.profile.width, self.profile.height)
+
+    def time_s(
+        self, stamp_s: Any, logged_exposure_s: Any, readout_fraction: Any = 0.0, exposure_share: Any = ROW_START
+    ) -> Any:
+        """IMU time at which rows that start at a fraction of the readout are exposed to a share of their exposure."""
+        shutter = self.profile.shutter
+        first_row_s = self.profile.imu_time_s(shutter.first_row_start_s(stamp_s, logged_exposure_s))
+        exposure_s = shutter.true_exposure_s(logged_exposure_s)
+        return row_time_s(first_row_s, shutter.readout_time_s, readout_fraction, exposure_s, exposure_share)
+
+    def seen_s(
+        self, points_px: NDArray[Any], stamp_s: Any, logged_exposure_s: Any, exposure_share: Any = ROW_MIDDLE
+    ) -> Array:
+        """IMU time (...) at which frames see pixels (..., 2): at a share of the exposure of the pixels' rows."""
+        fraction = self.readout_fraction(points_px)
+        return np.asarray(self.time_s(stamp_s, logged_exposure_s, fraction, exposure_share), float)
+
+    def middle_s(self, stamp_s: Any, logged_exposure_s: Any) -> Any:
+        """IMU time in the middle of a frame: of the exposure of the row halfway through the readout."""
+        return self.time_s(stamp_s, logged_exposure_s, 0.5, ROW_MIDDLE)
+
+    def end_s(self, stamp_s: Any, logged_exposure_s: Any) -> Any:
+        """IMU time at which the row after the last one would end its exposure."""
+        return self.time_s(stamp_s, logged_exposure_s, 1.0, ROW_END)
+
+    def camera_time_s(self, imu_time_s: Any) -> Any:
+        """Camera clock of an IMU time: the inverse of :meth:`CameraProfile.imu_time_s`."""
+        return (imu_time_s - (self.profile.time_offset_s or 0.0)) / (1.0 + self.profile.clock_skew)
