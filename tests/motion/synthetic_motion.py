@@ -157,5 +157,5 @@ def _seen_s(setup: Setup, points_px: Array, stamp_s: float) -> Array:
         "right_to_left": 1 - (points_px[:, 0] + 1) / setup.width,
     }[setup.readout_direction]
     before = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}[setup.timestamp]
-    camera_s = stamp_s + along * setup.readout_time_s + (0.5 - before) * setup.exposure_s
-    return camera_s * (1 + setup.clock_skew) + setup.time_offset_s
+    first_row_s = (stamp_s - before * setup.exposure_s) * (1 + setup.clock_skew) + setup.time_offset_s
+    return first_row_s + along * setup.readout_time_s + 0.5 * setup.exposure_s

@@ -251,8 +251,8 @@ class Recording:
             "right_to_left": 1 - (points_px[:, 0] + 1) / s.width,
         }[s.readout_direction]
         before = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}[s.timestamp]
-        camera_s = self.stamp_s[frame] + along * s.readout_time_s + (0.5 - before) * self.exposure_s[frame]
-        return camera_s * (1 + s.clock_skew) + s.time_offset_s
+        first_row_s = (self.stamp_s[frame] - before * self.exposure_s[frame]) * (1 + s.clock_skew) + s.time_offset_s
+        return first_row_s + along * s.readout_time_s + 0.5 * self.exposure_s[frame]
 
     @cached_property
     def _shift(self) -> tuple[Array, Array]:

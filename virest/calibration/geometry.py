@@ -28,6 +28,7 @@ from virest.motion.comparable_noise import residual_px, tracking_noise_px
 from virest.motion.displacement import drift_std_m
 from virest.motion.observed_tracks import ObservedTracks, observe_tracks
 from virest.motion.recorder_lag import StartUpLag, fit_start_up_lag
+from virest.motion.row_clock import row_time_s
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
 from virest.motion.track_model import TrackTable, ground
@@ -417,7 +418,7 @@ def right_way_round(profile: CameraProfile) -> CameraProfile:
         "right_to_left": "left_to_right",
     }[shutter.readout_direction]
     rows = profile.width if shutter.reads_columns else profile.height
-    moved = shutter.readout_time_s * (1 - 1 / rows)
+    moved = row_time_s(0.0, shutter.readout_time_s, 1 - 1 / rows)
     return replace(
         profile,
         time_offset_s=(profile.time_offset_s or 0.0) + moved,
