@@ -27,7 +27,7 @@ PHONE = CameraProfile(
     time_offset_s=0.25,
     clock_skew=0.001,
 )
-"""The frame stamped 3 s and logged with 8 ms is exposed for 12 ms, from 2.994 s of the camera: 3.246994 s of the IMU."""
+"""The frame stamped 3 s and logged with 8 ms is exposed for 12 ms from 2.994 s on, 3.246994 s of the IMU."""
 POINTS_PX = np.array([[3.0, 1.0], [5.0, 3.0], [0.5, -0.5]])
 
 
