@@ -72,8 +72,8 @@ def _along_readout(profile: CameraProfile) -> Array:
     return np.stack([x, y], -1)
 
 
-def flicker(profile: CameraProfile, middle_s: Any, lasting_s: float = 0.0) -> Array:
-    """Mean factor on the light (...) over spans of ``lasting_s`` about times (...)."""
+def flicker(profile: CameraProfile, middle_s: Any, lasting_s: Any = 0.0) -> Array:
+    """Mean factor on the light (...) over spans of ``lasting_s``, one or (...), about times (...)."""
     extensions = profile.extensions
     # the mean of a sine over a span is the sine at its middle times sin(x) / x of half the span
     amplitude = extensions.flicker_amplitude * np.sinc(extensions.flicker_frequency_hz * lasting_s)
@@ -90,7 +90,16 @@ def vignetting(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:
     """Part of the light that is left at pixels (x, y); float32 stays float32."""
     x, y = np.subtract(x_px, 0.5 * (profile.width - 1)), np.subtract(y_px, 0.5 * (profile.height - 1))
     corner_squared = 0.25 * (profile.width**2 + profile.height**2)
-    return np.maximum(1.0 - profile.extensions.vignetting_corner_loss / corner_squared * (x * x + y * y), LEAST_LIGHT)
+    return _left(profile.extensions.vignetting_corner_loss / corner_squared, x * x + y * y)
+
+
+def vignetting_at_radius(profile: CameraProfile, radius: Array) -> Array:
+    """The same at distances (...) from the picture's centre, 1 in its corners."""
+    return np.asarray(_left(profile.extensions.vignetting_corner_loss, radius**2))
+
+
+def _left(loss: float, radius_squared: Any) -> Any:
+    return np.maximum(1.0 - loss * radius_squared, LEAST_LIGHT)
 
 
 def equivalent_length_px(profile: CameraProfile, length_px: Any) -> Any:

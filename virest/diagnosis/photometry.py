@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
+from virest.degradation.light import flicker, vignetting_at_radius
 from virest.motion.row_clock import ROW_MIDDLE, ROW_START, RowClock
 
 Array = NDArray[np.float64]
@@ -132,21 +133,14 @@ def log_light_factor(observations: PhotometricObservations, profile: CameraProfi
     ext = profile.extensions
     total = observations.log_product.copy()
     if ext.vignetting_corner_loss:
-        total += np.log(np.maximum(1 - ext.vignetting_corner_loss * observations.radius**2, 1e-3))
+        total += np.log(vignetting_at_radius(profile, observations.radius))
     if ext.flicker_amplitude:
-        total += np.log(np.maximum(_mean_flicker(observations, profile), 1e-3))
+        middle_s = observations.row_time_s(profile, ROW_MIDDLE)
+        exposure_s = profile.shutter.true_exposure_s(observations.exposure_s)
+        total += np.log(np.maximum(flicker(profile, middle_s, exposure_s), 1e-3))
     if ext.gain:
         total += np.log(np.append(ext.gain, 1.0))[np.minimum(observations.frame, len(ext.gain))]
     return total
-
-
-def _mean_flicker(observations: PhotometricObservations, profile: CameraProfile) -> Array:
-    """Mean of 1 + A sin(2π f t + φ) over each exposure: the sine at its middle, weaker by sinc(f · exposure)."""
-    ext = profile.extensions
-    exposure = profile.shutter.true_exposure_s(observations.exposure_s)
-    middle = observations.row_time_s(profile, ROW_MIDDLE)
-    wave = np.sin(2 * np.pi * ext.flicker_frequency_hz * middle + ext.flicker_phase_rad)
-    return np.asarray(1 + ext.flicker_amplitude * np.sinc(ext.flicker_frequency_hz * exposure) * wave)
 
 
 def predict(observations: PhotometricObservations, profile: CameraProfile, weight: Array | None = None) -> Prediction:
