@@ -27,6 +27,7 @@ from virest.motion.coarse_alignment import axis_maps
 from virest.motion.guidance import GyroGuide, gyro_guide
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import frame_times
+from virest.motion.row_clock import RowClock, row_time_s
 from virest.motion.shared_out import Each, one_by_one
 from virest.motion.tracking import Picture, TrackPair, track_frames
 from virest.motion.trajectory import Trajectory
@@ -186,14 +187,13 @@ class _Trial:
         assert profile.intrinsics is not None
         self.lens: Intrinsics = profile.intrinsics
         self.scores = scores
-        self.profile = profile
         self.trajectory: Trajectory = integrate_gyro(capture.imu, profile)
         stamp_s, exposure_s, _ = frame_times(capture)
-        shutter = profile.shutter
-        middle_s = shutter.first_row_start_s(stamp_s, exposure_s) + 0.5 * shutter.true_exposure_s(exposure_s)
-        rows_s = shutter.readout_time_s * shutter.readout_fraction(scores.centres_px, profile.width, profile.height)
-        first_s, second_s = (middle_s[index][:, None] + rows_s for index in (scores.first, scores.second))
-        self.first_s, self.second_s = (time_s * (1 + profile.clock_skew) for time_s in (first_s, second_s))
+        self.clock = RowClock(replace(profile, time_offset_s=0.0))
+        self.first_s, self.second_s = (
+            self.clock.seen_s(scores.centres_px, stamp_s[index, None], exposure_s[index, None])
+            for index in (scores.first, scores.second)
+        )
         self.maps = axis_maps()
         own = np.abs(self.maps - np.eye(3)).max(axis=(1, 2)) == 0
         self.maps = np.concatenate([self.maps[own], self.maps[~own]])
@@ -242,16 +242,14 @@ class _Trial:
         once = np.cross(vector, rays)
         turned = rays + once + 0.5 * np.cross(vector, once)
         moved = self.lens.project(turned) - self.scores.centres_px
-        shutter = self.profile.shutter
         lasting = np.maximum(self.second_s - self.first_s, 1e-6)
-        late_s = self._late_s(moved) * shutter.readout_time_s
-        return np.asarray(moved * (1 + late_s / lasting)[..., None])
+        return np.asarray(moved * (1 + self._late_s(moved) / lasting)[..., None])
 
     def _late_s(self, moved: Array) -> Array:
-        """Part of the readout (..., p, tiles) by which the tiles are read later than where they were."""
-        before_px, size = self.scores.centres_px, (self.profile.width, self.profile.height)
-        fraction = self.profile.shutter.readout_fraction
-        return np.asarray(fraction(before_px + moved, *size) - fraction(before_px, *size))
+        """By how much (..., p, tiles) the tiles are read later than where they were."""
+        before_px, fraction = self.scores.centres_px, self.clock.readout_fraction
+        later = fraction(before_px + moved) - fraction(before_px)
+        return np.asarray(row_time_s(0.0, self.clock.profile.shutter.readout_time_s, later))
 
 
 def _beyond_chance(own: Array, rivals: Array) -> bool:

@@ -18,6 +18,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.records import STALL, Capture
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import MIN_TRACKS
+from virest.motion.row_clock import RowClock
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.trajectory import Trajectory
 from virest.motion.turns import gyro_turns, picture_rotation
@@ -159,13 +160,9 @@ def _stands(pair: TrackPair | None) -> bool:
 
 def _middle_s(capture: Capture, profile: CameraProfile) -> Array:
     """When the middle of each capture's picture was seen, IMU clock."""
-    shutter = profile.shutter
     stamp_s = np.array([frame.time_s for frame in capture.frames])
     exposure_s = np.array([frame.exposure_s or 0.0 for frame in capture.frames])
-    started_s = shutter.first_row_start_s(stamp_s, exposure_s)
-    return np.asarray(
-        profile.imu_time_s(started_s + 0.5 * (shutter.true_exposure_s(exposure_s) + shutter.readout_time_s))
-    )
+    return np.asarray(RowClock(profile).middle_s(stamp_s, exposure_s))
 
 
 def _shows(window: range, start: int, repeats: Sequence[int]) -> dict[int, int]:
