@@ -238,9 +238,9 @@ def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> 
     exposures_s = np.array([np.nan if frame.exposure_s is None else frame.exposure_s for frame in frames])
     usual_s = float(np.nanmedian(exposures_s)) if np.isfinite(exposures_s).any() else 0.0
     exposures_s = np.where(np.isfinite(exposures_s), exposures_s, usual_s)
-    clock, stamps_s = RowClock(profile), np.zeros(len(frames))
+    clock = RowClock(replace(profile, time_offset_s=0.0, clock_skew=0.0))  # samples are written on the camera's clock
     instant = clock.time_s if reference == "exposure-start" else clock.middle_s
-    return np.asarray(clock.camera_time_s(instant(stamps_s, exposures_s)), np.float64)
+    return np.asarray(instant(np.zeros(len(frames)), exposures_s), np.float64)
 
 
 def _stamped(
