@@ -43,7 +43,7 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPlan:
-    """A capture that was read, and what of it is looked at."""
+    """A capture that was read, and which of its frames are used."""
 
     capture: Capture
     profile: CameraProfile

@@ -65,7 +65,7 @@ JUDGED_OVER_TIME = slice(4, 7)
 SINGLE = "virest best, single"
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MAP_GAIN = 2
-"""Difference maps are shown so many times as bright."""
+"""Gain of the difference maps."""
 SHEET_COLUMNS = 4
 
 

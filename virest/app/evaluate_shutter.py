@@ -54,7 +54,7 @@ JUDGED, JUDGED_QUICK = 10, 4
 CROP_MARGIN_PX = 12
 """Around the board's corners, for the comparison of pictures."""
 MAP_GAIN = 2
-"""Difference maps are shown so many times as bright."""
+"""Gain of the difference maps."""
 
 
 @dataclass(frozen=True, slots=True)

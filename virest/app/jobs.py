@@ -345,7 +345,7 @@ def prepare_worker() -> None:
 
 
 def process_pool(jobs: int, *, verbose: bool = False) -> ProcessPoolExecutor:
-    """So many processes, set up as workers; they start when they are first needed."""
+    """Worker processes, which start when they are first needed."""
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
     context = multiprocessing.get_context("spawn")

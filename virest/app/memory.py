@@ -10,7 +10,7 @@ import ctypes
 import sys
 
 MAPPED_FROM_BYTES, KEPT_BYTES = 64 << 20, 128 << 20
-"""Pieces below the first come from memory that is kept; of that, so much may lie free."""
+"""Pieces below the first come from memory that is kept; at most the second of it may lie free."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Names in glibc's malloc.h."""
 

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def side_by_side(jobs: int) -> Iterator[Each]:
-    """Calls shared out among so many processes, which are started when they are first needed; one: done here."""
+    """Calls distributed over ``jobs`` processes, which start when they are first needed; one: this process."""
     shared = _SharedOut(jobs)
     try:
         yield shared if jobs > 1 else one_by_one

@@ -61,9 +61,10 @@ def simulate_command(
 ) -> dict[str, Any]:
     """Simulate a recording and write it to ``out``; returns a summary for ``--json``.
 
-    exposure_ms: one exposure, or several that the frames take in turn; the ISO makes up for a change.
-    auto_exposure_ev: exposure × ISO, and the brightness with them, walk smoothly over so many EV about exposure_ms;
-    with auto_exposure_steps they climb a staircase of so many exposures.  rate_rad_s: 0 is a camera that does not turn;
+    exposure_ms: one exposure, or several that the frames take in turn; the ISO compensates for a change.
+    auto_exposure_ev: exposure × ISO, and the brightness with them, walk smoothly over this range about exposure_ms;
+    with auto_exposure_steps they climb a staircase of that many exposures.  rate_rad_s: 0 is a camera that does not
+    turn;
     where it does not sway either (no depth_m, or sway_m 0), the pictures are still.  direction: right_to_left for an
     upright picture and top_to_bottom for one on its side, unless given.  pan_rad_s: a steady turn about the camera's
     vertical axis.  near_m: distance of things that hang before the scene.  moving_px_s: speed of things that move

@@ -27,9 +27,9 @@ OPTIONAL = {
 TWINS = {"focal": "gyro-scale", "gyro-scale": "focal"}
 """What turns about the picture's axes tell only the product of; turns about the optical axis tell the two apart."""
 TWIN_SIGMA, TWIN_STD = 3.0, 0.01
-"""A twin held fixed is said to be wrong from so many deviations on, and to be open above this part of itself."""
+"""A twin held fixed is reported as wrong above this many deviations, and as undetermined above this part of itself."""
 WRONG_SIGMA = 6.0
-"""Any other value held fixed is said to be wrong from so many deviations on."""
+"""Any other value held fixed is reported as wrong above this many deviations."""
 BELIEVABLE = {
     "focal": 0.2,
     "distortion": 0.3,
@@ -38,7 +38,7 @@ BELIEVABLE = {
     "clock-skew": CLOCK_SKEW,
     "exposure-scale": 1.0,
 }
-"""A larger change stands in for something else, such as a stabiliser or stamps of another meaning."""
+"""A larger change absorbs something else, such as a stabiliser or stamps of another meaning."""
 _FACTORS = ("focal", "gyro-scale", "exposure-scale")
 """Values whose terms are natural logarithms of a factor."""
 
@@ -103,7 +103,7 @@ def held_notes(held: dict[str, HeldValue], fitted: Sequence[str]) -> list[str]:
         said.add(twin.name)
         if twin.sigma > TWIN_SIGMA:
             pair = f"--with {','.join([*fitted, twin.name])}"
-            notes.append(f"{name} makes up for a wrong {twin}, which the points contradict: fit both, {pair}")
+            notes.append(f"{name} is absorbing a wrong {twin}, which the points contradict: fit both, {pair}")
         elif twin.std[0] > TWIN_STD:
             notes.append(
                 f"{name} is only as right as {twin.name}, which was held fixed: this motion tells it to "

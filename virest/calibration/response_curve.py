@@ -40,7 +40,7 @@ SMOOTH_WEIGHT = 5.0
 MOVED_LEVELS = 8.0
 MAX_MOVED = 0.2
 USUAL_MISSES = 3.0
-"""A place whose worst miss is so many times the usual worst miss is left out."""
+"""A place whose worst miss exceeds the usual worst miss by this factor is left out."""
 OUTLIER_LEVELS = 20.0
 WIDEST_EV = 20.0
 """Corrections of listed exposures are sought up to this; cameras' shutters span less."""

@@ -107,7 +107,7 @@ class Field:
         return replace(self, values=rows, std=() if std is None else tuple(map(tuple, np.asarray(std).tolist())))
 
     def rounded(self, digits: int = 5) -> Field:
-        """The field with so many significant digits, as it is written."""
+        """The field rounded to a number of significant digits, as it is written."""
         rows = (tuple(tuple(float(f"{v:.{digits}g}") for v in row) for row in part) for part in (self.values, self.std))
         values, std = rows
         return replace(self, values=values, std=std)
@@ -117,7 +117,7 @@ class Field:
         return (self.kind, self.covariates, self.knots) == (other.kind, other.covariates, other.knots)
 
     def later(self, seconds: float) -> Field:
-        """The field with times counted from so much later."""
+        """The field with its times counted from a later origin."""
         if self.covariates == ("time",):
             return replace(self, knots=(tuple(k - seconds for k in self.knots[0]),))
         if self.log is None:

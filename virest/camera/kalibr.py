@@ -209,7 +209,7 @@ def _one_instant(profile: CameraProfile) -> list[str]:
 
 
 def format_imu(noise: ImuNoise, command: str = "calibrate") -> str:
-    """Write noise as Kalibr's ``imu.yaml``, which needs every value: a usual random walk stands in for an unknown one.
+    """Write noise as Kalibr's ``imu.yaml``, which needs every value: a typical random walk replaces an unknown one.
 
     An unknown density is left out with a comment, for Kalibr to ask for it.
     """

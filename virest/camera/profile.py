@@ -35,7 +35,7 @@ LARGEST = 1e12
 OPENCV_HEAD = re.compile(r"\A\ufeff?%YAML:1\.0[^\n]*")
 """First line of OpenCV's files, which is no YAML directive."""
 MAX_DIGITS = 250
-"""No number of so many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
+"""No number of this many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
 NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
 ANDROID_R_CAM_IMU = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """Stored portrait picture of an Android phone's rear camera against the device axes."""

@@ -1,4 +1,4 @@
-"""A folder of MARSLogger on Android: which of its files there are, and what stands in for those that are not."""
+"""A folder of MARSLogger on Android: which of its files there are, and what replaces those that are not."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ MOST_STALLED = 0.25
 REPEATS_APART = 6
 """Repeats that use a lag up come at most this many frames apart, the first one as long after the stall's beginning."""
 SETTLED_FRAMES = 10
-"""Repeats come at most six frames apart; so many quiet frames must follow before the start-up counts as over."""
+"""Repeats come at most six frames apart; this many quiet frames must follow before the start-up counts as over."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ NODE_STEP_S = 2e-3
 """Instants at which a path is worked out, with a cubic spline between: at 100 Hz off by 0.7 % of the vibration."""
 MIN_NODES = 8
 ACROSS_PX, MIN_KNOTS = 160, 5
-"""Knots of splines over the picture: at most so far apart, and at least so many each way."""
+"""Knots of splines over the picture: largest spacing in pixels, and least number each way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +144,7 @@ def field_along(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: f
 
 @lru_cache(maxsize=8)
 def _spline(length: int, knots: int) -> CubicSpline:
-    """Weights of so many evenly spaced knots from the first pixel to the last, as functions of the place."""
+    """Weights of evenly spaced knots from the first pixel to the last, as functions of the place."""
     return CubicSpline(np.linspace(0.0, length - 1.0, knots), np.eye(knots))
 
 

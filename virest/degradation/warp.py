@@ -26,7 +26,7 @@ PIXELS_WITHIN_PX = 1e-3
 FIXED_POINT_STEPS = 8
 """Row times depend on where a point lands; each step shrinks the error about thirtyfold."""
 CELLS_PER_KNOT, MIN_KNOTS = 3, 12
-"""A map's splines have a knot for so many cells of its grid, but at least so many: one in some 2 ms of a readout."""
+"""Cells of a map's grid for each knot of its splines, and least number of knots: one in about 2 ms of a readout."""
 
 
 def moved_between(motion: RowMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = None) -> Array:

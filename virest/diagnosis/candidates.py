@@ -21,7 +21,7 @@ SCREEN_POINTS = 1500
 """Points that a first look at a cause is fitted to."""
 CLOCKS = ("time_offset", "clock_skew")
 FURTHER_OFF = 1.1
-"""A far start of the clocks is tried unless points are off there by more than so many times as much."""
+"""A far start of the clocks is tried unless points are off there by more than this factor."""
 CONSTANT_EXPOSURE = 0.03
 """Exposures within this part of their median are one."""
 

@@ -68,7 +68,7 @@ LARGE_GAIN = 0.05
 MIN_GAIN = 0.004
 """Least part of the loss that a cause must take away on held-out blocks."""
 FEEBLE_GAIN, ASTRAY_SCALE = 0.1, 1.25
-"""A cause that takes less than this part away, while points are so many times their noise from where the model puts
+"""A cause that takes less than this part away, while points are this many times their noise from where the model puts
 them, is not what is wrong: two that gain little alone are then tried together."""
 PAIR_FIRSTS, PAIRS_JUDGED = 8, 4
 """The best causes alone, each beside all others, which it may hide; pairs that each fold chooses from."""

@@ -29,7 +29,7 @@ from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, frames_o
 STATED_DOUBT = np.array([0.15, 0.02])
 """How far a curve that a profile states may be off: logarithm of gamma, black level."""
 UNKNOWN_DOUBT = np.array([0.3, 0.04])
-"""The same of the curve that stands in for an unknown one."""
+"""The same of the default for an unknown curve."""
 _STEP = 1e-3
 _GAMMA, _BLACK = 0, 1
 

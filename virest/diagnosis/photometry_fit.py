@@ -261,7 +261,7 @@ def _lag_of_gains(log_gain: Array, exposed: Array) -> Array:
 
 
 def _frames_before(values: Array, frames: int) -> Array:
-    """The values (n,) of so many frames before; the first holds before it."""
+    """The values (n,) a given number of frames before; the first holds before it."""
     return np.concatenate([np.repeat(values[:1], frames), values])[: len(values)]
 
 

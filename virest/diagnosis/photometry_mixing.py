@@ -77,7 +77,7 @@ class MixingSettings:
     reach_frames: int = 8
     tile_px: int = 80
     tiles: int = 60
-    """At most so many of a pair's tiles, evenly over the picture: more of a large picture's tell what these do."""
+    """At most ``most`` of a pair's tiles, evenly over the picture: more tell nothing new."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,9 @@ from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import Array, Indices, PhotometricObservations
 
 _MOST_ROW_KNOTS = 17
-"""Lamps pulse two or three times in a readout: so many knots follow them."""
+"""Lamps pulse two or three times in a readout: this many knots follow them."""
 _PLACES_PER_TERM = 3.0
-"""A field has at most one term for so many places of its frame: the three colours of a place are not independent."""
+"""A field has at most one term for this many places of its frame: the three colours of a place are not independent."""
 _PRIOR_COUNT = 6.0
 """Weight of the frame's own noise, in observations, against that of the patch."""
 _LEAST_LEVELS = 0.05

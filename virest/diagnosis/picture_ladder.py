@@ -49,13 +49,14 @@ WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130
 """Brightness is judged in every frame of a short capture, and in one stretch of a longer one: patches hang together
 from frame to frame."""
 MAX_GAIN_FRAMES = 3000
-"""A gain for each frame is looked for in all of up to so many."""
+"""A gain for each frame is fitted in captures of up to this many frames."""
 SAME_SPREAD = 0.05
 """Stretches whose log exposure × ISO spreads alike to this tell the curve alike."""
 MIN_OBSERVATIONS = 300
 CURVE, MOST_KEPT = ("response_curve", "black_level"), 0.45
-"""An encoder that keeps so much of the last picture keeps more of dark patches than of bright ones, whatever the curve:
-a black level then only stands in for that."""
+"""An encoder that keeps this part of the last picture keeps more of dark patches than of bright ones, whatever the
+curve:
+a black level would only absorb that."""
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
 MIXING_P = 1.5e-3
@@ -66,7 +67,8 @@ BLUR_Z = float(stats.norm.isf(MAX_P / 2))
 """Deviations from no change of exposure or defocus at which the two-sided probability is MAX_P."""
 MIN_DEFOCUS_PX = 0.5
 SOFT_Z = 5.0
-"""A defocus that is not named, for lenses differ, is said from so many deviations on; named from twice BLUR_Z."""
+"""Above this many deviations, note possible defocus; report it as a cause only above twice BLUR_Z, since lenses
+vary."""
 MIN_EXPOSURE_CHANGE = 0.08
 
 SENTENCES = {

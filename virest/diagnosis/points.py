@@ -33,7 +33,8 @@ from virest.motion.turns import gyro_turns
 
 Array = NDArray[np.float64]
 WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
-"""Every frame of captures up to 15 s at 30 frames a second is followed; of longer ones runs, so many frames in all."""
+"""Every frame of captures up to 15 s at 30 frames a second is followed; of longer ones runs, this many frames in
+all."""
 MIN_PAIRS = 6
 MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
 AXIS_EXPLAINED = 0.6

@@ -89,7 +89,7 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
 
 
 def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> tuple[float, float]:
-    """Probabilities that pairs' whitened distances are noise alone, and that so many points stray by chance.
+    """Probabilities that pairs' whitened distances are noise alone, and that as many points stray by chance.
 
     One-sided t tests over the pairs: of their capped mean squares against 2 noise² (SCALE_EXCESS allowed for), and of
     their parts of strays against STRAY_PART.

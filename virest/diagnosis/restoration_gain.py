@@ -102,7 +102,7 @@ class _Restoration:
     """Of the recorded frames, where the pictures follow the gyroscope."""
 
     def pair(self, first: int) -> _Pair | None:
-        """Frames ``first`` and the next; None where one of them was not to be had."""
+        """Frames ``first`` and the next; None where one of them could not be restored."""
         a, b = (self.restored.get(first + step) for step in (0, 1))
         if a is None or b is None or a.picture is None or b.picture is None:
             return None

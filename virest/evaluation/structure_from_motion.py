@@ -32,7 +32,7 @@ class SfmSettings:
     max_features: int = 500
     """SIFT features of a picture."""
     overlap: int = 6
-    """Each picture is matched with so many next ones, and with those 8, 16, 32, … on."""
+    """Each picture is matched with this many following ones, and with those 8, 16, 32, … further on."""
     least_angle_deg: float = 6.0
     """Least angle between the rays of the first pair; COLMAP's own 16 is for photographs, not for a short movie."""
     threads: int = 1

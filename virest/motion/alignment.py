@@ -67,7 +67,8 @@ fitted.  A moving camera's steady parallax looks like bias."""
 AGREEMENT_SLACK_S = 0.03
 """An offset wrong by this is a matter for calibration, not a sign that pictures and gyroscope are strangers."""
 CLEARLY_BETTER = 30.0
-"""Chi-square of one from which on another offset is clearly better; errors of pairs go together, so more than nine."""
+"""Chi-square (one degree of freedom) above which another offset is clearly better; errors of pairs go together, so
+more than nine."""
 
 
 @dataclass(frozen=True, slots=True)

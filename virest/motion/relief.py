@@ -33,7 +33,7 @@ OUTSIDE = 0.05
 NEAR_S = 1.0
 """Points seen within this time of a frame speak for it."""
 ENOUGH, MOST, NEARBY = 500, 1500, 1 / 32
-"""A frame takes the points of the nearest pairs: so many, or up to MOST while parallax stays below this part of the
+"""A frame takes the points of the nearest pairs: this many, or up to MOST while parallax stays below this part of the
 picture's longer side."""
 MIN_POINTS = 60
 """A frame with fewer keeps its plane."""
@@ -58,7 +58,7 @@ STD_STEP = 6
 """Standard deviations are worked out at every such node."""
 JUDGED_INSTANTS, MIN_JUDGED_CELLS = 4, 12
 SURE, LEAST_GAIN = 3.0, 0.1
-"""A surface must beat the plane on held-out points by so many standard errors and by this part of their distance."""
+"""A surface must beat the plane on held-out points by this many standard errors and by this part of their distance."""
 
 
 @dataclass(frozen=True, slots=True)

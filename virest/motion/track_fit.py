@@ -36,9 +36,9 @@ MIN_BLOCKS = 4
 MAX_DAMPING = 1e3
 SMALLEST_SCALE = 0.03
 PLACES = 5
-"""The picture is taken in so many parts each way: a wall or a ceiling fills some of them."""
+"""The picture is divided into this many parts each way: a wall or a ceiling fills some of them."""
 ON_THE_WAY, AT_THE_END = (1.5, 0.5), (0.1, 0.05)
-"""Slopes serve until the points have moved so many pixels (median), or the scene's own values by this part, since."""
+"""Reuse the Jacobian until points move this far (median, px) or the scene changes by this fraction."""
 NOT_AT_ALL = (0.0, 0.0)
 ALMOST_NOTHING = 1e-9
 ANY_DEPTH = 1e6
@@ -155,7 +155,7 @@ class TrackFit:
     slices: dict[str, slice] = field(default_factory=dict)
 
     def distance_at(self, depth_spread_per_m: float) -> Array:
-        """Whitened distances (n,) as if points' inverse depths spread so much about the plane.
+        """Whitened distances (n,) as if points' inverse depths spread by this deviation about the plane.
 
         Fits are comparable at one spread only: a wrong plane calls for a wide one, and is then no further off.
         """

@@ -152,7 +152,7 @@ def track_frames(
 
 
 def _parts(frames: Sequence[int]) -> list[tuple[list[int], int]]:
-    """Parts of the runs of neighbours, each with its lead, and the index from which on a part's frames are its own."""
+    """Parts of the runs of neighbours, each with its lead, and the index of the first frame that is a part's own."""
     rising = np.array(sorted(set(frames)), np.intp)
     parts: list[tuple[list[int], int]] = []
     for run in np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1):

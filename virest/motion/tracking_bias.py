@@ -4,7 +4,8 @@ Followed points lag and shrink a little where blur changes from frame to frame, 
 blocks replace what was seen.  Measured on simulated captures with H.264 at 0.12 to 2 bits a pixel; it grows with the
 noise of a tracked step, of which 0.15 px is typical.
 
-Whatever its pattern is, a part of it goes along with what a value itself does to the points.  Where a value moves many
+Whatever its pattern is, a part of it is correlated with what a value itself does to the points.  Where a value moves
+many
 points far, that is little; where it moves them by hundredths of a pixel (a lens seen while walking straight on, a skew
 within three seconds), it is most of what is not known.
 """
@@ -19,7 +20,8 @@ from virest.motion.track_fit import TrackFit
 Array = NDArray[np.float64]
 TYPICAL_NOISE_PX, LEAST_NOISE_PX = 0.15, 0.05
 SHARED = 0.025
-"""Part of each point's error that goes along with a value's own pattern.  Ten kinds of values in forty captures whose
+"""Part of each point's error that is correlated with a value's own pattern.  Ten kinds of values in forty captures
+whose
 truth was known came out wrong by 0.018 to 0.027 of it (rms), hand-held or walking, before far things, walls and rooms,
 at 0.04 to 0.19 px of noise; statistics alone had put one in five of them more than two deviations off."""
 SHARED_READOUT = 0.03
@@ -45,7 +47,7 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
 }
 """At the typical noise, in the units of the terms of profile_terms; a depth's relative."""
 WANDER_STD = {"gyro_bias": 1.5e-4}
-"""What a value does of its own accord however well points are tracked: a phone's gyroscope drifts by so much within
+"""What a value does of its own accord however well points are tracked: a phone's gyroscope drifts by this much within
 seconds, and its noise of 3e-4 rad/s/√Hz has that mean over two of them."""
 
 

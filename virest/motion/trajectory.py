@@ -70,7 +70,7 @@ class Trajectory:
 
 
 def turned_angle(pieces: Array, since_s: Array) -> Array:
-    """Rotation vector (3, ...) after so many seconds at the rate of polynomials (4, 3, ...), highest power first.
+    """Rotation vector (3, ...) after a given time at the rate of polynomials (4, 3, ...), highest power first.
 
     The rate's integral and the second term of the Magnus series for a rate that changes linearly: Δt²/12 ω₀ × ω₁ (body
     axes).

@@ -44,7 +44,7 @@ MAX_FLOW_STD = 0.2
 """Of velocity over depth, part of its rms, where metres are not known: rotation alone errs by all of it.  Inertial data
 of another recording, bent until they fit, leave 0.3 and more; those of the recording itself hardly 0.12."""
 MAX_PRIOR_STD = 3.0
-"""So many of its prior's standard deviations no term of the profile may have had to give way for a fit."""
+"""Reject fits that move a parameter of the profile by more than this many prior standard deviations."""
 MIN_PARALLAX = 1.15
 """Rotation alone must leave this many times what is left with translation."""
 MAX_LEFT = 0.15

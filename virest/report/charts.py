@@ -14,7 +14,7 @@ WIDTH, HEIGHT = 360.0, 176.0
 """Of a chart, in units that are about a pixel of a phone: the letters stay readable at that width."""
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 10.0, 10.0, 34.0
 MAX_COLUMNS = 300
-"""Longer series are drawn by their least and greatest value in each of so many columns."""
+"""Longer series are drawn by their least and greatest value in each of this many columns."""
 TICKS = 4
 ABSURD = 1e12
 """Of any quantity in its unit: such values, and infinite ones, are not drawn."""

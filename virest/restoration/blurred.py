@@ -24,8 +24,8 @@ PULLED_DOWN_LEVELS = 8.0
 CODEC_REACH_PX = 2.5
 """A lamp's edge is smeared about so far by the movie's codec."""
 SHRUNK_PARTS, LOOKED_AT = 8, 4
-"""Neighbourhoods are summed in a picture in which they have about so many pixels a side, or more; of the rows that fall
-on such a pixel so many are looked at, or a few more."""
+"""Neighbourhoods are summed in a picture in which they have this many pixels a side or more; this many of the rows
+that fall on such a pixel are read."""
 SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
 
@@ -164,7 +164,7 @@ def as_kept(light: Image, blurred: BlurredPicture) -> Image:
 
 
 def reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
-    """The luma of a picture so many times smaller, and all that restoring it needs, to its measure; no colour."""
+    """The luma of a picture at 1 / times its size, and all that restoring it needs, to scale; no colour."""
     height, width = blurred.light[0].shape
     size = (max(round(width / times), 1), max(round(height / times), 1))
 

@@ -15,8 +15,8 @@ from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
-"""Part of what is not clipped that lies clear of clipped light, from which on restoring begins, and is all taken;
-seen over so many pixels and the path to both sides."""
+"""Parts of the unclipped pixels clear of clipped light at which restoring begins and at which it is taken whole;
+seen over this many pixels and the path to both sides."""
 
 PLACES = 4
 """Parts of the picture each way whose own blur path is used."""
@@ -48,7 +48,7 @@ def measured_part(holes: Image) -> Image:
 
 
 def _around(mask: Image, reach: int) -> tuple[slice, slice]:
-    """Rows and columns of all that is not 0 in a mask (height, width), and so many pixels more on each side."""
+    """Rows and columns of all that is not 0 in a mask (height, width), widened on each side by a margin in pixels."""
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
     return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
 

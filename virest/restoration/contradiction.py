@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 PLACES = 5
 """Places each way at which two motions are compared."""
 MOST_FOREIGN = 0.25
-"""Part of the predicted path beyond the seen one from which on deblurring loses: a path a third as long again as the
+"""Skip deblurring when more than this part of the predicted path lies outside the observed one: a path a third as
+long again as the
 true one leaves about as much error as it takes away."""
 MOST_LEFT = 0.75
 """Part of the rows' displacement that straightening may leave by the seen motion, which is an estimate itself."""

@@ -39,7 +39,7 @@ def richardson_lucy(
 ) -> Image:
     """Multiplicative updates for Poisson noise (Richardson 1972, Lucy 1974), with weights (Whyte et al. 2014).
 
-    f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.  relaxation: each step goes so many times
+    f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.  relaxation: each step goes this many times
     as far, but never below a fifth.
     """
     sharp: Image = cv2.max(start, 1e-4)

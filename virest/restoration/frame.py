@@ -39,15 +39,15 @@ from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
 from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
-"""Straightening that moves no point further than this is left out: so much a gyroscope at rest seems to turn, too."""
+"""Straightening that moves no point further than this is left out: a gyroscope at rest seems to turn as much."""
 MIN_GAIN_DB = 0.1
 """A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
 FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
-"""Gradients of so many times the noise are not wiped out with it; nor does it matter where so much is to be gained."""
+"""Gradients of this many times the noise survive the prior; above this gain their loss does not matter."""
 PART_STEP_PX = 80
-"""Spacing of the places at which it is looked whether the blur is worth the trouble."""
+"""Grid spacing of the minimum-blur test."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"

@@ -203,7 +203,7 @@ def _with_seen_paths(
     """Say where the pictures show blur paths of another length than predicted, and take no step that then loses.
 
     Tracked points see the middle of the exposures, and an offset found with them holds for it.  A stated one that they
-    do not contradict, or only since the exposures are so much shorter or longer, stays.
+    do not contradict, or contradict only because the exposures differ as much, stays.
     """
     profile = plan.contradicted or plan.profile
     found_by_points = plan.contradicted is not None or given.time_offset_s is None
@@ -369,7 +369,7 @@ def _times(capture: Capture) -> tuple[list[float], list[float | None]]:
 
 
 def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[str, ...]:
-    """A warning for each value that a documented default stands in for."""
+    """A warning for each value that is a documented default."""
     warnings = []
     if profile.response is None:
         warnings.append("response curve unknown: srgb taken")

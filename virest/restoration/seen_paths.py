@@ -34,7 +34,7 @@ SCALES = np.geomspace(2**-2, 2**1.5, 15)
 LONGEST = 2.2
 """Longer ones are no estimate: pictures with little detail, or such as no lens gives, go on to the last one tried."""
 MOST_FRAMES = 16
-"""So many frames are looked at."""
+"""Number of frames that are measured."""
 MOST_TILES = 24
 """Tiles of a frame of which spectra are kept; the most blurred MANY_TILES of them are used."""
 LEAST_PATH_PX = 1.5
@@ -47,12 +47,12 @@ BELIEVED = 1 / 3
 MODEL_STD = 0.1
 """How far, in the logarithm, right profiles are off: lenses, curves and paths that change over a tile."""
 STARVED_BITS = 0.1
-"""Bits a pixel at which a coder repeats so much of the frames before that the scale is known half as well."""
+"""Bits a pixel below which a coder repeats the frames before: the scale is known half as well."""
 MOST_CLIPPED = 0.002
 """Tiles with a larger part of clipped light are taken only where there are none better."""
 RESAMPLED = 60
 SURE = 3.0
-"""Standard deviations from which on the pictures contradict a profile."""
+"""Above this many standard deviations the frames contradict a profile."""
 _FIT_STEPS = 6
 _TINY = 1e-30
 

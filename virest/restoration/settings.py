@@ -18,7 +18,7 @@ JOINT_METHODS = ("gradient-wiener", "hyper-laplacian")
 SHUTTER_METHODS = ("none", "perspective", "rowwise")
 REFERENCES = ("exposure-start", "frame-middle")
 FEW_ITERATIONS = 2
-"""Up to so many, what is dear beside the iterations is done more coarsely."""
+"""At or below this iteration count, use cheaper approximations elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,12 +30,12 @@ MOST_WRONG, LEAST_TILE, FIELD_SAMPLES = 0.7, 0.7, (6, 5)
 """Error in noises that a tile's kernel may make of edges half a step away; part of the preset's side to which tiles
 shrink for it; rows and columns of places at which the kernels' change is looked at."""
 OVERLAP_GIVE = 0.1
-"""Wide overlaps may be narrower by so much, where fewer tiles then reach to the picture's edge."""
+"""Wide overlaps may be narrower by this part, where fewer tiles then reach to the picture's edge."""
 BORDER_NOISE_TO_SIGNAL = 0.003
 """Least N / S of tiles that see beyond the picture."""
 UNEVEN_NOISE_TO_SIGNAL = 0.03
 """Least N / S of a picture whose power lies at few places: an error of the kernel there, or of what a tile sees around
-itself, is by so much in proportion to the power, and stands out of the noise."""
+itself, is proportional to the power, and exceeds the noise."""
 
 
 def luma_tiles(

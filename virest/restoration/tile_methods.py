@@ -31,9 +31,9 @@ from virest.restoration.tile_layout import (
 )
 
 REDUCTIONS = (1.5, 4 / 3)
-"""A picture so many times smaller serves few iterations as well, where noise hides all finer detail."""
+"""Reductions of the picture that lose nothing with few iterations where noise hides all finer detail."""
 FEW_SCALE = 0.6
-"""Few steps do not reach as far into the weak gradients; a smaller unit makes up for it."""
+"""Few steps do not reach as far into the weak gradients; a smaller unit compensates for that."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
 """Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
 RESIDUAL_SHARE = 0.05

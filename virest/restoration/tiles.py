@@ -19,13 +19,13 @@ from virest.degradation.blur import FAST_SIZES, Image, TileGrid, fast_size, tile
 from virest.restoration.deconvolution import richardson_lucy
 
 LEAST_SIDE, LARGEST_SIDE = 0.8, 1.15
-"""Tiles may be so much smaller or larger than asked for, where that makes their transforms quick."""
+"""Least and largest side of tiles over the requested one, where that makes their transforms fast."""
 LITTLE_LONGER = 1.05
 """Time that tiles may take over the quickest ones, where their side is nearer to what was asked for."""
 SETTLING_ITERATIONS, SETTLING_RELAXATION = 4, 1.7
 """About as good as seven plain steps of Richardson-Lucy's."""
 LAMP_DOUBT = 0.02
-"""Lamp light in a streak, in units of the recorded range, from which on half of the light there is the steps' own."""
+"""Highlight level, in units of the recorded range, at which the blend is half Richardson–Lucy."""
 Filter = Callable[[Image], Image]
 """Turns a kernel's power spectrum |K|² (packed, real parts doubled) into the real factor that follows conj(K)."""
 

@@ -1,7 +1,8 @@
 """How the phone exposes each picture: exposure time, ISO, and how much light they let the picture have.
 
 As logged, light is exposure × ISO.  Without auto-exposure every picture gets the same: where the exposure changes, the
-ISO makes up for it.  With it the product moves, in one of two ways: a smooth walk, as when a phone follows a scene, or
+ISO compensates for it.  With it the product moves, in one of two ways: a smooth walk, as when a phone follows a
+scene, or
 a staircase from dark to bright, as when somebody brackets one.  Exposure and ISO share the change half and half, as far
 as the frame's duration and the lowest ISO let them.
 """
@@ -30,7 +31,7 @@ class AutoExposure:
     range_ev: float
     """From the darkest picture to the brightest; the nominal exposure lies in the middle."""
     steps: int | None = None
-    """A staircase of so many exposures, dark to bright, each held equally long; None: a smooth walk."""
+    """A staircase of exposures, dark to bright, each held equally long; None: a smooth walk."""
 
     def __post_init__(self) -> None:
         if not 0 < self.range_ev <= MAX_RANGE_EV:

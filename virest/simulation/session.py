@@ -58,7 +58,7 @@ class SessionSettings:
     frames: int = 12
     fps: float = 30.0
     exposure_s: tuple[float, ...] = (0.010,)
-    """As logged; frame k takes entry k modulo the length. The ISO makes up for a change: the light stays."""
+    """As logged; frame k takes entry k modulo the length. The ISO compensates for a change: the light stays."""
     auto_exposure: AutoExposure | None = None
     """Exposure × ISO moves, and the picture's brightness with it; None: it stays."""
     rate_rad_s: float = 1.0

@@ -146,7 +146,7 @@ def masked_psnr_db(picture: Picture | None, truth: Picture, mask: Mask) -> float
 
 
 CLIPPING = ("sunlit", "lamps")
-"""Leaves in so much light that CLIPPED_SHARE of the pixels clip; leaves with lamps and glints 2 to 12 times too bright,
+"""Leaves in light that clips CLIPPED_SHARE of the pixels; leaves with lamps and glints 2 to 12 times too bright,
 on some 3 % of the area."""
 CLIPPED_SHARE = 0.03
 

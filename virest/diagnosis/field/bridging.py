@@ -23,11 +23,12 @@ from virest.motion.track_model import TrackTable, ground
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LEAST_PAIRS_LEFT = 20
-"""So many pairs of frames without a doubtful stretch are enough for the ladder."""
+"""Least number of frame pairs without a doubtful stretch that the ladder needs."""
 MAX_P = 1e-3
 """One-sided, that points in doubtful stretches lie no further off than elsewhere."""
 LEFT_PART, LEFT_RATIO = 0.2, 1.5
-"""A bridge holds where at most this part of the excess is left, or points are off by so many times the noise."""
+"""A bridge holds where at most this part of the excess is left, or points are off by at most this many times the
+noise."""
 
 
 @dataclass(frozen=True, slots=True)

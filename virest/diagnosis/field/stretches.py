@@ -28,7 +28,8 @@ CHANCE = 1e-6
 """Of a straight run somewhere in the log, by the rate of such differences on the three axes."""
 LEAST_STRAIGHT_S = 0.02
 PILE_PART, LEAST_PILED, PILED_RUN = 0.005, 6, 3
-"""Readings within this part of the largest are at the limit; so many, with a run of so many, are a pile."""
+"""Readings within this part of the largest count as at the limit; this many in all, with a run this long, show
+clipping."""
 PILE_RATIO = 4.0
 """Of readings at the limit to those in as wide a band just below: a peak's top is wider than its flanks, but not so."""
 KNOT_STEP_S = 0.03

@@ -43,7 +43,7 @@ class ConfirmedGain:
     pairs: int
 
     def expected_db(self, promised_db: float) -> float:
-        """The gain to be expected where the model promises so much, before anything is restored."""
+        """The expected gain for a gain that the model promises, before anything is restored."""
         return _gain_db(min(self.share, 1.0) * (1 - 10 ** (-promised_db / 10)))
 
     def taken(self, further: float) -> float:
@@ -70,7 +70,7 @@ def tellers(ideal: float, changed: float, left: float) -> NDArray[np.float64]:
 
 
 def _gain_db(part: float) -> float:
-    """Gain in dB where so much of the error is taken away."""
+    """Gain in dB for a removed part of the error."""
     return 10 * float(np.log10(1 / max(1 - part, 1e-3)))
 
 

@@ -240,7 +240,7 @@ def _power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
 
 
 def _tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
-    """(n, 2) top and left of at most so many tiles, evenly over a picture."""
+    """(n, 2) top and left of tiles spread evenly over a picture, at most the given number."""
     tops, lefts = (
         np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(
             np.intp

@@ -120,7 +120,7 @@ def _luma_light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.flo
 def _least_clipped(
     clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]], most_tiles: int
 ) -> NDArray[np.intp]:
-    """Numbers of the tiles to measure: at most so many, evenly over those with the least clipped light."""
+    """Numbers of the tiles to measure: at most ``most``, spread evenly over those with the least clipped light."""
     chosen = np.arange(len(corners))
     if clipped is not None:
         parts = np.array([np.count_nonzero(cut(clipped, corner)) for corner in corners]) / SIDE**2

@@ -19,7 +19,7 @@ from virest.restoration.statistics.rings import SIDE
 SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
 MIN_SAMPLES = 6
-"""So many tiles, the most blurred ones, are measured in any case."""
+"""Least number of measured tiles, the most blurred ones."""
 LARGEST_RADIUS = SIDE // 4
 """Kernels of a larger radius leave too little of a measured tile that is not bent by its window."""
 CURVE_SLOPE_STD = 0.1

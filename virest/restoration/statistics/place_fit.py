@@ -12,19 +12,19 @@ from virest.restoration.statistics.rings import RINGS, axes, place_ring
 from virest.restoration.statistics.tile_power import MANY_TILES
 
 _LITTLE_MISFIT, _LARGE_MISFIT = 0.8, 1.1
-"""RMS of ln |G|² about the fit's, over its cells, up to which rings are believed, and from which on they are not.
+"""RMS of ln |G|² about the fit's, over its cells, below which rings are trusted fully, and above which not at all.
 
 Of MANY_TILES; what fewer of them hold differs more from one to the next."""
 _SINGLE_PLACES = 2.0
-"""Along the axes, which the fit leaves out, single places scatter so many times as much as cells."""
+"""Along the axes, which the fit leaves out, single places scatter this many times as much as cells."""
 _INDEPENDENT = 4.0
-"""Of a place's nine neighbours under the window, itself one of them, so many are independent."""
+"""Effective number of independent places in a 3×3 neighbourhood under the window."""
 _STEEPEST_PLACE = 4.0
-"""S of a place is at most so many times its ring's, or what came through the blur, whichever is more.
+"""S of a place is at most this many times its ring's, or what came through the blur, whichever is more.
 
 What exceeds both where kernels cancel is the coder's pattern."""
 _FEW_PLACES = 20.0
-"""A ring with so many reliable places is half way from its fit to what these have."""
+"""A ring with this many reliable places lies half way between its fit and their mean."""
 
 
 def unevenness(rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32]) -> float:

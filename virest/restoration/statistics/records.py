@@ -15,7 +15,7 @@ LUMA_RED, LUMA_BLUE = 0.299, 0.114
 _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 _EDGES_BEYOND = 2.0
-"""A picture's edges stand out of its spectrum by so much: rings of tiles have the mean of edge and plain surface."""
+"""A picture's edges exceed its mean spectrum by this factor: rings of tiles have the mean of edge and plain surface."""
 _DETAIL_SLOPE = 3.0
 """The power of a natural picture falls with frequency about like f⁻³."""
 
@@ -32,7 +32,7 @@ class PlaceStatistics:
     """(SIDE, SIDE / 2 - 1) mean |K|² of the kernels."""
 
     def after(self, passed: Array) -> PlaceStatistics:
-        """The same where more blur came on top, that passes so much (RINGS,) of |G|²."""
+        """The same after further blur that passes the given part (RINGS,) of |G|²."""
         return replace(self, passed=(self.passed * passed[place_ring()]).astype(np.float32))
 
     def expected_gain_db(self, signal: Array, noise: Array) -> float:
@@ -117,7 +117,7 @@ class PictureStatistics:
         )
 
     def with_error_share(self, share: float) -> PictureStatistics:
-        """With an error of so much of S beside the noise: what the model of light is known to be wrong by.
+        """With an error of ``share`` times S beside the noise: the known error of the model of light.
 
         It comes from edges, whose power lies everywhere; a grating's, which lies at few places, is as it is.
         """
@@ -134,7 +134,7 @@ class PictureStatistics:
         return replace(self, noise=noise, noise_levels=self.noise_levels * float(np.sqrt(after / before)))
 
     def doubted_by(self, spread: KernelSpread | None) -> PictureStatistics:
-        """With kernels that are known to so much: what their variance leaves unknown of S counts as noise."""
+        """With uncertain kernels: what their variance leaves unknown of S counts as noise."""
         if spread is None:
             return self
         over_places = spread.variance(SIDE)[:, 1 : SIDE // 2]

@@ -23,11 +23,11 @@ there: recorded less true pictures at 0.25 bits a pixel fall about as f⁻¹·�
 frames, read by eye).  It hardly matters: ``python -m virest.app.bench --only fits`` finds 1.9 ± 2.2, and between 0.5
 and 2.5 the mean gain on 14 captures changes by 0.01 dB."""
 _SLOPE_SPAN = 3.0
-"""The noise's growth is measured from the lowest determined ring to so many times its frequency."""
+"""The noise's growth is measured from the lowest determined ring to this many times its frequency."""
 _STANDS_OUT = 0.5
 """A coder's noise is no longer cut with the picture where it has less than this part of what is seen."""
 _CLEAR_SIGNAL = 3.0
-"""What comes through the blur is clear where it has so many times the noise's power."""
+"""What passes the blur is clear where it has this many times the noise's power."""
 _PLACES_IN_CELL = 4
 """The mean of fewer tells little."""
 

@@ -13,7 +13,7 @@ _WINDOW = np.outer(np.hanning(SIDE + 2)[1:-1], np.hanning(SIDE + 2)[1:-1]).astyp
 _WINDOW_SUM = float(_WINDOW.sum())
 _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 MANY_TILES, FEW_TILES = 12, 8
-"""So many are measured at most; fewer tell weak noise to a third only."""
+"""Largest number of measured tiles; fewer determine weak noise to a third only."""
 _ON_PATH = 2e-3
 """Kernels are larger than this where the path goes."""
 _FILLING_PX = (5, 15, 45, 135)
