@@ -20,7 +20,7 @@ from virest.camera.profile import CameraProfile, read_profile, write_profile
 from virest.capture.folder import read_capture
 from virest.capture.profile_source import read_any_profile
 from virest.errors import CalibrationError, OutputError
-from virest.motion import lively_frames
+from virest.motion import frame_selection
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 OFFSET_S, READOUT_S, ROTATION, BIAS = 0.031, 0.0236, (0.012, -0.017, 0.021), (0.018, -0.011, 0.006)
@@ -252,8 +252,8 @@ def test_what_another_sensor_s_imu_yaml_says_is_compared(
 def test_long_captures_are_looked_at_in_runs(shaken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the limit, runs of consecutive frames spread over the capture are tracked, and that is enough."""
     monkeypatch.setattr(command, "MAX_FRAMES", 40)
-    monkeypatch.setattr(lively_frames, "MIN_RUN_FRAMES", 10)
-    monkeypatch.setattr(lively_frames, "RUN_S", 0.33)
+    monkeypatch.setattr(frame_selection, "MIN_RUN_FRAMES", 10)
+    monkeypatch.setattr(frame_selection, "RUN_S", 0.33)
     plan = plan_calibration(shaken)
     runs = np.split(np.array(plan.frames), np.flatnonzero(np.diff(plan.frames) > 1) + 1)
     assert len(plan.frames) == 40

@@ -24,7 +24,7 @@ from virest.diagnosis.findings import (
     Rung,
 )
 from virest.errors import CalibrationError, OutputError
-from virest.motion.shared_out import Each
+from virest.motion.parallel import ParallelMap
 
 CAUSE_KEYS = {"name", "parameters", "held_out", "rivals", "p_value", "sentence", "figures"}
 TOP_KEYS = {"schema", "verdict", "nominal", "causes", "fields", "unexplained", "restoration_gain", "extended_profile"}
@@ -74,7 +74,7 @@ def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Let the ladder come to a given verdict."""
 
     def give(verdict: str = "explained", *causes: Finding, error: Exception | None = None) -> None:
-        def climb(source: diagnose.Source, progress: Say, _each: Each, _kept_back: object = ()) -> Diagnosis:
+        def climb(source: diagnose.Source, progress: Say, _each: ParallelMap, _kept_back: object = ()) -> Diagnosis:
             progress("points", 0.5)
             assert [number for number, _ in source.pictures([7, 3, 4])] == [3, 4, 7]
             assert next(source.gray([5]))[1].shape == (120, 160)  # type: ignore[union-attr]
@@ -91,7 +91,7 @@ def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blank files for figures: drawing takes most of the time, and what is left is too little for processes."""
 
-    def blank(_capture: object, found: Diagnosis, _each: Each) -> tuple[dict[str, bytes], list[list[str]]]:
+    def blank(_capture: object, found: Diagnosis, _each: ParallelMap) -> tuple[dict[str, bytes], list[list[str]]]:
         names = [f"figures/{number:02d}_{cause.name}.png" for number, cause in enumerate(found.causes, start=1)]
         return dict.fromkeys(names, b"\x89PNG"), [[name] for name in names]
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from virest.app import jobs
-from virest.app.jobs import Ahead, Segment, Workers, cut_frames, cut_imu, run_segment, run_segments
+from virest.app.jobs import PrefetchedCalls, Segment, Workers, cut_frames, cut_imu, run_segment, run_segments
 from virest.app.outputs import RunFolder
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
@@ -300,7 +300,7 @@ def _square_or_die(number: int) -> int:
 def test_a_call_that_kills_its_worker_fails_alone() -> None:
     """Its neighbours' results come all the same, in order; an error is raised when its turn comes."""
     workers = Workers(2)
-    ahead = Ahead(_square_or_die, [(number,) for number in range(6)], workers)
+    ahead = PrefetchedCalls(_square_or_die, [(number,) for number in range(6)], workers)
     results: list[Any] = []
     try:
         for number in range(6):

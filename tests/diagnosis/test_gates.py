@@ -16,16 +16,16 @@ from virest.camera.profile import CameraProfile
 from virest.diagnosis import geometric_ladder, local_blur, local_blur_fit, photometry_fit, picture_ladder
 from virest.diagnosis.candidates import Candidate
 from virest.diagnosis.catalogue import CATALOGUE, FALSE_ALARM, MAX_P
+from virest.diagnosis.cross_validation import Judged, Screened, choose
+from virest.diagnosis.cross_validation import judge as judge_points
 from virest.diagnosis.findings import Rung
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import Trial, _best_single, _significant
 from virest.diagnosis.photometry_effects import Vignetting
 from virest.diagnosis.photometry_fit import HeldOut, fit_photometry, judge, time_blocks
-from virest.diagnosis.trials import Judged, Screened, choose
-from virest.diagnosis.trials import judge as judge_points
 from virest.motion import profile_terms as terms_of
-from virest.motion.shared_out import one_by_one
+from virest.motion.parallel import one_by_one
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
 EFFECT = {effect.name: effect for effect in GEOMETRIC_EFFECTS}

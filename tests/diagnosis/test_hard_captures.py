@@ -17,7 +17,7 @@ from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
 from virest.diagnosis import photometry_fit
-from virest.diagnosis.alike import stamped
+from virest.diagnosis.ambiguities import offset_as_timestamp
 from virest.diagnosis.findings import CONSISTENT, GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
@@ -28,7 +28,7 @@ from virest.diagnosis.local_blur_spectra import bin_count, join_ratios
 from virest.diagnosis.photometry_effects import GainDrift
 from virest.diagnosis.photometry_fit import fit_photometry, significance
 from virest.diagnosis.picture_ladder import changes_of, frames_of, values_of
-from virest.diagnosis.points import with_null_values
+from virest.diagnosis.tracking_stage import with_null_values
 from virest.motion import profile_terms as terms_of
 from virest.motion.integration import integrate_gyro
 
@@ -147,5 +147,5 @@ def test_an_offset_without_exposures_may_be_an_exposure() -> None:
     change = {"time_offset_s": ParameterChange(0.0, 0.004, 1e-5)}
     finding = Finding("time_offset", change, HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1), (), 1e-9, "")
     verdict = SimpleNamespace(nominal=Model(CameraProfile(640, 480), None, ()))
-    (named,) = stamped(verdict, [finding], np.zeros(5))  # type: ignore[arg-type]
+    (named,) = offset_as_timestamp(verdict, [finding], np.zeros(5))  # type: ignore[arg-type]
     assert [rival.name for rival in named.rivals] == ["exposure_time"]

@@ -16,8 +16,8 @@ from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
 from virest.capture.video import probe_movie, read_frames
+from virest.diagnosis.curve_from_blur import MixingEvidence, estimate_mixing, judge_mixing, observe_mixing
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange
-from virest.diagnosis.light_values import settle_light
 from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
 from virest.diagnosis.photometry_effects import (
     BlackLevel,
@@ -29,10 +29,10 @@ from virest.diagnosis.photometry_effects import (
     photometric_effects,
 )
 from virest.diagnosis.photometry_fit import RESOLUTION, fit_photometry, judge, pulls, significance, time_blocks
-from virest.diagnosis.photometry_mixing import MixingEvidence, estimate_mixing, judge_mixing, observe_mixing
 from virest.diagnosis.photometry_noise import measured_noise
 from virest.diagnosis.photometry_patches import observe_photometry
 from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, climb_observations, name_curve, values_of
+from virest.diagnosis.refit_photometry import settle_light
 from virest.motion.integration import integrate_gyro
 
 FRAMES, NOISE = 60, 0.5

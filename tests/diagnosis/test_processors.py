@@ -15,10 +15,10 @@ import pytest
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.diagnosis import geometric_ladder
+from virest.diagnosis.cross_validation import Judged
 from virest.diagnosis.findings import ParameterChange
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import Accepted, _apart, _either
-from virest.diagnosis.trials import Judged
 
 TESTS = Path(__file__).resolve().parent.parent
 CORES = ("Haswell", "Nehalem")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from motion.synthetic_tracks import Recording, Setup
 
+from virest.diagnosis.cross_validation import chance_of
 from virest.diagnosis.findings import GEOMETRY, HeldOutGain
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import _lag_std_s, climb, findings_of
-from virest.diagnosis.trials import chance_of
 from virest.motion.comparable_noise import residual_px, tracking_noise_px
 from virest.motion.track_fit import many_directions, start_scene
 from virest.motion.track_model import ground

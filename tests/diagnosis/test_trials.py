@@ -9,10 +9,10 @@ import numpy as np
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.diagnosis.candidates import FarClock, candidates_of
+from virest.diagnosis.cross_validation import FOLDS, GLANCE, RACED, RACED_STARTS, best_of_each, race, screen
 from virest.diagnosis.geometric_evidence import ITERATIONS, Model, make_evidence
-from virest.diagnosis.geometric_ladder import _Course
-from virest.diagnosis.trials import FOLDS, GLANCE, RACED, RACED_STARTS, best_of_each, race, screen
-from virest.motion.shared_out import one_by_one
+from virest.diagnosis.geometric_ladder import SearchContext
+from virest.motion.parallel import one_by_one
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
 CAMERA = Recording(HAND)
@@ -43,7 +43,7 @@ def test_the_right_cause_wins_a_race_as_it_wins_a_screening() -> None:
 def test_a_rival_way_takes_causes_of_the_first_alone() -> None:
     """What may enter on the way that is climbed for comparison is what entered on the other."""
     model = Model(replace(CAMERA.profile, time_offset_s=0.025), None, ())
-    course = _Course(EVIDENCE, model.profile, (), FarClock(), one_by_one)
+    course = SearchContext(EVIDENCE, model.profile, (), FarClock(), one_by_one)
     some = replace(course, among=frozenset({"gyro_bias", "focal_length"}))
     assert {candidate.name for candidate in some.candidates(model, {"focal_length"})} == {"gyro_bias"}
     assert {"gyro_bias", "stabilisation"} < {candidate.name for candidate in course.candidates(model, set())}

@@ -19,11 +19,11 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
+from virest.motion.frame_rotations import FrameRotations
 from virest.motion.observed_tracks import ObservedTracks
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_model import TrackTable, track_table
 from virest.motion.tracking import TrackPair
-from virest.motion.turns import PictureTurns
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -228,14 +228,14 @@ class Recording:
             self.in_trajectory_axes(plane / (1 - moved[:, None])),
         )
 
-    def turns(self, offset_s: float = 0.0) -> PictureTurns:
+    def turns(self, offset_s: float = 0.0) -> FrameRotations:
         """Rotation of every pair at its middle row, stamps counted from another zero, without looking at points."""
         s = self.setup
         middle = np.array([[(s.width - 1) / 2, (s.height - 1) / 2]])
         seen = np.concatenate([self.seen_s(middle, np.array([k])) for k in range(s.frames)])
         after, before = self.orientation(seen[1:]), self.orientation(seen[:-1])
         camera_s = (seen - s.time_offset_s) / (1 + s.clock_skew) + offset_s
-        return PictureTurns(camera_s[:-1], camera_s[1:], (after.inv() * before).as_rotvec())
+        return FrameRotations(camera_s[:-1], camera_s[1:], (after.inv() * before).as_rotvec())
 
     def in_trajectory_axes(self, vectors: Array) -> Array:
         """Turn world vectors into the camera's axes at the first inertial sample."""

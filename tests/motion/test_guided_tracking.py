@@ -16,7 +16,7 @@ from virest.motion.guide_choice import find_guide
 from virest.motion.track_model import ground, predict, track_table
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.restoration.capture import restore_frames
-from virest.restoration.planning import plan_restoration
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.settings import PRESETS
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import pytest
 from swaying_camera import CENTRE_PX, Sway, SwayingCamera
 
 from virest.camera.intrinsics import Intrinsics
-from virest.motion.depth import Sights, TriangulatedPoints
+from virest.motion.depth import Sightings, TriangulatedPoints
 from virest.motion.optics import MovingLens
 from virest.motion.relief import measure_roughness, picture_grid
 from virest.motion.relief_surface import Relief, angles
@@ -89,7 +89,7 @@ def test_the_plane_stays_where_a_surface_tells_held_out_points_no_better(setup: 
             )
 
 
-def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> Sights:
+def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> Sightings:
     """Points on patches of 0.1 rad at two inverse depths, 0.3 apart, each seen once in every pair."""
     rng = np.random.default_rng(4)
     rays = LENS.rays(rng.uniform((0, 0), (639, 479), (count * pairs, 2)), np.zeros(count * pairs))
@@ -101,7 +101,7 @@ def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> Sights:
     points = TriangulatedPoints(
         np.zeros(len(rays), np.intp), rays / inverse[:, None], 0.03 * pair, inverse, np.full(len(rays), noise)
     )
-    return Sights(points, pair, np.zeros((len(rays), 3)), rays, found, np.zeros(len(rays)))
+    return Sightings(points, pair, np.zeros((len(rays), 3)), rays, found, np.zeros(len(rays)))
 
 
 def test_the_variogram_tells_sill_and_length() -> None:

@@ -13,7 +13,7 @@ from virest.camera.profile import CameraProfile
 from virest.errors import ImuError
 from virest.motion import profile_terms as terms_of
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.track_fit import Doubt, Term, TrackFit, fit_tracks, start_scene
+from virest.motion.track_fit import CovarianceModel, Term, TrackFit, fit_tracks, start_scene
 from virest.motion.track_model import ground, predict
 from virest.motion.tracking_bias import bias_std
 
@@ -286,7 +286,7 @@ def test_what_cancels_in_a_combination_is_not_doubted() -> None:
     """Two values whose errors cancel in their sum; a correction of one alone must not come back in it."""
     together = np.array([[1.0, -1.0], [-1.0, 1.0]])
     by_place = np.array([[3.0, -3.0], [-3.0, 3.0]])
-    doubt = Doubt(1e-6 * np.eye(2), together, by_place, np.zeros((2, 2)), relief=np.array([[0.5, -0.5]]))
+    doubt = CovarianceModel(1e-6 * np.eye(2), together, by_place, np.zeros((2, 2)), relief=np.array([[0.5, -0.5]]))
     each = doubt.of(np.eye(2))
     np.testing.assert_allclose(np.diag(each), 4.0)
     total = np.array([[1.0, 1.0]])

@@ -13,7 +13,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.degradation.light import FrameLight
 from virest.motion.alignment import OffsetEstimate
-from virest.restoration import planning
+from virest.restoration import capture_estimation
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.frame import _relit
 from virest.restoration.settings import PRESETS
@@ -51,9 +51,9 @@ def test_frames_are_copied_where_the_offset_is_not_known_well_enough(
         0.02, std_s, (0.0,) * 3, (0.01,) * 3, 0.1, 0.1, 0.99, 0.02, 0.0, 0.0, 0.001, None, None, "rotation", 60, 4000,
         True, "",
     )  # fmt: skip
-    monkeypatch.setattr(planning, "estimate_time_offset", lambda *_: estimate)
+    monkeypatch.setattr(capture_estimation, "estimate_time_offset", lambda *_: estimate)
     lens = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
     profile = replace(CameraProfile(640, 480, intrinsics=lens), time_offset_s=None)
     capture = SimpleNamespace(imu=None, frames=())
-    plan = planning._filled(RestorationPlan(profile, PRESETS["balanced"]), capture, [])  # type: ignore[arg-type]
+    plan = capture_estimation._filled(RestorationPlan(profile, PRESETS["balanced"]), capture, [])  # type: ignore[arg-type]
     assert (plan.copy_reason is not None) is copied

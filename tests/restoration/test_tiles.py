@@ -226,14 +226,14 @@ def _with_lamp_tamed(recorded: NDArray[np.float32], kernel: NDArray[np.float32])
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], len(grid.centres_px), 0), 16)
     holes = (recorded >= 1).astype(np.float32)
     numbers = deconvolution.touched(holes)
-    deconvolution.tame(numbers, np.repeat(kernel[None], len(numbers), 0), recorded, 1 - holes, 1.0)
+    deconvolution.remove_highlights(numbers, np.repeat(kernel[None], len(numbers), 0), recorded, 1 - holes, 1.0)
     return deconvolution, numbers
 
 
 def _filtered_with_lamps(deconvolution: TileDeconvolution, recorded: NDArray[np.float32]) -> NDArray[np.float32]:
     ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
     projected = deconvolution.back_projected(recorded)
-    return deconvolution.with_lamps(deconvolution.blend(deconvolution.solutions(projected, ratio, ratio)))
+    return deconvolution.restore_highlights(deconvolution.blend(deconvolution.solutions(projected, ratio, ratio)))
 
 
 def test_a_tamed_tile_knows_a_clipped_lamp_from_its_streak() -> None:

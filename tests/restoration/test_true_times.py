@@ -13,7 +13,7 @@ from virest.capture.records import NO_IMU, STARTUP, Frame
 from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times
-from virest.restoration.planning import applied_extensions, resting_points
+from virest.restoration.capture_estimation import applied_extensions, resting_points
 from virest.restoration.settings import RestorationSettings
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from motion.synthetic_tracks import Setup, recorded
 
 from virest.capture.records import Capture, CaptureMetadata, Frame
-from virest.restoration.planning import UNCHECKED, plan_restoration
+from virest.restoration.capture_estimation import UNCHECKED, plan_restoration
 from virest.restoration.settings import RestorationSettings
 
 STILL = Setup(seed=3, frames=6, width=96, height=128, focal_px=100.0)

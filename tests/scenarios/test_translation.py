@@ -26,8 +26,8 @@ from virest.capture.video import probe_movie, read_frames, read_gray
 from virest.degradation.row_motion import FrameTranslation, frame_times_s
 from virest.evaluation.fidelity import psnr_db
 from virest.restoration.capture import RestorationPlan, restore_frames
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame import RestoredFrame
-from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import PRESETS
 
 pytestmark = pytest.mark.scenario

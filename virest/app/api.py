@@ -107,7 +107,7 @@ class Capture:
 
     def plan(self, preset: str = "balanced", **settings: Any) -> RestorationPlan:
         """What restoring this capture takes: the profile with unknown values filled in, translations, warnings."""
-        from virest.restoration.planning import plan_restoration
+        from virest.restoration.capture_estimation import plan_restoration
 
         composed = _settings(preset, settings)
         if composed not in self._plans:

@@ -14,16 +14,16 @@ import numpy as np
 from virest.app.console import table
 from virest.app.outputs import output_error, write_whole
 from virest.calibration.geometry import FRAME_LAG, NO_FINDING, CalibratedValue, GeometryCalibration, calibrate_geometry
-from virest.calibration.held_fixed import OPTIONAL
+from virest.calibration.unfitted_parameters import OPTIONAL
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
 from virest.camera.profile import CameraProfile, format_profile, load_yaml_mapping, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import CalibrationError, OutputError
+from virest.motion.frame_selection import high_motion_frames
 from virest.motion.guide_choice import track_guided
-from virest.motion.lively_frames import lively_frames
-from virest.motion.shared_out import Each, one_by_one
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.report.words import residual_words
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
@@ -116,7 +116,7 @@ def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str
 
 def choose_frames(capture: Capture, profile: CameraProfile, with_startup: bool = False) -> list[int]:
     """Movie indices to track, rising: every usable frame, or lively runs of them; the start-up's where asked for."""
-    chosen = lively_frames(capture.frames, capture.imu, MAX_FRAMES, profile.time_offset_s or 0.0)
+    chosen = high_motion_frames(capture.frames, capture.imu, MAX_FRAMES, profile.time_offset_s or 0.0)
     if with_startup:
         chosen += [frame.index for frame in capture.frames if frame.only_startup]
     return sorted(set(chosen))
@@ -138,7 +138,7 @@ def run_calibration(
     plan: CalibrationPlan,
     output: CalibrationOutput,
     progress: Callable[[int], Any] | None = None,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> tuple[Json, str]:
     """Track, fit and write; returns the mapping for ``--json`` and the table for people.
 
@@ -154,7 +154,7 @@ def run_calibration(
 
 
 def find_calibration(
-    plan: CalibrationPlan, progress: Callable[[int], Any] | None = None, each: Each = one_by_one
+    plan: CalibrationPlan, progress: Callable[[int], Any] | None = None, each: ParallelMap = one_by_one
 ) -> tuple[Json, GeometryCalibration, ImuNoise | None]:
     """Track and fit; the mapping for ``--json``, and what it was made from.  Raises CalibrationError."""
     step = progress or (lambda _: None)

@@ -31,7 +31,7 @@ from virest.diagnosis.restoration_gain import (
     pairs_to_keep_back,
 )
 from virest.errors import OutputError, VirestError
-from virest.motion.shared_out import Each, one_by_one
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
 from virest.report.words import residual_words
@@ -94,7 +94,7 @@ class Source:
 
 
 def run_diagnosis(
-    path: str, options: DiagnosisOptions, progress: Progress | None = None, each: Each = one_by_one
+    path: str, options: DiagnosisOptions, progress: Progress | None = None, each: ParallelMap = one_by_one
 ) -> DiagnosisOutcome:
     """Diagnose one capture and write DIR/<capture>/diagnosis.json, extended.yaml and figures.
 
@@ -124,7 +124,7 @@ def find_diagnosis(path: Path, config: Path | None = None) -> Json:
     return {**facts, "extended_profile": profile_mapping(found.extended_profile), "residuals": found.residuals}
 
 
-def _found_and_judged(source: Source, say: Progress, each: Each) -> tuple[Diagnosis, RestorationGain]:
+def _found_and_judged(source: Source, say: Progress, each: ParallelMap) -> tuple[Diagnosis, RestorationGain]:
     """What is wrong, and what mending it does to pictures that no fit has seen."""
     firsts = pairs_to_keep_back(source.capture, source.profile)
     kept_back = [first + step for first in firsts for step in (0, 1)]
@@ -135,7 +135,9 @@ def _found_and_judged(source: Source, say: Progress, each: Each) -> tuple[Diagno
     return found, gain
 
 
-def climb(source: Source, progress: Progress, each: Each = one_by_one, kept_back: Collection[int] = ()) -> Diagnosis:
+def climb(
+    source: Source, progress: Progress, each: ParallelMap = one_by_one, kept_back: Collection[int] = ()
+) -> Diagnosis:
     """The ladder itself; kept_back: movie indices of frames that no fit is to see."""
     from virest.diagnosis.ladder import diagnose_capture
 
@@ -292,7 +294,7 @@ def _plain_std(std: Any) -> Any:
 
 
 def draw_figures(
-    capture: Capture, found: Diagnosis, each: Each = one_by_one
+    capture: Capture, found: Diagnosis, each: ParallelMap = one_by_one
 ) -> tuple[dict[str, bytes], list[list[str]]]:
     """PNG files by their path below the capture's folder, and the paths that belong to each cause."""
     drawings: dict[str, tuple[Any, ...]] = {}

@@ -22,8 +22,8 @@ from virest.errors import CaptureError, OutputError
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame import RestoredFrame
-from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import RestorationSettings
 
 Picture = NDArray[np.uint8]

@@ -566,7 +566,7 @@ def _is_killed(error: Exception) -> bool:
     return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
 
 
-class Ahead(Generic[Result]):
+class PrefetchedCalls(Generic[Result]):
     """Calls whose results are wanted one after the other; workers begin some of them before it is their turn.
 
     A call that was lost with its worker is tried once more, alone; lost again, it raises RestorationError.

@@ -30,7 +30,7 @@ from virest.errors import CaptureError, VirestError
 from virest.motion.recorder_stall import at_shown_times, fit_stall, stall_window
 from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
-from virest.restoration.planning import plan_restoration
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.undistortion import require_undistortable
 

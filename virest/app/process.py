@@ -14,7 +14,7 @@ from virest.app import console
 from virest.app.account import PARTLY_FAILED, failure_account, run_account, run_totals
 from virest.app.cluster import is_lost
 from virest.app.finish import Finished, finish_pictures, require_finishable
-from virest.app.jobs import Ahead, Segment, Workers, cut_frames, make_segment, run_segments
+from virest.app.jobs import PrefetchedCalls, Segment, Workers, cut_frames, make_segment, run_segments
 from virest.app.names import shard_of
 from virest.app.outcome import CaptureOutcome, summary
 from virest.app.outputs import (
@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class _Turn:
+class CaptureSlot:
     """One of the captures of a call."""
 
     path: str
@@ -56,7 +56,7 @@ class _Turn:
     number: int = 0
     among: int = 1
     """How many captures there are."""
-    ahead: Ahead[Planned] | None = None
+    ahead: PrefetchedCalls[Planned] | None = None
     """The workers that plan; None: it is done here."""
 
     def begin_next(self) -> None:
@@ -90,7 +90,7 @@ def process_captures(paths: list[str], options: ProcessOptions, shard: tuple[int
         ahead = _planned_ahead(paths, names, options, workers)
         for number, (path, name) in enumerate(zip(paths, names, strict=True)):
             try:
-                turn = _Turn(path, name, number, len(paths), ahead)
+                turn = CaptureSlot(path, name, number, len(paths), ahead)
                 outcomes.append(_process(turn, options, workers))
                 codes.append(outcomes[-1].exit_code)
             except (BrokenPipeError, SettingsError, MemoryError) as error:
@@ -126,10 +126,10 @@ def _require_out(out: Path) -> None:
 
 def process_capture(path: str, name: str, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
     """Process one capture into OUT/<name>. One that cannot be processed leaves its account there all the same."""
-    return _process(_Turn(path, name), options, workers)
+    return _process(CaptureSlot(path, name), options, workers)
 
 
-def _process(turn: _Turn, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
+def _process(turn: CaptureSlot, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
     """Process the capture whose turn it is, and account for it if that cannot be."""
     began = time.perf_counter()
     planned = Planned()
@@ -152,7 +152,7 @@ def _process(turn: _Turn, options: ProcessOptions, workers: Workers) -> CaptureO
 
 
 def _process_planned(
-    turn: _Turn, planned: Planned, options: ProcessOptions, workers: Workers, seconds: float
+    turn: CaptureSlot, planned: Planned, options: ProcessOptions, workers: Workers, seconds: float
 ) -> CaptureOutcome:
     """Have a planned capture's segments done; ``seconds`` went into its plan."""
     began = time.perf_counter() - seconds
@@ -180,7 +180,7 @@ def _process_planned(
 
 def _planned_ahead(
     paths: list[str], names: list[str], options: ProcessOptions, workers: Workers
-) -> Ahead[Planned] | None:
+) -> PrefetchedCalls[Planned] | None:
     """The captures' plans, made by the workers; None where they are better made here, each at its turn.
 
     A cluster's workers need not see the file of --config.
@@ -188,10 +188,14 @@ def _planned_ahead(
     if len(paths) == 1 or workers.here or (options.scheduler is not None and options.config is not None):
         return None
     if options.scheduler is None:
-        return Ahead(plan_elsewhere, [(path, name, options) for path, name in zip(paths, names, strict=True)], workers)
+        return PrefetchedCalls(
+            plan_elsewhere, [(path, name, options) for path, name in zip(paths, names, strict=True)], workers
+        )
     apart = dataclasses.replace(options, out=options.out.absolute())  # a worker may stand in another folder
     places = [str(locate(path).absolute()) for path in paths]
-    return Ahead(plan_elsewhere, [(place, name, apart) for place, name in zip(places, names, strict=True)], workers)
+    return PrefetchedCalls(
+        plan_elsewhere, [(place, name, apart) for place, name in zip(places, names, strict=True)], workers
+    )
 
 
 def _run(
@@ -295,7 +299,9 @@ def _in_order(
     return give
 
 
-def _leave_account(turn: _Turn, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float) -> None:
+def _leave_account(
+    turn: CaptureSlot, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float
+) -> None:
     """Write down why a capture could not be processed, where no run stands in its folder.
 
     A single mistyped path writes no run.json.

@@ -20,7 +20,7 @@ from virest.errors import CaptureError, OutputError, SettingsError, VirestError
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import vector_from_rotation
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
-from virest.restoration.planning import plan_restoration
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.settings import PRESETS, RestorationSettings
 from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
 from virest.simulation.recording import RecordingOptions, write_recording

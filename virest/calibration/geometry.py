@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from virest.calibration.held_fixed import OPTIONAL, HeldValue, held_notes, held_values
 from virest.calibration.physical_limits import limit_reasons
+from virest.calibration.unfitted_parameters import OPTIONAL, HeldValue, held_notes, held_values
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples

@@ -22,17 +22,7 @@ from virest.calibration.physical_limits import is_depth
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
 from virest.diagnosis.catalogue import FALSE_ALARM, MAX_P
-from virest.diagnosis.findings import GEOMETRY, JOINED, Finding, HeldOutGain, ParameterChange, Rival, Rung
-from virest.diagnosis.geometric_effects import GeometricEffect
-from virest.diagnosis.geometric_evidence import (
-    KNOWN_DEPTH_STD,
-    Evidence,
-    Model,
-    base_scene,
-    capped_rms,
-    depth_of,
-)
-from virest.diagnosis.trials import (
+from virest.diagnosis.cross_validation import (
     JUDGE_POINTS,
     Judged,
     Screened,
@@ -46,9 +36,19 @@ from virest.diagnosis.trials import (
     screen,
     t_ratio,
 )
+from virest.diagnosis.findings import GEOMETRY, JOINED, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.geometric_effects import GeometricEffect
+from virest.diagnosis.geometric_evidence import (
+    KNOWN_DEPTH_STD,
+    Evidence,
+    Model,
+    base_scene,
+    capped_rms,
+    depth_of,
+)
 from virest.motion import profile_terms as terms_of
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.recorder_lag import Schedule
-from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term, TrackFit
 from virest.motion.track_model import TrackTable
 from virest.motion.tracking_bias import bias_std
@@ -146,7 +146,7 @@ def climb(
     far: FarClock | None = None,
     progress: Callable[[float], None] | None = None,
     max_rungs: int = MAX_RUNGS,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> GeometricVerdict:
     """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
 
@@ -159,7 +159,7 @@ def climb(
     start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
     model, notes = _with_unknowns(evidence, start)
     nominal_model = model
-    course = _Course(evidence, nominal, lags, far or FarClock(), each)
+    course = SearchContext(evidence, nominal, lags, far or FarClock(), each)
     say(0.1)
     path, fork = _ascended(course, _Path(model, (), ()), max_rungs)
     say(0.6)
@@ -190,7 +190,7 @@ class _Path:
         return _Path(model, (*self.accepted, *step.accepted), (*self.rungs, entered))
 
 
-def _ascended(course: _Course, path: _Path, max_rungs: int) -> tuple[_Path, _Path | None]:
+def _ascended(course: SearchContext, path: _Path, max_rungs: int) -> tuple[_Path, _Path | None]:
     """The path to its end, and the one that leaves it where it first might as well have gone another way."""
     fork: tuple[_Path, _Step, Rung] | None = None
     while len(path.rungs) < max_rungs:
@@ -272,14 +272,14 @@ def _refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, Tra
 
 
 @dataclass(frozen=True, slots=True)
-class _Course:
+class SearchContext:
     """What is the same on all rungs."""
 
     evidence: Evidence
     nominal: CameraProfile
     lags: Sequence[Schedule]
     far: FarClock
-    each: Each
+    each: ParallelMap
     among: frozenset[str] | None = None
     """Names of the causes that may enter; None: all."""
 
@@ -335,7 +335,7 @@ class _Step:
     """Of the held-out loss that it takes away."""
 
 
-def _rung(course: _Course, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, _Step | None, Rung]:
+def _rung(course: SearchContext, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, _Step | None, Rung]:
     """What enters, what might have entered as well, and the rung."""
     tried = {entry.name for entry in accepted}
     nothing = Candidate("", model, (), None)
@@ -406,7 +406,7 @@ def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: floa
 
 
 def _best_pair(
-    course: _Course, model: Model, tried: set[str], base: Screened, better: Sequence[Screened]
+    course: SearchContext, model: Model, tried: set[str], base: Screened, better: Sequence[Screened]
 ) -> tuple[_Step | None, _Step | None]:
     """Two causes that gain together what neither does alone, while points are far from where the model puts them.
 

@@ -13,14 +13,22 @@ import numpy as np
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
-from virest.diagnosis.alike import as_exposure, exposed, exposure_hypothesis, merged, one_exposure, stamped
+from virest.diagnosis.ambiguities import (
+    as_exposure,
+    exposed,
+    exposure_hypothesis,
+    merged,
+    offset_as_timestamp,
+    one_exposure,
+)
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
-from virest.diagnosis.light_values import settle_light
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
-from virest.diagnosis.points import (
+from virest.diagnosis.refit_photometry import settle_light
+from virest.diagnosis.residual_tests import points_left, remaining_structure, residuals
+from virest.diagnosis.tracking_stage import (
     MIN_PAIRS,
     TrackedPoints,
     at_model_times,
@@ -31,14 +39,13 @@ from virest.diagnosis.points import (
     pulsing,
     with_null_values,
 )
-from virest.diagnosis.remaining import points_left, remaining_structure, residuals
 from virest.errors import CaptureError
 from virest.motion.guide_choice import find_guide, track_guided
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import observe_tracks
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.recorder_lag import lag_schedules
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_model import predict
 from virest.motion.tracking import TrackPair, track_pairs
 
@@ -53,7 +60,7 @@ def diagnose_capture(
     pictures: Reader,
     gray: Reader,
     progress: Progress | None = None,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
     kept_back: Collection[int] = (),
 ) -> Diagnosis:
     """Climb the ladder on one capture; pictures gives (index, RGB), gray (index, luma) of the frames asked for.
@@ -66,7 +73,7 @@ def diagnose_capture(
     points, notes = _tracked(capture, profile, gray, each, frozenset(kept_back))
     say("points", 0.15)
     first = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
-    story = _Story(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each)
+    story = DiagnosisSession(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each)
     story.kept_back = frozenset(kept_back)
     say("brightness", 0.5)
     story.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
@@ -82,7 +89,7 @@ def diagnose_capture(
 
 
 def _tracked(
-    capture: Capture, profile: CameraProfile, gray: Reader, each: Each, kept_back: frozenset[int]
+    capture: Capture, profile: CameraProfile, gray: Reader, each: ParallelMap, kept_back: frozenset[int]
 ) -> tuple[TrackedPoints, list[str]]:
     """Points of the frames that are followed, those of the start-up too; pairs with a frame kept back are left out."""
     indices = frames_to_follow(capture, profile)
@@ -112,7 +119,7 @@ def _seen(pairs: Sequence[TrackPair], kept_back: frozenset[int]) -> list[TrackPa
 
 
 @dataclass(slots=True)
-class _Story:
+class DiagnosisSession:
     """What has been found so far."""
 
     capture: Capture
@@ -127,7 +134,7 @@ class _Story:
     findings: list[Finding] = field(default_factory=list)
     """Of the points, and what blur made of them."""
     notes: list[str] = field(default_factory=list)
-    each: Each = one_by_one
+    each: ParallelMap = one_by_one
     kept_back: frozenset[int] = frozenset()
     """Movie indices of frames that only brightness is to see."""
 
@@ -165,7 +172,9 @@ class _Story:
             )
             self.geometric = self.points.climbed(progress)
         self.geometric = self.points.described(self.geometric, self.light.profile)
-        self.findings = stamped(self.geometric, findings_of(self.geometric), self.points.observed.exposure_s)
+        self.findings = offset_as_timestamp(
+            self.geometric, findings_of(self.geometric), self.points.observed.exposure_s
+        )
 
     def judge_blur(self, gray: Reader, progress: Callable[[float], None]) -> None:
         """Blur, where points go where the model says; it tells an exposure's length from an offset."""
@@ -186,7 +195,7 @@ class _Story:
             exposure = as_exposure(self.findings, scale, float(np.median(exposure_s)))
             points = replace(self.points, start=exposed(self.points.start, scale))
             self.geometric = points.described(points.climbed(progress), self.light.profile)
-            self.findings = [exposure, *stamped(self.geometric, findings_of(self.geometric), exposure_s)]
+            self.findings = [exposure, *offset_as_timestamp(self.geometric, findings_of(self.geometric), exposure_s)]
         if any(finding.name == "exposure_time" for finding in self.findings):
             self.blur, is_exposure = one_exposure(self.blur), True
         extended = merged(self.geometric.model.profile, self.light.profile, self.blur.profile, is_exposure)

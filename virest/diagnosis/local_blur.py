@@ -40,7 +40,7 @@ from virest.diagnosis.local_blur_spectra import (
     observe_pair,
     ring_of_bin,
 )
-from virest.motion.shared_out import Each, one_by_one
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -149,7 +149,7 @@ def look_for_blur(
     capture: Capture,
     profile: CameraProfile,
     trajectory: Trajectory,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> BlurObservations:
     """Measure the frames of :func:`frames_to_read` of a capture, part by part; the same as in one stream of them."""
     wanted, curve = frames_to_read(capture), profile.response or ResponseCurve("srgb")

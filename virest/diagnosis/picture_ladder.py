@@ -20,19 +20,19 @@ from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
 from virest.diagnosis.catalogue import MAX_P
-from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
-from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
-from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
-from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
-from virest.diagnosis.photometry_mixing import (
+from virest.diagnosis.curve_from_blur import (
     MixingEstimate,
     MixingEvidence,
     estimate_mixing,
     judge_mixing,
     observe_mixing,
 )
+from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
+from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
+from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
-from virest.motion.shared_out import Each, one_by_one
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ def climb_light(
     profile: CameraProfile,
     trajectory: Trajectory,
     rgb: Reader,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
     """Find what changes brightness, on a stretch of a long capture; a gain for each frame then in all of it."""
     looked = light_stretch(frames)
@@ -149,7 +149,7 @@ def climb_photometry(
     profile: CameraProfile,
     trajectory: Trajectory,
     rgb: Reader,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
     """Find what changes the brightness of patches; frames at their true times."""
     verdict = PictureVerdict(profile)
@@ -170,7 +170,7 @@ def climb_photometry(
 
 
 def climb_observations(
-    verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int, each: Each = one_by_one
+    verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int, each: ParallelMap = one_by_one
 ) -> None:
     """Enter into the verdict what the brightness of patches says."""
     nominal = verdict.profile
@@ -208,7 +208,7 @@ def _rung(
     plain: PhotometricFit,
     effects: Sequence[PhotometricEffect],
     accepted: list[PhotometricEffect],
-    each: Each,
+    each: ParallelMap,
 ) -> tuple[Rung, PhotometricEffect | None, PhotometricFit]:
     """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part."""
     before = normalised_rms(observations.with_memory(plain.memory), plain.profile)[0]
@@ -316,7 +316,7 @@ def judge_curve(
     frames: Sequence[Frame],
     trajectory: Trajectory,
     pictures: Reader,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
     """Gamma or black level from how blur mixes light, where nothing else tells them; paths must be right by now."""
     verdict = PictureVerdict(profile)
@@ -383,7 +383,7 @@ def climb_blur(
     trajectory: Trajectory,
     gray: Reader,
     exposure_hypothesis: float | None,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> tuple[PictureVerdict, bool]:
     """Find a wrong exposure and defocus from local blur; also whether a time offset is really a wrong exposure.
 

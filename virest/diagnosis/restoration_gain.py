@@ -35,12 +35,12 @@ from virest.motion.guidance import GyroGuide, MapBetween, map_between
 from virest.motion.guide_choice import find_guide
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
-from virest.motion.shared_out import Each, one_by_one
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.tracking import Guide, TrackPair, track_pairs
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame import RestoredFrame
-from virest.restoration.planning import plan_restoration
 from virest.restoration.settings import PRESETS, RestorationSettings
 
 Array = NDArray[np.float64]
@@ -142,7 +142,7 @@ def measure_restoration_gain(
     pictures: Reader,
     gray: Reader,
     settings: RestorationSettings = PRESETS["balanced"],
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
     firsts: Sequence[int] | None = None,
 ) -> RestorationGain:
     """Restore a few pairs of neighbours with both profiles and compare; pictures: RGB by index, gray: luma.
@@ -252,7 +252,7 @@ def _restored(
     recorded: dict[int, Picture],
     gray: Reader,
     settings: RestorationSettings,
-    each: Each,
+    each: ParallelMap,
 ) -> list[_Restoration]:
     """What each profile makes of the recorded frames."""
     planned = [_planned(capture, profile, gray, settings) for profile in profiles]

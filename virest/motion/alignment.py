@@ -18,6 +18,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
+from virest.motion.frame_rotations import FrameRotations, OffsetScan, gyro_turns, picture_turns, scan_offsets
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import guessed_lens
 from virest.motion.point_fit import (
@@ -32,7 +33,6 @@ from virest.motion.point_fit import (
 from virest.motion.row_clock import RowClock
 from virest.motion.tracking import TrackPair
 from virest.motion.trajectory import Trajectory
-from virest.motion.turns import OffsetScan, PictureTurns, gyro_turns, picture_turns, scan_offsets
 
 log = logging.getLogger(__name__)
 
@@ -183,7 +183,7 @@ class _Observed:
     exposure_known: bool
     lens: Intrinsics
     profile: CameraProfile
-    turns: PictureTurns
+    turns: FrameRotations
     trajectory: Trajectory
 
     @property

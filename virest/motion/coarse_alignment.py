@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.motion.frame_rotations import FrameRotations, gyro_turns
 from virest.motion.integration import integrate_gyro
-from virest.motion.turns import PictureTurns, gyro_turns
 
 Array = NDArray[np.float64]
 STEP_S = 0.004
@@ -32,7 +32,7 @@ SAME_VALLEY_S = 0.06
 SKEWS = (-0.0045, -0.003, -0.0015, 0.0015, 0.003, 0.0045)
 SKEW_GAIN = 0.8
 """Another clock rate is taken if it leaves less than this part of what the profile's leaves unexplained."""
-SOFT = 3.0
+SOFTENING = 3.0
 """Pairs further off than this many typical deviations are held back."""
 
 
@@ -58,7 +58,7 @@ class CoarseAlignment:
 
 
 def align_coarsely(
-    turns: PictureTurns, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
+    turns: FrameRotations, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
 ) -> CoarseAlignment | None:
     """Search offsets within ± search_s of the profile's; None if the inertial data cover the pairs nowhere."""
     centre = profile.time_offset_s or 0.0
@@ -93,7 +93,7 @@ def align_coarsely(
 
 
 def align_with_skew(
-    turns: PictureTurns, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
+    turns: FrameRotations, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
 ) -> tuple[CoarseAlignment, float] | None:
     """Align coarsely at several clock skews; the profile's stays unless another fits much better."""
     best = align_coarsely(turns, imu, profile, search_s)
@@ -142,7 +142,7 @@ def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tupl
 def _soft_weights(seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array) -> Array:
     squared = ((seen - gyro @ np.swapaxes(rotation, -1, -2)) ** 2).sum(axis=-1)
     scale = np.maximum(np.median(squared, axis=1, keepdims=True), 1e-14)
-    return inside / (1 + squared / (SOFT**2 * scale))
+    return inside / (1 + squared / (SOFTENING**2 * scale))
 
 
 def _explained(seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.track_model import SMALLEST_DEPTH, Ground, TrackTable, centre, seen_s, turned
+from virest.motion.track_model import SMALLEST_DEPTH, IntegratedMotion, TrackTable, centre, seen_s, turned
 
 Array = NDArray[np.float64]
 PASSES = 3
@@ -66,7 +66,7 @@ class TriangulatedPoints:
 
 
 @dataclass(frozen=True, slots=True)
-class Sights:
+class Sightings:
     """Triangulated points with how they were seen first."""
 
     points: TriangulatedPoints
@@ -84,9 +84,9 @@ class Sights:
     def __len__(self) -> int:
         return len(self.pair)
 
-    def chosen(self, use: NDArray[np.bool_]) -> Sights:
+    def chosen(self, use: NDArray[np.bool_]) -> Sightings:
         """Some of the points."""
-        return Sights(
+        return Sightings(
             self.points.chosen(use), self.pair[use], self.from_m[use], self.rays[use], self.above_per_m[use],
             self.across[use],
         )  # fmt: skip
@@ -116,7 +116,7 @@ class FrameDepth:
         return replace(self, depth_m=1 / inverse, std_m=relative / inverse, relief=relief)
 
 
-def triangulate(known: Ground, scene: InertialMotion, table: TrackTable) -> TriangulatedPoints:
+def triangulate(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> TriangulatedPoints:
     """Find the inverse depth of every matched point whose parallax tells it and that lies about the plane.
 
     Points before which the camera hardly moved, or with an absurd depth, are left out.
@@ -127,7 +127,7 @@ def triangulate(known: Ground, scene: InertialMotion, table: TrackTable) -> Tria
     return sights.points.chosen(near & (sights.points.std_per_m < MAX_RELATIVE_STD * expected))
 
 
-def triangulate_relief(known: Ground, scene: InertialMotion, table: TrackTable) -> Sights:
+def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> Sightings:
     """Find the inverse depth of every matched point whose parallax tells it, however far from the plane.
 
     A point that leaves the line of its parallax is a mismatch or moves on its own.
@@ -144,7 +144,7 @@ def triangulate_relief(known: Ground, scene: InertialMotion, table: TrackTable) 
     return replace(sights, points=replace(sights.points, place_m=place, inverse_depth_per_m=far))
 
 
-def _sights(known: Ground, scene: InertialMotion, table: TrackTable, passes: int, reach: float) -> Sights:
+def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, passes: int, reach: float) -> Sightings:
     """Gauss-Newton on one unknown a point, from the plane of its window, at most ``reach`` of it in a pass.
 
     The standard deviation is the pair's tracking noise over the parallax.
@@ -168,7 +168,7 @@ def _sights(known: Ground, scene: InertialMotion, table: TrackTable, passes: int
     depth, std, across = view.inverse_depths(expected, passes, reach)
     safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
     points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], first_s, depth, std)
-    return Sights(points, table.pair, centre_1, rays, depth - expected, across)
+    return Sightings(points, table.pair, centre_1, rays, depth - expected, across)
 
 
 @dataclass(frozen=True, slots=True)

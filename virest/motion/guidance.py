@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.motion.observed_tracks import frame_times
-from virest.motion.track_model import Ground, ground, predict, track_table
+from virest.motion.track_model import IntegratedMotion, ground, predict, track_table
 from virest.motion.tracking import Picture, TrackPair
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 1.0, 0.2, 2.0
 class GyroGuide:
     """A camera that turns as the gyroscope says, at the offset of its profile."""
 
-    known: Ground
+    known: IntegratedMotion
     stamp_s: Array
     """(frames,) by movie index, camera clock from stamp_0; NaN where the stamp or the log is not to be relied on."""
     exposure_s: Array

@@ -24,14 +24,14 @@ from virest.capture.join import median_period_s
 from virest.capture.records import Capture, Frame
 from virest.motion.alignment import choose_pairs
 from virest.motion.coarse_alignment import axis_maps
+from virest.motion.frame_rotations import gyro_turns
 from virest.motion.guidance import GyroGuide, gyro_guide
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import frame_times
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.row_clock import RowClock, row_time_s
-from virest.motion.shared_out import Each, one_by_one
 from virest.motion.tracking import Picture, TrackPair, track_frames
 from virest.motion.trajectory import Trajectory
-from virest.motion.turns import gyro_turns
 
 Array = NDArray[np.float64]
 Reader = Callable[[Sequence[int]], Iterable[tuple[int, Picture | None]]]
@@ -92,7 +92,7 @@ def track_guided(
     profile: CameraProfile,
     gray: Reader,
     frames: Sequence[int],
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
     progress: Callable[[int], None] | None = None,
 ) -> list[TrackPair]:
     """Follow points through frames (movie indices, rising) as :func:`track_frames` does, guided where that may be."""

@@ -12,11 +12,11 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
+from virest.motion.frame_rotations import FrameRotations, picture_turns
 from virest.motion.row_clock import RowClock
 from virest.motion.track_model import TrackTable, track_table
 from virest.motion.track_noise import step_noise_px
 from virest.motion.tracking import TrackPair
-from virest.motion.turns import PictureTurns, picture_turns
 
 Array = NDArray[np.float64]
 MIN_TRACKS = 15
@@ -50,7 +50,7 @@ class ObservedTracks:
         """Number of tracked points."""
         return sum(map(len, self.pairs))
 
-    def turns(self, profile: CameraProfile) -> PictureTurns:
+    def turns(self, profile: CameraProfile) -> FrameRotations:
         """Rotation of every pair, at the middle of the readout and exposure, camera clock."""
         clock = RowClock(profile)
         middle = clock.camera_time_s(clock.middle_s(self.stamp_s, self.exposure_s))

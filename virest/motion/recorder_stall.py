@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import STALL, Capture
+from virest.motion.frame_rotations import gyro_turns, picture_rotation
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import MIN_TRACKS
 from virest.motion.row_clock import RowClock
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.trajectory import Trajectory
-from virest.motion.turns import gyro_turns, picture_rotation
 
 Array = NDArray[np.float64]
 CONTEXT = 8

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from virest.motion.depth import Sights
+from virest.motion.depth import Sightings
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief, angles
 from virest.motion.track_model import SMALLEST_DEPTH
@@ -109,7 +109,7 @@ def picture_grid(lens: MovingLens, time_s: float) -> Grid:
 # ── how rough ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def measure_roughness(sights: Sights, grid: Grid) -> Roughness | None:
+def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
     """Fit the variogram of a window's points to differences between points of the same frame; None: too few.
 
     ½ Δ² less the two points' own variances, averaged over classes of distance; sill and nugget by least squares for
@@ -199,7 +199,7 @@ class Before:
         return Before(self.place[use], self.above_per_m[use], self.variance[use])
 
 
-def points_before(sights: Sights, view: View, prior: ReliefPrior) -> Before:
+def points_before(sights: Sightings, view: View, prior: ReliefPrior) -> Before:
     """Move the window's points into a frame's camera axes.
 
     A point seen from elsewhere may be hidden by now: the surface that is seen in its place has been displaced against
@@ -221,7 +221,7 @@ def points_before(sights: Sights, view: View, prior: ReliefPrior) -> Before:
     return Before(place, inverse - rays @ view.plane_per_m, std**2 + rough.lost(parallax))
 
 
-def _seen_nearby(sights: Sights, view: View, prior: ReliefPrior) -> Index:
+def _seen_nearby(sights: Sightings, view: View, prior: ReliefPrior) -> Index:
     """Numbers of the points seen from about here: by pairs, the nearest first.
 
     All pairs between which the sill's parallax is below NEARBY of a cell, or as many as give ENOUGH points.
@@ -372,7 +372,7 @@ def _cells(place: Array, grid: Grid) -> tuple[Index, NDArray[np.bool_]]:
 class WindowRelief:
     """What stands out of the planes of a window."""
 
-    sights: Sights
+    sights: Sightings
     """All tracked points of the window."""
     prior: ReliefPrior
 
@@ -382,7 +382,7 @@ class WindowRelief:
         return fit_surface(before, self.prior) if len(before.place) >= MIN_POINTS else None
 
 
-def find_relief(sights: Sights, grid: Grid, view: Callable[[float], View]) -> WindowRelief | None:
+def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) -> WindowRelief | None:
     """Measure how rough a window's scene is, and keep the surfaces if they tell held-out points better.
 
     view: the camera at a time, before its frame's plane.

@@ -21,7 +21,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
-from virest.motion.track_model import Ground, Index, Prediction, TrackTable, ground, predict, with_profile
+from virest.motion.track_model import Index, IntegratedMotion, Prediction, TrackTable, ground, predict, with_profile
 from virest.motion.travel_direction import find_directions, without_directions
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class CovarianceModel:
     """What the covariance of values, or of anything linear in them, is made of: sandwich H⁻¹ S H⁻¹ and prior.
 
     A correction along a value must not be carried over to combinations in which values' errors cancel, such as the
@@ -129,7 +129,7 @@ class TrackFit:
     """(k,) total change of the terms' values from the starting profile."""
     covariance: Array
     """(k + scene, k + scene): the terms first."""
-    doubt: Doubt
+    doubt: CovarianceModel
     """What the covariance is made of, for what is linear in the values."""
     scale: float
     """Robust standard deviation of the whitened differences; 1 where the model explains all."""
@@ -145,7 +145,7 @@ class TrackFit:
     """(k,) on how many blocks of time each value of the terms rests: (Σ share)² / Σ share² of its information."""
     cost: float
     """Σ of the robust loss over the points, whitened: comparable between fits of one table."""
-    ground: Ground
+    ground: IntegratedMotion
     seconds: Array
     """(n,) when the second points were seen, IMU clock."""
     noise_px: Array
@@ -205,7 +205,9 @@ class TrackFit:
         return self.change[self.slices[name]]
 
 
-def start_scene(imu: ImuSamples, known: Ground, table: TrackTable, inverse_depth_per_m: float) -> InertialMotion:
+def start_scene(
+    imu: ImuSamples, known: IntegratedMotion, table: TrackTable, inverse_depth_per_m: float
+) -> InertialMotion:
     """Begin at rest before a plane across the first sight, with gravity as the mean specific force says."""
     origin = np.asarray(known.profile.imu_time_s(table.origin_s))
     axis = known.trajectory.orientation(origin)[:, :, 2]
@@ -225,7 +227,7 @@ def fit_tracks(
     terms: Sequence[Term],
     scene: Motion | None = None,
     *,
-    known: Ground | None = None,
+    known: IntegratedMotion | None = None,
     blocks: int = 12,
     max_iterations: int = MAX_ITERATIONS,
     covariances: bool = True,
@@ -301,7 +303,7 @@ def _descend(
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    known: Ground
+    known: IntegratedMotion
     scene: Motion | None
     change: Array
     depth_spread: float
@@ -526,7 +528,7 @@ def _conclude(table: TrackTable, terms: tuple[Term, ...], state: _State, system:
     )  # fmt: skip
 
 
-def _doubt(table: TrackTable, system: _System, inverse: Array, blocks: int) -> Doubt:
+def _doubt(table: TrackTable, system: _System, inverse: Array, blocks: int) -> CovarianceModel:
     """Scatter of the points' pull on the values, by blocks of time and by parts of the picture.
 
     Points of one moment share its errors, and points of one part of the picture share the relief that stands there as
@@ -534,13 +536,13 @@ def _doubt(table: TrackTable, system: _System, inverse: Array, blocks: int) -> D
     """
     count = min(blocks, table.n_pairs)
     if count < MIN_BLOCKS or not inverse.size:
-        return Doubt(inverse)
+        return CovarianceModel(inverse)
     block = table.pair * count // table.n_pairs
     weighted = system.left * (system.weight / system.scale**2)[:, None]
     moved = np.einsum("nki,nk->ni", system.rows, weighted) @ inverse / _true_curvature(system)
     place = _parts_of_picture(table.first_px)
     by_place = _scatter(moved, place) - _scatter(moved, block * PLACES**2 + place)
-    return Doubt(inverse, _scatter(moved, block), by_place, inverse @ (system.prior[:, None] * inverse))
+    return CovarianceModel(inverse, _scatter(moved, block), by_place, inverse @ (system.prior[:, None] * inverse))
 
 
 def _scatter(moved: Array, group: Index) -> Array:

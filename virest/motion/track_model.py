@@ -99,7 +99,7 @@ class TrackTable:
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class IntegratedMotion:
     """What a profile makes of the inertial samples: kept while its gyroscope and lens stay the same."""
 
     profile: CameraProfile
@@ -135,7 +135,7 @@ class Poses:
 
 
 @dataclass(frozen=True, slots=True)
-class Sights:
+class Sightings:
     """Rays through the first points with the stabiliser at rest: the same for every motion of one lens."""
 
     lens: Intrinsics
@@ -158,7 +158,7 @@ class Prediction:
     """How the camera moved between the two sights; None without translation."""
     per_step: Array | None = None
     """(n, 2, 3) change of second_px per unit of the camera's step over a point's depth, world axes; where asked for."""
-    sights: Sights | None = None
+    sights: Sightings | None = None
     """Through which the first points are seen."""
 
     @property
@@ -172,15 +172,17 @@ class Prediction:
         return self.poses.second_s
 
 
-def ground(imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None) -> Ground:
+def ground(
+    imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None
+) -> IntegratedMotion:
     """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier ground."""
     measured = measured or Measured(gyro_polynomials(imu), force_at_samples(imu) if translation else None)
     trajectory = integrate_gyro(imu, profile, measured.gyro)
     displacement = integrate_accelerometer(imu, profile, trajectory, measured.force) if translation else None
-    return Ground(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S), measured)
+    return IntegratedMotion(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S), measured)
 
 
-def with_profile(known: Ground, imu: ImuSamples, profile: CameraProfile) -> Ground:
+def with_profile(known: IntegratedMotion, imu: ImuSamples, profile: CameraProfile) -> IntegratedMotion:
     """Return the ground for another profile; what does not depend on the change is kept."""
     before, kept = known.profile, known
     same = ("gyro_bias_rad_s", "gyro_scale", "p_cam_imu_m")
@@ -211,7 +213,7 @@ def _moves(before: CameraProfile, after: CameraProfile) -> bool:
     return any(getattr(before.extensions, name) != getattr(after.extensions, name) for name in names)
 
 
-def _turned_about(known: Ground, turn: Array) -> Ground:
+def _turned_about(known: IntegratedMotion, turn: Array) -> IntegratedMotion:
     """The ground with the camera's axes turned on the IMU, (3, 3): everything in camera and world axes turns along."""
     way = known.trajectory
     trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, turn @ way.rate_polynomials)
@@ -289,7 +291,12 @@ def pulse_delay_s(profile: CameraProfile, middle_s: Array, exposure_s: Array) ->
 
 
 def predict(
-    known: Ground, table: TrackTable, scene: Motion | None, *, slopes: bool = False, like: Prediction | None = None
+    known: IntegratedMotion,
+    table: TrackTable,
+    scene: Motion | None,
+    *,
+    slopes: bool = False,
+    like: Prediction | None = None,
 ) -> Prediction:
     """Predict the second points (n, 2); scene None: rotation only.
 
@@ -313,7 +320,7 @@ def predict(
     return replace(seen, sights=sights)
 
 
-def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sights | None:
+def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sightings | None:
     """Rays through the first points where they do not depend on the time, an earlier prediction's if the lens is its.
 
     None: the focal length changes.
@@ -322,17 +329,17 @@ def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sig
         return None
     if like is not None and like.sights is not None and like.sights.lens == lens.lens:
         return like.sights
-    return Sights(lens.lens, lens.lens.rays(table.first_px))
+    return Sightings(lens.lens, lens.lens.rays(table.first_px))
 
 
-def _lens_slope(known: Ground, rays: Array, second_s: Array, expected: Array) -> Array:
+def _lens_slope(known: IntegratedMotion, rays: Array, second_s: Array, expected: Array) -> Array:
     """Change (n, 2, 3) of pixels per unit of each part of rays (n, 3)."""
     steps = (known.lens.project(rays + RAY_STEP * axis, second_s) for axis in np.eye(3))
     return np.stack([(step - expected) / RAY_STEP for step in steps], axis=-1)
 
 
-def _poses(known: Ground, table: TrackTable, like: Prediction | None) -> Poses:
-    """Sights and turns of the points; those of an earlier prediction where they are the same."""
+def _poses(known: IntegratedMotion, table: TrackTable, like: Prediction | None) -> Poses:
+    """Sightings and turns of the points; those of an earlier prediction where they are the same."""
     profile, scale = known.profile, known.profile.shutter.exposure_scale
     first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
     second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
@@ -379,7 +386,7 @@ class Moved:
     """(n, 3, k) change of step · inverse depth per entry of the motion's vector."""
 
 
-def _paths(known: Ground, table: TrackTable, scene: InertialMotion, poses: Poses) -> tuple[Paths, Paths]:
+def _paths(known: IntegratedMotion, table: TrackTable, scene: InertialMotion, poses: Poses) -> tuple[Paths, Paths]:
     assert known.displacement is not None
     origin_s = np.asarray(known.profile.imu_time_s(table.origin_s))[table.window]
     first, second = (
@@ -388,7 +395,7 @@ def _paths(known: Ground, table: TrackTable, scene: InertialMotion, poses: Poses
     return first, second
 
 
-def _seen_again(known: Ground, world: Array, poses: Poses, moved: Moved) -> Prediction:
+def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Moved) -> Prediction:
     back, second_s = poses.back, poses.second_s
     rays = turned(back, world + moved.step * moved.inverse_depth[:, None])
     rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)

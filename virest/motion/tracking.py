@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.motion.shared_out import Each, one_by_one
+from virest.motion.parallel import ParallelMap, one_by_one
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -132,7 +132,7 @@ def track_pairs(
 def track_frames(
     gray: Callable[[Sequence[int]], Stream],
     frames: Sequence[int],
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
     progress: Callable[[int], None] | None = None,
     guide: Guide | None = None,
 ) -> list[TrackPair]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.motion.depth import FrameDepth, Sights, TriangulatedPoints, frame_depth, triangulate, triangulate_relief
+from virest.motion.depth import FrameDepth, Sightings, TriangulatedPoints, frame_depth, triangulate, triangulate_relief
 from virest.motion.displacement import Displacement
 from virest.motion.observed_tracks import WINDOW_S, ObservedTracks
 from virest.motion.optics import settling_time_s
@@ -26,7 +26,7 @@ from virest.motion.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT,
 from virest.motion.relief import View, WindowRelief, find_relief, picture_grid
 from virest.motion.scene_motion import InertialMotion
 from virest.motion.track_fit import Term, TrackFit, fit_tracks, start_scene
-from virest.motion.track_model import Ground, TrackTable, centre, ground, with_profile
+from virest.motion.track_model import IntegratedMotion, TrackTable, centre, ground, with_profile
 from virest.motion.tracking_bias import SHARED_RELIEF
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ class Stretch:
     points: TriangulatedPoints
     velocity_floor_m_s: Array
     """(windows,) what tracking's own bias makes of the velocity."""
-    nudged: tuple[Ground, ...]
+    nudged: tuple[IntegratedMotion, ...]
     """The fit's ground with each value of its terms one quotient's step further."""
     reliefs: tuple[WindowRelief | None, ...] = ()
     """By window; None: the plane tells held-out points as well as a surface does."""
@@ -196,14 +196,14 @@ class Stretch:
         nearness_slope[:, own + 3 : own + 6] = rotation[..., 2]
         return velocity, nearness, slope, nearness_slope
 
-    def _seen_from(self, known: Ground, window: int, stamp_s: Array) -> tuple[Array, Array, Array]:
+    def _seen_from(self, known: IntegratedMotion, window: int, stamp_s: Array) -> tuple[Array, Array, Array]:
         """Velocity in camera axes, inverse depth on the optical axis, and R_world_cam, (n, 3), (n,), (n, 3, 3)."""
         time_s = np.asarray(known.profile.imu_time_s(stamp_s))
         rotation = known.trajectory.orientation(time_s)
         velocity = np.einsum("nji,nj->ni", rotation, self._velocity(known, window, time_s))
         return velocity, np.maximum(rotation[..., 2] @ self.scene.plane_per_m[window], 1e-6), rotation
 
-    def _velocity(self, known: Ground, window: int, time_s: Array) -> Array:
+    def _velocity(self, known: IntegratedMotion, window: int, time_s: Array) -> Array:
         moves, scene = known.displacement, self.scene
         assert moves is not None
         origin = np.array([float(known.profile.imu_time_s(self.table.origin_s[window]))])
@@ -512,7 +512,7 @@ def _fit_stretch(
     return replace(stretch, windows=windows, reliefs=reliefs)
 
 
-def _relief(stretch: Stretch, sights: Sights, window: int) -> WindowRelief | None:
+def _relief(stretch: Stretch, sights: Sightings, window: int) -> WindowRelief | None:
     """What stands out of a window's planes, if it tells held-out points better."""
     if not stretch.windows[window].usable:
         return None
@@ -524,7 +524,7 @@ def _relief(stretch: Stretch, sights: Sights, window: int) -> WindowRelief | Non
     return find_relief(sights.chosen(sights.points.window == window), grid, view)
 
 
-def _nudged(fit: TrackFit, imu: ImuSamples) -> tuple[Ground, ...]:
+def _nudged(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
     """The fit's ground with each value of its terms one quotient's step further."""
     steps = [(term, np.diag(term.quotient)[k]) for term in fit.terms for k in range(len(term))]
     return tuple(with_profile(fit.ground, imu, term.change(fit.profile, step)) for term, step in steps)

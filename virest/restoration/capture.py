@@ -1,4 +1,4 @@
-"""A capture: records in, restored frames out, by a plan (see :mod:`planning`): gate, deblur and warp."""
+"""A capture: records in, restored frames out, by a plan (see :mod:`capture_estimation`): gate, deblur and warp."""
 
 from __future__ import annotations
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.degradation.blur import Image
-from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
+from virest.restoration.row_chunks import RowRenderer
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
 """Parts of the unclipped pixels clear of clipped light at which restoring begins and at which it is taken whole;
@@ -78,7 +78,7 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     return masks
 
 
-def unseen_kept(sharp: LevelsOfRows, recorded: NDArray[np.uint8], blurred: BlurredPicture) -> LevelsOfRows:
+def unseen_kept(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: BlurredPicture) -> RowRenderer:
     """The grey levels (height, width, 3) that were recorded where nothing says more.
 
     Among them are some that no light gives, as noise and codec leave them beyond the curve's ends.

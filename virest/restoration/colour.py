@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from virest.degradation.blur import Image
-from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
 from virest.restoration.encoding import grey_levels
 from virest.restoration.neighbours.joint import HALF, NeighbourPicture
+from virest.restoration.row_chunks import RowRenderer
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED
 from virest.restoration.tile_layout import COARSE_OVERLAP, join_neighbours, noise_to_signal, tile_deconvolution
@@ -28,7 +28,7 @@ NEARBY_SIDE, FINE_SIDE = 5, 3
 besides the path to both sides, and for sharp ones."""
 
 
-def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> LevelsOfRows:
+def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> RowRenderer:
     """Grey levels of a sharp luma, in light and perhaps smaller, and the colour differences.
 
     These are restored at half size or less, since a movie stores no more of them, and come back as differences of grey

@@ -10,10 +10,10 @@ import numpy as np
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.motion.coarse_alignment import SKEWS
+from virest.motion.frame_rotations import scan_offsets
 from virest.motion.integration import integrate_gyro
 from virest.motion.observed_tracks import ObservedTracks, guessed_lens, observe_tracks
 from virest.motion.tracking import TrackPair
-from virest.motion.turns import scan_offsets
 from virest.motion.visual_inertial import VisualInertialAlignment
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan
 from virest.restoration.profile_conflict import CONTRADICTED, MIN_PAIRS, Settled, settle_conflict

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import BlurredPicture
+from virest.restoration.row_chunks import RowRenderer
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.tile_methods import by_tile_filter, by_tile_hyper_laplacian
 from virest.restoration.whole_picture import by_global_hyper_laplacian, by_richardson_lucy
 
 
-def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
+def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
     """The sharp picture, through the curve again, at the kernels' anchor."""
-    methods: dict[str, Callable[[BlurredPicture, RestorationSettings], LevelsOfRows]] = {
+    methods: dict[str, Callable[[BlurredPicture, RestorationSettings], RowRenderer]] = {
         "inverse": by_tile_filter,
         "wiener": by_tile_filter,
         "gradient-wiener": by_tile_filter,

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.restoration.bands import bands
+from virest.restoration.row_chunks import bands
 
 Image = NDArray[np.float32]
 Operator = Callable[[Image], Image]

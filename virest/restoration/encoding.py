@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.degradation.blur import Image
-from virest.restoration.bands import bands
+from virest.restoration.row_chunks import bands
 
 _STEPS = 65535
 """Steps of the root of light in the tables: the root is about as steep as a curve, so all of them are much alike."""

@@ -21,7 +21,6 @@ from virest.degradation.light import FrameLight, equivalent_length_px, frame_lig
 from virest.degradation.row_motion import RowMotion
 from virest.degradation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
-from virest.restoration.bands import LevelsOfRows, bands
 from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture
 from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept
 from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
@@ -31,6 +30,7 @@ from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.joint import NeighbourPicture, worth_joining
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.parameters import degradation_parameters, unknown_parameters
+from virest.restoration.row_chunks import RowRenderer, bands
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
@@ -321,7 +321,7 @@ def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) 
 
 
 def _mixed(
-    sharp: LevelsOfRows, recorded: NDArray[np.uint8], part: NDArray[np.float32] | np.float32
+    sharp: RowRenderer, recorded: NDArray[np.uint8], part: NDArray[np.float32] | np.float32
 ) -> NDArray[np.float32]:
     """So much of the sharp picture, the rest recorded, (height, width, 3): grey levels of 255, not rounded.
 

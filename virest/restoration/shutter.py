@@ -15,7 +15,7 @@ from virest.degradation.warp import (
     seen_by_rows,
     straightened_points,
 )
-from virest.restoration.bands import bands
+from virest.restoration.row_chunks import bands
 from virest.restoration.undistortion import distorted_points
 
 USUAL_SPACING_PX, LEAST_SPACING_PX = 16, 4

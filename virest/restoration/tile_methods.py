@@ -10,11 +10,11 @@ import numpy as np
 
 from virest.degradation.blur import Image
 from virest.restoration import tiles
-from virest.restoration.bands import LevelsOfRows, bands
 from virest.restoration.blurred import BlurredPicture, luma_of, reduced
 from virest.restoration.clipped_light import measured_part
 from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import LEVELS_PER_UNIT, shrinkage_levels
+from virest.restoration.row_chunks import RowRenderer, bands
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.records import PictureStatistics
@@ -42,13 +42,13 @@ LINEAR_SHARE = 0.5
 """Of a picture whose power lies at few places, the linear filter's part: the prior makes its waves steps."""
 
 
-def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
+def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
     """One linear filter for each tile."""
     deconvolution = luma_tiles(blurred, settings)
     projected = _projected_luma(blurred, deconvolution, settings)
     factors = _tile_factors(deconvolution, settings, blurred.statistics)
     sharp = deconvolution.blend(cv2.multiply(s, f) for s, f in zip(projected, factors, strict=True))
-    return with_colour(blurred, deconvolution.with_lamps(sharp), settings)
+    return with_colour(blurred, deconvolution.restore_highlights(sharp), settings)
 
 
 def _tile_factors(
@@ -79,11 +79,11 @@ def _projected_luma(
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
-        deconvolution.tame(numbers, kernels, luma, measured_part(holes), float(luma.max()))
+        deconvolution.remove_highlights(numbers, kernels, luma, measured_part(holes), float(luma.max()))
     return deconvolution.back_projected(luma)
 
 
-def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
+def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
     """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
     times = _reduction(blurred.statistics, settings)
     if times == 1.0:
@@ -113,35 +113,35 @@ def tile_hyper_laplacian(
     start = statistics.between_rings_and_level if few else statistics
     ratios = noise_to_signal(deconvolution, settings, start)
     linear = sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
-    emptier = _emptier(statistics, deconvolution.size)
+    extra_noise = _extra_noise(statistics, deconvolution.size)
     before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
     for step, beta in enumerate(beta_schedule(settings.iterations)):
-        ahead, before = _further_on(sharp, before, step), sharp
+        ahead, before = _extrapolated(sharp, before, step), sharp
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
         pulled = deconvolution.pulled(projected, pull, beta / trust, beta / guarded)
-        inner, at_border = (gradients * np.float32(beta / t) + emptier for t in (trust, guarded))
+        inner, at_border = (gradients * np.float32(beta / t) + extra_noise for t in (trust, guarded))
         sharp = deconvolution.blend(deconvolution.solutions(pulled, inner, at_border))
     if settings.iterations > FEW_ITERATIONS:
         sharp += _returned_residual(deconvolution, projected, sharp, statistics)
     if statistics.unevenness:
         share = LINEAR_SHARE * statistics.unevenness
         sharp = cv2.addWeighted(linear, share, sharp, 1 - share, 0.0)
-    return deconvolution.with_lamps(sharp)
+    return deconvolution.restore_highlights(sharp)
 
 
-def _emptier(statistics: PictureStatistics, size: int) -> Image | np.float32:
+def _extra_noise(statistics: PictureStatistics, size: int) -> Image | np.float32:
     """N / S beyond that of the rings: a prior of gradients lets noise through where a grating leaves nothing."""
     if not statistics.unevenness:
         return np.float32(0)
     rings = on_spectrum(statistics, statistics.noise_to_signal, size, by_place=False)
     places = on_spectrum(statistics, statistics.noise_to_signal, size)
     least = np.float32(UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness)
-    emptier = cv2.max(cv2.subtract(np.maximum(places, least), rings), 0.0)
-    emptier[0, 0] = 0.0
-    return emptier
+    extra_noise = cv2.max(cv2.subtract(np.maximum(places, least), rings), 0.0)
+    extra_noise[0, 0] = 0.0
+    return extra_noise
 
 
-def _further_on(sharp: Image, before: Image, step: int) -> Image:
+def _extrapolated(sharp: Image, before: Image, step: int) -> Image:
     """The picture on along its last step, by more as the steps settle: it takes two thirds as many of them.
 
     Nesterov 1983's momentum, as Beck and Teboulle 2009 (doi:10.1137/080716542) apply it to shrinkage.

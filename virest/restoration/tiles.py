@@ -74,9 +74,9 @@ class TileDeconvolution:
         self._once: Image | np.float32 = np.float32(1)
         self._joined: list[Image] = []
         """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra of each channel."""
-        self._tamed: dict[int, Image] = {}
+        self._without_highlights: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
-        self._lamps: dict[int, tuple[Image, Image]] = {}
+        self._highlights: dict[int, tuple[Image, Image]] = {}
         """How much of the steps' own light to take in those tiles, and that light, (side, side) each."""
 
     def filters(self, make: Filter, at_border: Filter | None = None) -> Iterator[Image]:
@@ -93,7 +93,7 @@ class TileDeconvolution:
         padded, projected = self.padded(channel), np.empty_like(self.kernels)
         ends = np.empty((*self.kernels.shape[:2], 2), np.float32)
         for number, (top, left) in enumerate(self.grid.corners()):
-            spectrum = self._tamed.get(number)
+            spectrum = self._without_highlights.get(number)
             if spectrum is None:
                 spectrum = cv2.dft(self.periodic(padded, top, left), self._spectrum)
             inner = _inner_numbers(projected[number])
@@ -146,7 +146,9 @@ class TileDeconvolution:
             if cv2.hasNonZero(padded[top : top + patch, left : left + patch])
         ]
 
-    def tame(self, numbers: list[int], kernels: Image, channel: Image, weight: Image, top_light: float) -> None:
+    def remove_highlights(
+        self, numbers: list[int], kernels: Image, channel: Image, weight: Image, top_light: float
+    ) -> None:
         """Take the lamps out of some tiles: what is left is a picture of ordinary light, all of it recorded.
 
         Around a lamp a linear filter rings, since the light that is missing there is many times what was recorded;
@@ -167,24 +169,24 @@ class TileDeconvolution:
             lamp = cv2.subtract(found, rest)
             blurred_rest, blurred_lamp = (_through(part, self.kernels[number], True) for part in (rest, lamp))
             left_over = recorded - blurred_lamp - blurred_rest
-            self._tamed[number] = cv2.dft(cv2.add(blurred_rest, cv2.multiply(measured, left_over)))
+            self._without_highlights[number] = cv2.dft(cv2.add(blurred_rest, cv2.multiply(measured, left_over)))
             near = cv2.max(_through(blurred_lamp, self.kernels[number], False), 0.0)
             share = near / (near + np.float32(LAMP_DOUBT * top_light))
             inner = np.s_[margin : margin + self.grid.side, margin : margin + self.grid.side]
-            self._lamps[number] = share[inner].copy(), (lamp + share * rest)[inner]
+            self._highlights[number] = share[inner].copy(), (lamp + share * rest)[inner]
 
-    def with_lamps(self, picture: Image) -> Image:
+    def restore_highlights(self, picture: Image) -> Image:
         """A picture (height, width) restored from tamed tiles, with the lamps that were taken out of them.
 
         Along a lamp's streak the steps' own light is taken: what the movie's codec got wrong there is a part of the
         lamp's light, and a linear filter would carry it on.
         """
-        if not self._lamps:
+        if not self._highlights:
             return picture
         grid, side = self.grid, self.grid.side
         shares, lamps = np.zeros((2, grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
         corners = list(grid.corners())
-        for number, parts in self._lamps.items():
+        for number, parts in self._highlights.items():
             top, left = corners[number]
             for part, whole in zip(parts, (shares, lamps), strict=True):
                 cv2.accumulateProduct(part, self._windows[number], whole[top : top + side, left : left + side])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from virest.camera.intrinsics import Intrinsics
 from virest.errors import SettingsError
 from virest.motion.optics import MovingLens
-from virest.restoration.bands import bands
+from virest.restoration.row_chunks import bands
 
 Array = NDArray[np.float64]
 MARGIN_PX = 16

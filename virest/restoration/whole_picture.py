@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from virest.degradation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
-from virest.restoration.bands import LevelsOfRows
 from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
 from virest.restoration.clipped_light import near_clipped
 from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import hyper_laplacian, richardson_lucy
 from virest.restoration.encoding import grey_levels
+from virest.restoration.row_chunks import RowRenderer
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.tile_methods import beta_schedule, tile_hyper_laplacian
 
@@ -23,7 +23,7 @@ WEIGHED_PX = 5
 """Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
 
 
-def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
+def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
     """Each channel by itself; what is censored has no weight."""
     operator = _whole_operator(blurred, positive=True)
     sharp = []
@@ -36,7 +36,7 @@ def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -
     return lambda rows: cv2.merge([plane[rows] for plane in sharp])
 
 
-def by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> LevelsOfRows:
+def by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
     """Luma over the whole operator, where censored pixels have no weight; colour as in tiles, all that a movie stores.
 
     Near clipped light the tiles' solution stays: its lamps were found with light held positive.

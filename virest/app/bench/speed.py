@@ -29,7 +29,7 @@ from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recor
 from virest.app.jobs import prepare_worker
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_gray
-from virest.restoration.planning import plan_restoration
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.settings import PRESETS as SETTINGS
 
 FLOOR = "floor"

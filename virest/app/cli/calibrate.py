@@ -59,7 +59,7 @@ def calibrate(
     console.configure(quiet=quiet, verbose=verbose)
     one_thread_each()
     from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
-    from virest.app.side_by_side import side_by_side
+    from virest.app.process_map import process_map
 
     names = _parse_extras(extra or [])
     output = CalibrationOutput(out, kalibr, overwrite)
@@ -68,7 +68,7 @@ def calibrate(
     if len(paths) != 1:
         raise typer.BadParameter(f"standard input names {len(paths)} captures; a profile is calibrated from one")
     plan = plan_calibration(Path(paths[0]), config, names)
-    with side_by_side(cores()) as each, console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
+    with process_map(cores()) as each, console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
         facts, text = run_calibration(plan, output, bar.update if bar else None, each)
     emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0

@@ -41,9 +41,9 @@ def diagnose(
     console.configure(quiet=quiet, verbose=verbose)
     one_thread_each()
     from virest.app.diagnose import DiagnosisOptions, run_diagnosis
-    from virest.app.side_by_side import side_by_side
+    from virest.app.process_map import process_map
 
-    with side_by_side(cores()) as each, console.progress_bar(100, "diagnose", quiet=quiet) as bar:
+    with process_map(cores()) as each, console.progress_bar(100, "diagnose", quiet=quiet) as bar:
         outcome = run_diagnosis(console.folder_of(capture), DiagnosisOptions(out, config, overwrite), on_bar(bar), each)
     emit_facts(outcome.facts, outcome.text, as_json=json, quiet=quiet)
     return outcome.check_code if check else 0

@@ -12,13 +12,13 @@ from contextlib import contextmanager
 from typing import Any
 
 from virest.app.jobs import process_pool, submit_uninterrupted
-from virest.motion.shared_out import Each, one_by_one
+from virest.motion.parallel import ParallelMap, one_by_one
 
 log = logging.getLogger(__name__)
 
 
 @contextmanager
-def side_by_side(jobs: int) -> Iterator[Each]:
+def process_map(jobs: int) -> Iterator[ParallelMap]:
     """Calls distributed over ``jobs`` processes, which start when they are first needed; one: this process."""
     shared = _SharedOut(jobs)
     try:

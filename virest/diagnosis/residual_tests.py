@@ -11,8 +11,8 @@ from scipy import stats
 from virest.diagnosis import picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_ladder import GeometricVerdict
-from virest.diagnosis.points import STRAY_PART
 from virest.diagnosis.structure import Structure, structures
+from virest.diagnosis.tracking_stage import STRAY_PART
 from virest.motion.track_model import seen_s
 
 log = logging.getLogger(__name__)

@@ -35,8 +35,8 @@ from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, Indices, Mask
 from virest.diagnosis.photometry_fit import HeldOut
 from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock
-from virest.motion.shared_out import Each, one_by_one
 from virest.motion.trajectory import Trajectory
 
 Gray = NDArray[np.uint8]
@@ -152,7 +152,7 @@ def observe_mixing(
     trajectory: Trajectory,
     profile: CameraProfile,
     settings: MixingSettings | None = None,
-    each: Each = one_by_one,
+    each: ParallelMap = one_by_one,
 ) -> MixingEvidence:
     """Compare blurred frames with sharp ones near them. Empty where the hand gives no such pairs."""
     settings = settings or MixingSettings()

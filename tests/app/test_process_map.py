@@ -9,8 +9,8 @@ import time
 
 import pytest
 
-from virest.app.side_by_side import _SharedOut, side_by_side
-from virest.motion.shared_out import one_by_one
+from virest.app.process_map import _SharedOut, process_map
+from virest.motion.parallel import one_by_one
 
 
 def die_elsewhere(parent: int, value: float) -> float:
@@ -23,7 +23,7 @@ def die_elsewhere(parent: int, value: float) -> float:
 def test_results_come_in_the_order_of_the_calls_and_a_worker_s_death_costs_none() -> None:
     """Two processes give what one gives; the calls of a worker that dies are made here, and so are all later ones."""
     calls = [(float(k), 3.0) for k in range(7)]
-    with side_by_side(2) as each:
+    with process_map(2) as each:
         told: list[int] = []
         assert each(math.fmod, calls, told.append) == one_by_one(math.fmod, calls)
         assert told == list(range(7))
@@ -34,7 +34,7 @@ def test_results_come_in_the_order_of_the_calls_and_a_worker_s_death_costs_none(
 
 def test_one_job_is_done_here() -> None:
     """Without a second core no process is started."""
-    with side_by_side(1) as each:
+    with process_map(1) as each:
         assert each(os.getpid, [(), ()]) == [os.getpid()] * 2
 
 
@@ -43,7 +43,7 @@ def test_an_interruption_waits_for_no_worker() -> None:
     begun = []
 
     def interrupted() -> None:
-        with side_by_side(2) as each:
+        with process_map(2) as each:
             assert isinstance(each, _SharedOut)
             each._submit(time.sleep, (3600,))
             assert each._pool is not None

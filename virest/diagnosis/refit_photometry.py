@@ -35,7 +35,7 @@ _GAMMA, _BLACK = 0, 1
 
 
 @dataclass(frozen=True, slots=True)
-class Openness:
+class CurveUncertainty:
     """What is not known of values that brightness is read by."""
 
     spread: Array
@@ -59,7 +59,7 @@ def settle_light(
         fitted = fit_photometry(observations, profile, fitted.effects)
     prior = _prior(given)
     if light_varies(observations):
-        openness = Openness(_curve_by_brightness(observations, fitted, prior))
+        openness = CurveUncertainty(_curve_by_brightness(observations, fitted, prior))
     else:
         openness = _curve_by_mixing(curve, prior)
     openness.spread[2, 2] = _exposure_variance(causes)
@@ -114,7 +114,7 @@ def _prior(given: CameraProfile) -> Array:
     return doubt
 
 
-def _doubt(observations: PhotometricObservations, fitted: PhotometricFit, openness: Openness) -> Array:
+def _doubt(observations: PhotometricObservations, fitted: PhotometricFit, openness: CurveUncertainty) -> Array:
     """(k, k) to be added to the covariance; a rival is as likely as what was named."""
     changed = [(_shifted(fitted.profile, change), _STEP) for change in _STEP * np.eye(3)]
     pull = pulls(observations, fitted.profile, fitted, changed)
@@ -167,7 +167,7 @@ def _curve_by_brightness(observations: PhotometricObservations, fitted: Photomet
     return spread
 
 
-def _curve_by_mixing(curve: PictureVerdict, prior: Array) -> Openness:
+def _curve_by_mixing(curve: PictureVerdict, prior: Array) -> CurveUncertainty:
     """What blur leaves open: the deviation of what it named, or of a gamma that it did not name."""
     spread = np.zeros((3, 3))
     now = curve.profile.response or ResponseCurve("srgb")
@@ -185,7 +185,7 @@ def _curve_by_mixing(curve: PictureVerdict, prior: Array) -> Openness:
     else:
         spread[_GAMMA, _GAMMA] = prior[_GAMMA] ** 2
     rivals = (_rival(finding, rival.name, curve) for finding in curve.findings for rival in finding.rivals)
-    return Openness(spread, tuple(rivals))
+    return CurveUncertainty(spread, tuple(rivals))
 
 
 def _rival(named: Finding, rival: str, curve: PictureVerdict) -> ResponseCurve:

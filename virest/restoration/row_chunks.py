@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from virest.degradation.blur import Image
 
 BAND_ROWS = 64
-LevelsOfRows = Callable[[slice], Image]
+RowRenderer = Callable[[slice], Image]
 """Grey levels of some rows of a picture, (rows, width, 3), from 0 to 255 and not rounded."""
 
 

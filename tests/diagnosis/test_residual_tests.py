@@ -11,7 +11,7 @@ from motion.synthetic_tracks import Recording, Setup
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
 from virest.diagnosis.ladder import MOST_TRAVEL_PX, travel_blur_px
-from virest.diagnosis.remaining import points_left
+from virest.diagnosis.residual_tests import points_left
 
 WALL = Setup(
     seed=71, frames=31, points=40, velocity_m_s=(0.1, -0.05, 0.8), plane_per_m=(0.05, -0.1, 0.6), noise_px=0.08

@@ -21,7 +21,7 @@ from virest.diagnosis.geometric_evidence import (
     loss,
     relief_loss,
 )
-from virest.motion.shared_out import Each
+from virest.motion.parallel import ParallelMap
 from virest.motion.track_fit import Term
 from virest.motion.track_model import TrackTable
 
@@ -71,12 +71,12 @@ class Screened:
         return 0.5 * sum(self.losses)
 
 
-def screen(evidence: Evidence, candidates: Sequence[Candidate], each: Each) -> list[Screened]:
+def screen(evidence: Evidence, candidates: Sequence[Candidate], each: ParallelMap) -> list[Screened]:
     """Fit each candidate to the blocks of each fold."""
     return _descended(evidence, [(c, (c.model, c.model)) for c in candidates], ITERATIONS, each)
 
 
-def race(evidence: Evidence, candidates: Sequence[Candidate], count: int, each: Each) -> list[Screened]:
+def race(evidence: Evidence, candidates: Sequence[Candidate], count: int, each: ParallelMap) -> list[Screened]:
     """Screen many: all begin, those that are best for either fold after a few steps go on to the end.
 
     Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  Of each cause up to RACED_STARTS starting points
@@ -94,7 +94,7 @@ def race(evidence: Evidence, candidates: Sequence[Candidate], count: int, each: 
 
 
 def _descended(
-    evidence: Evidence, starts: Sequence[tuple[Candidate, tuple[Model, Model]]], iterations: int, each: Each
+    evidence: Evidence, starts: Sequence[tuple[Candidate, tuple[Model, Model]]], iterations: int, each: ParallelMap
 ) -> list[Screened]:
     """Fit each candidate to the blocks of each fold, from the model of that fold."""
     tables = {
@@ -159,7 +159,7 @@ def promising(base: Screened, better: Sequence[Screened], count: int) -> tuple[f
 
 
 def judge(
-    evidence: Evidence, screened: Sequence[Screened], scale: float, depth_spread_per_m: float, each: Each
+    evidence: Evidence, screened: Sequence[Screened], scale: float, depth_spread_per_m: float, each: ParallelMap
 ) -> list[Judged]:
     """Fit on every other block, judge on those between, and the other way round."""
     tables = [evidence.table(entry.candidate.model, JUDGE_POINTS) for entry in screened]

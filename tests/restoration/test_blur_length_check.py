@@ -11,7 +11,7 @@ from blurred_scene import camera, record
 
 from virest.camera.response import ResponseCurve
 from virest.degradation.row_motion import RowMotion
-from virest.restoration.seen_paths import (
+from virest.restoration.blur_length_check import (
     BEST_PATH_PX,
     LEAST_FRAMES,
     MOST_FRAMES,

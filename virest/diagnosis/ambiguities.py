@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 COINCIDENCE_SIGMA = 3.5
 
 
-def stamped(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
+def offset_as_timestamp(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
     """At constant exposure an offset of just half or one exposure is another meaning of the stamp.
 
     Where exposures are unknown, points are placed at the exposure's start: an offset may be half of it.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from virest.calibration.geometry import _value
-from virest.calibration.held_fixed import BELIEVABLE, OPTIONAL, HeldValue, held_notes
+from virest.calibration.unfitted_parameters import BELIEVABLE, OPTIONAL, HeldValue, held_notes
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 

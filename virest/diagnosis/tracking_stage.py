@@ -21,15 +21,15 @@ from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
 from virest.diagnosis.picture_ladder import Reader
 from virest.motion import profile_terms as terms_of
 from virest.motion.coarse_alignment import align_coarsely, align_with_skew
+from virest.motion.frame_rotations import gyro_turns
+from virest.motion.frame_selection import high_motion_frames
 from virest.motion.integration import integrate_gyro
-from virest.motion.lively_frames import lively_frames
 from virest.motion.observed_tracks import CELLS, ObservedTracks
+from virest.motion.parallel import ParallelMap, one_by_one
 from virest.motion.recorder_lag import Schedule
 from virest.motion.row_clock import RowClock
-from virest.motion.shared_out import Each, one_by_one
 from virest.motion.track_fit import Term
 from virest.motion.track_noise import step_noise_px
-from virest.motion.turns import gyro_turns
 
 Array = NDArray[np.float64]
 WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
@@ -51,10 +51,10 @@ NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 
 
 def frames_to_follow(capture: Capture, profile: CameraProfile) -> list[int]:
     """Movie indices, rising: every stamped frame of a short capture; of a longer one lively runs and the start-up."""
-    stamped = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
-    if len(stamped) <= WHOLE_FRAMES:
-        return stamped
-    chosen = lively_frames(capture.frames, capture.imu, FRAMES_IN_RUNS, profile.time_offset_s or 0.0)
+    offset_as_timestamp = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
+    if len(offset_as_timestamp) <= WHOLE_FRAMES:
+        return offset_as_timestamp
+    chosen = high_motion_frames(capture.frames, capture.imu, FRAMES_IN_RUNS, profile.time_offset_s or 0.0)
     begun = [frame.index for frame in capture.frames if frame.only_startup][:FRAMES_IN_RUNS]
     return sorted({*chosen, *begun})
 
@@ -70,7 +70,7 @@ class TrackedPoints:
     schedules: Sequence[Schedule]
     far: FarClock
     rungs_allowed: int
-    each: Each = one_by_one
+    each: ParallelMap = one_by_one
 
     def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
         """The ladder's end, climbed again without the parts of the picture that move together on their own."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.motion.lively_frames import lively_frames
+from virest.motion.frame_selection import high_motion_frames
 
 
 def recorded(frames: int, rate_hz: float) -> tuple[list[Frame], ImuSamples]:
@@ -21,7 +21,7 @@ def recorded(frames: int, rate_hz: float) -> tuple[list[Frame], ImuSamples]:
 def test_runs_lie_where_the_camera_turns_and_reach_over_the_whole_capture() -> None:
     """Of 60 s, six runs of a second and a half are taken: one of every ten seconds, in its liveliest stretch."""
     frames, imu = recorded(1800, 30.0)
-    chosen = np.array(lively_frames(frames, imu, 270))
+    chosen = np.array(high_motion_frames(frames, imu, 270))
     runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
     assert [len(run) for run in runs] == [45] * 6
     assert [int(run[0]) // 300 for run in runs] == [0, 1, 2, 3, 4, 5]
@@ -32,4 +32,4 @@ def test_a_short_capture_is_followed_whole() -> None:
     """Up to the limit every usable frame is taken; one that is left out is not."""
     frames, imu = recorded(90, 25.0)
     left_out = Frame(31, frames[31].timestamp_ns, frames[31].time_s, 0.01, 100.0, "no IMU", ("no-imu",))
-    assert lively_frames([*frames[:31], left_out, *frames[32:]], imu, 90) == [*range(31), *range(32, 90)]
+    assert high_motion_frames([*frames[:31], left_out, *frames[32:]], imu, 90) == [*range(31), *range(32, 90)]

@@ -19,7 +19,9 @@ from virest.motion.alignment import choose_pairs
 RUN_S, MIN_RUN_FRAMES, MAX_RUN_FRAMES = 1.5, 20, 80
 
 
-def lively_frames(frames: Sequence[Frame], imu: ImuSamples, max_frames: int, time_offset_s: float = 0.0) -> list[int]:
+def high_motion_frames(
+    frames: Sequence[Frame], imu: ImuSamples, max_frames: int, time_offset_s: float = 0.0
+) -> list[int]:
     """Movie indices, rising: every usable frame of a short capture, lively runs of a longer one, max_frames in all."""
     usable = [frame for frame in frames if frame.skip_reason is None]
     return sorted(set(choose_pairs(frames, imu, max_frames, run_frames(usable), time_offset_s)))

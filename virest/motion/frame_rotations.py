@@ -19,7 +19,7 @@ SOFT_CAP = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class PictureTurns:
+class FrameRotations:
     """Rotation of the pictures over pairs of frames: x_second = exp(vector) x_first for rays in camera axes."""
 
     first_s: Array
@@ -76,10 +76,10 @@ def picture_rotation(lens: Intrinsics, pair: TrackPair) -> Array:
     return vector_from_rotation(rotation)
 
 
-def picture_turns(lens: Intrinsics, pairs: Sequence[TrackPair], first_s: Array, second_s: Array) -> PictureTurns:
+def picture_turns(lens: Intrinsics, pairs: Sequence[TrackPair], first_s: Array, second_s: Array) -> FrameRotations:
     """Rotation of every pair; first_s, second_s: (p,) camera clock at which the pictures' centres were seen."""
     vectors = np.array([picture_rotation(lens, pair) for pair in pairs]).reshape(-1, 3)
-    return PictureTurns(first_s, second_s, vectors)
+    return FrameRotations(first_s, second_s, vectors)
 
 
 def gyro_turns(trajectory: Trajectory, first_s: Array, second_s: Array) -> Array:
@@ -89,7 +89,7 @@ def gyro_turns(trajectory: Trajectory, first_s: Array, second_s: Array) -> Array
 
 
 def scan_offsets(
-    turns: PictureTurns, trajectory: Trajectory, clock_skew: float, offsets_s: Array, free_gain: bool = False
+    turns: FrameRotations, trajectory: Trajectory, clock_skew: float, offsets_s: Array, free_gain: bool = False
 ) -> OffsetScan:
     """Compare the pictures' turns with the gyroscope's at each offset; bias and slow drift are free.
 

@@ -33,12 +33,12 @@ from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.row_clock import RowClock
 from virest.motion.tracking import TrackPair, track_pairs
 from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
+from virest.restoration.blur_length_check import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.conflict_plan import MAX_FOCAL_SPREAD, MAX_OFFSET_STD_S, explains_points, settle
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbour_plan import with_neighbours_asked
 from virest.restoration.neighbours.survey import kept_lumas, survey_runs
-from virest.restoration.seen_paths import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.settings import RestorationSettings
 
 MIN_COARSE_EXPLAINED = 0.5

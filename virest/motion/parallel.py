@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 
-class Each(Protocol):
+class ParallelMap(Protocol):
     """Calls a function of a module with each tuple of plain arguments and lists the results in that order."""
 
     def __call__(
