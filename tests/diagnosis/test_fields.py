@@ -59,7 +59,7 @@ def filled(from_s, to_s):
 def judged(
     phone: StrangePhone, nominal: CameraProfile, rungs: int = 0, fitted: tuple[Term, ...] = ()
 ) -> tuple[GeometricVerdict, list[FieldFinding]]:
-    """Fields after a ladder of so many rungs, as a diagnosis asks for them; fitted: terms in from the start."""
+    """Fields after a ladder of some rungs, as a diagnosis requests them; fitted: terms in from the start."""
     capture, observed = phone.capture, phone.observed
     doubtful = doubtful_pairs(observed, capture, nominal)
     rest = observed.chosen(~doubtful.hit) if doubtful.sets_aside else observed

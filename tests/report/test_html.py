@@ -282,7 +282,7 @@ def test_a_copied_frame_is_not_called_straightened():
 
 
 def test_only_what_a_profile_states_is_called_given():
-    """A null is not known, whatever stands in for it; a default may be nobody's."""
+    """A null is unknown, whatever default replaces it; a default may be nobody's."""
     profile = {"imu": {"time_offset_s": None, "gyro_bias_rad_s": [0.0, 0.0, 0.0]}, "intrinsics": {"fx_px": 500.0}}
     values = {value.title: value.source for value in camera_values(profile, "camera.yaml")}
     assert values["Time offset"] == "not known"

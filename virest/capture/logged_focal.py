@@ -35,7 +35,7 @@ def focal_scales(logged_px: Array, time_s: Array, half_diagonal_px: float) -> Ar
 
 
 def written_step(values: Array) -> float:
-    """The step of numbers written with so many decimals, 1 for whole ones."""
+    """The step of numbers written with a number of decimals, 1 for whole ones."""
     distinct = np.unique(values)
     for decimals in range(MOST_DECIMALS):
         if np.allclose(distinct, np.round(distinct, decimals), rtol=0.0, atol=1e-9):

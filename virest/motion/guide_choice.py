@@ -4,7 +4,7 @@ Tiles of a sample of pictures are compared with the pictures after them at every
 cross-correlation), without the gyroscope.  What the tiles score where the gyroscope puts them is its support.  Texture
 that repeats scores at many shifts, but over many pairs only the right motion finds them all.
 
-The same log with its axes interchanged (the 24 axis maps) and played backwards is as lively, as smooth in time and as
+The same log with its axes interchanged (the 24 axis maps) and played backwards is as fast, as smooth in time and as
 often tried, and knows nothing of the pictures.  Its supports, each the best of the same offsets, follow Gumbel's
 distribution of extremes; the gyroscope guides where its own lies beyond what they reach once in 1 / FALSE_ALARMS.
 """
@@ -52,7 +52,7 @@ SAME_PX = 2.0
 """Logs that put the tiles as near to each other as this (rms) are one."""
 MIN_RIVALS = 20
 STRETCH_PAIRS, LASTING, MOST = 4, 2.0, 0.75
-"""Most stretches of so many pairs must each support the gyroscope, by so many deviations of its rivals there: one
+"""Most stretches of this many pairs must each support the gyroscope, by this many deviations of its rivals there: one
 moment of a log may fit by chance, or be the only one that belongs."""
 GUMBEL_MEAN, GUMBEL_STD = 0.5772, 1.2825
 

@@ -31,7 +31,7 @@ REPEAT_PX, MOVED_PX = 0.1, 0.5
 """A picture that moves less than the first where the gyroscope says more than the second repeats its predecessor."""
 LEAST_NOISE_PX = 0.1
 TOLD_CHI2 = 37.0
-"""By so much, in the units of the turns' own scatter, the best place must be better than any other: exp(−37 / 2) is
+"""In units of the turns' own scatter, the best place must be better than any other by this: exp(−37 / 2) is
 1e-8, and 1e-6 where turns scatter 15 % more than their neighbours say."""
 OTHER_SIGMA, MOST_REST = 3.0, 0.2
 """A lateness that is no whole number of captures, by so many deviations and so much of a period, is something else."""

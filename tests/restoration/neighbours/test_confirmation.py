@@ -9,7 +9,7 @@ FRAMES, PLACES = 2000, 16
 
 
 def _filtered(strength: float) -> tuple[np.ndarray, np.ndarray]:
-    """What recorded signals lack, and what a Wiener filter with so many times the noise changes, (FRAMES, PLACES)."""
+    """What recorded signals lack, and what a Wiener filter with a multiple of the noise changes, (FRAMES, PLACES)."""
     rng = np.random.default_rng(5)
     passed, noise = np.linspace(1.0, 0.0, PLACES) ** 2, 0.02
     sharp = rng.normal(size=(FRAMES, PLACES))
@@ -61,7 +61,7 @@ def test_a_larger_change_promises_more_and_a_larger_rest_less():
 
 
 def test_neighbours_that_lack_something_else_confirm_nothing():
-    """A change that goes along with what is lacked, and leaves nearly all of that, is not borne out."""
+    """A change that correlates with what is missing, and leaves nearly all of it, is not confirmed."""
     unlike = confirmed_gain([(0.5, 0.1, 0.405, 0.4)] * 4)
     alike = confirmed_gain([(0.5, 0.1, 0.5, 0.4)] * 4)
     assert unlike is not None
