@@ -29,15 +29,30 @@ MOST_FILES, MOST_BYTES = 32, 1 << 30
 
 
 def run_totals(logs: list[Path]) -> dict[str, Any]:
-    """Counts by status and by what was done, and seconds by stage, over all lines."""
+    """Counts by status and by what was done, seconds by stage, and what neighbours brought, over all lines."""
     counts: Counter[str] = Counter()
     seconds: Counter[str] = Counter()
+    joined: list[tuple[int, float]] = []
     for content in read_each(logs):
         for line in parse_lines(content):
             counts[line["status"]] += 1
             counts.update(line.get("done", ()))
             seconds.update({stage: line["seconds"].get(stage, 0.0) for stage in STAGES})
-    return {"counts": {name: counts[name] for name in (*STATUSES, *STEPS)}, "seconds": dict(seconds)}
+            deblur = line.get("deblur") or {}
+            if deblur.get("neighbours"):
+                joined.append((len(deblur["neighbours"]), deblur.get("neighbours_gain_db") or 0.0))
+    return {
+        "counts": {name: counts[name] for name in (*STATUSES, *STEPS)},
+        "seconds": dict(seconds),
+        "neighbours": _joined(joined),
+    }
+
+
+def _joined(joined: list[tuple[int, float]]) -> dict[str, Any]:
+    """What neighbours brought: frames restored with some, how many each had, and the gain by the spectra, means."""
+    count = len(joined)
+    taken, gain_db = (sum(column) / count for column in zip(*joined, strict=True)) if count else (None, None)
+    return {"frames": count, "mean_taken": taken, "mean_gain_db": gain_db}
 
 
 def run_account(
@@ -71,6 +86,7 @@ def run_account(
         "frames": job.request["frames"],
         "inputs": _inputs(job),
         "counts": counts,
+        "neighbours": totals["neighbours"],
         "totals": _sums(len(job.selected), totals["seconds"], wall_s),
         "verdict": verdict(counts, plan.copy_reason),
         "warnings": [*notes, *plan.warnings, *([plan.copy_reason] if plan.copy_reason else [])],
@@ -101,6 +117,7 @@ def failure_account(
         "frames": job.request["frames"] if job else None,
         "inputs": _inputs(job) if job else _facts_of_folder(locate(path)),
         "counts": dict.fromkeys((*STATUSES, *STEPS), 0),
+        "neighbours": _joined([]),
         "totals": _sums(0, {}, wall_s),
         "verdict": f"not processed: {known.message}",
         "warnings": [text for text in (known.message, known.hint) if text],

@@ -153,6 +153,7 @@ class _Shutter(_Lenient):
 class _Deblur(_Lenient):
     method: str = "none"
     expected_gain_db: float | None = None
+    neighbours_gain_db: float | None = None
     noise_grey_levels: float | None = None
 
 
@@ -399,6 +400,7 @@ def _frame_facts(line: _Line) -> FrameFacts:
         depth_m=line.depth_m if isinstance(line.depth_m, float) else None,
         speed_m_s=None if velocity is None else float(np.hypot.reduce(velocity)),
         gain_db=deblur.expected_gain_db,
+        neighbours_gain_db=deblur.neighbours_gain_db,
         noise_levels=deblur.noise_grey_levels,
         deblurred=deblur.method != "none",
         straightened=line.status == "restored" and shutter.method != "none",

@@ -78,6 +78,8 @@ class FrameFacts:
     depth_m: float | None = None
     speed_m_s: float | None = None
     gain_db: float | None = None
+    neighbours_gain_db: float | None = None
+    """What restoring the frame with its neighbours adds, by the spectra."""
     """What deblurring was expected to gain."""
     noise_levels: float | None = None
     deblurred: bool = False
@@ -376,12 +378,16 @@ def time_charts(frames: Sequence[FrameFacts], marked: Sequence[int]) -> list[Cha
     def axis(k: int) -> Callable[[FrameFacts], float | None]:
         return lambda f: None if f.rate_rad_s is None else f.rate_rad_s[k]
 
+    def joint_gain_db(f: FrameFacts) -> float | None:
+        return f.neighbours_gain_db if any(other.neighbours_gain_db for other in frames) else None
+
     wanted = [
         ("Blur", "px", [("longest", column(lambda f: f.longest_blur_px)), ("centre", column(lambda f: f.blur_px))]),
         ("Rotation of the camera", "rad/s", [(name, column(axis(k))) for k, name in enumerate("xyz")]),
         ("Bent by the rolling shutter", "px", [("largest shift", column(lambda f: f.shift_px))]),
         ("Exposure", "ms", [] if steady_words(frames) else [("", column(exposure_ms))]),
         ("Expected gain of deblurring", "dB", [("", column(lambda f: f.gain_db))]),
+        ("Gain by neighbouring frames, by the spectra", "dB", [("", column(joint_gain_db))]),
         ("Noise", "grey levels", [("", column(lambda f: f.noise_levels))]),
         ("Scene depth", "m", [("", column(lambda f: f.depth_m))]),
         ("Speed of the camera", "m/s", [("", column(lambda f: f.speed_m_s))]),

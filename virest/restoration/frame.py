@@ -283,6 +283,7 @@ def _deblurred(
             part = part * np.float32(confirmed.taken(sum(float(one.weights.mean()) for one in joined.pictures)))
     restored = _mixed(sharp, recorded, part)
     ideal = luma_model.ideal_error(joined.passed, joined.shared)
+    alone = luma_model.ideal_error(np.zeros_like(joined.passed), 0.0)
     gain_db = (None, None) if confirmed is None else confirmed.of_change_db(_mean_square(restored, recorded), ideal)
     details = {
         "method": settings.deblur,
@@ -296,6 +297,7 @@ def _deblurred(
         "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
         "neighbours": [{"frame": one.number, "weight": float(one.weights.mean())} for one in joined.pictures],
+        "neighbours_gain_db": 10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }

@@ -101,6 +101,8 @@ def test_frames_restored_together_are_better_than_each_alone(simulated):
     joint = _gains(capture, plan)
     assert np.all(joint > single - 0.1)
     assert joint.mean() > single.mean() + 0.5
+    promised = [r.parameters["deblur"] for r in capture.restored(plan)]
+    assert {bool(p["neighbours"]) == (p["neighbours_gain_db"] > 0) for p in promised} == {True}
 
 
 def test_colour_is_restored_together_too(simulated):
