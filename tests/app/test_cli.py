@@ -540,10 +540,10 @@ def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
 
 @pytest.mark.scenario
 def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
-    virest: Virest, start: Callable[..., Any], swing: Path, slow: tuple[object, ...], tmp_path: Path
+    virest: Virest, start: Callable[..., Any], long_swing: Path, slow: tuple[object, ...], tmp_path: Path
 ) -> None:
     """SIGKILL at any time; a finished segment is not done again; workers do not outlive their parent."""
-    arguments = ("process", swing, *slow, "--jobs", 2, "--out")
+    arguments = ("process", long_swing, *slow, "--jobs", 2, "--out")
     run = tmp_path / "out/swing"
     with start(*arguments, tmp_path / "out") as process:
         wait_for(lambda: any(name.startswith(".segments/") for name in below(run)), process)
@@ -552,7 +552,7 @@ def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
     log = next((run / ".segments").glob("*.jsonl"))
     first = json.loads(log.read_text().splitlines()[0])["output"]
     written_ns = (run / first).stat().st_mtime_ns
-    (run / "frames/000009.png.0123abcd.part").write_bytes(b"half")
+    (run / "frames/000031.png.0123abcd.part").write_bytes(b"half")
     assert_refused(virest(*arguments, tmp_path / "out"), 8, "unfinished", "--resume")
     assert virest(*arguments, tmp_path / "out", "--resume").returncode == 0
     assert (run / first).stat().st_mtime_ns == written_ns
