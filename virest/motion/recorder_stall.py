@@ -34,7 +34,7 @@ TOLD_CHI2 = 37.0
 """In units of the turns' own scatter, the best place must be better than any other by this: exp(−37 / 2) is
 1e-8, and 1e-6 where turns scatter 15 % more than their neighbours say."""
 OTHER_SIGMA, MOST_REST = 3.0, 0.2
-"""A lateness that is no whole number of captures, by so many deviations and so much of a period, is something else."""
+"""A lateness that is no whole number of captures, by these deviations and this part of a period, is something else."""
 FITS = 1.5
 """Rms inside the stall over that about it, up to which turns are explained."""
 

@@ -40,7 +40,7 @@ VALUE_P = 1e-5
 """Of a value being nought, with tracking's own bias in its deviation: with nine trials at most, a false cause in fewer
 than one capture of ten thousand."""
 TOLD_SIGMA = 3.0
-"""A cause is told from its twin where it stands beside it by so many deviations."""
+"""A cause and its twin are told apart where they differ by more than this many deviations."""
 MAX_CAUSES = 3
 JUDGED = 2
 """Causes judged on held-out blocks each time, those first that fit best."""

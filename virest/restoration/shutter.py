@@ -21,7 +21,7 @@ from virest.restoration.undistortion import distorted_points
 USUAL_SPACING_PX, LEAST_SPACING_PX = 16, 4
 """Grid of a map; where it holds a lens's distortion, finer for wide lenses."""
 LINES_OFF_PX = 0.01
-"""Straight lines over a grid's cells may leave the map by so much."""
+"""Largest error of linear interpolation over a grid's cells, in pixels."""
 
 
 def rowwise_map(motion: RowMotion, anchor: float, *, undistort: bool = False) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 LEAST_PAIRS = 2
 """A single one has no scatter."""
 LEAST_SEEN_DB = 0.1
-"""Neighbours must be predicted better by so much; a frame is not deblurred for less either."""
+"""Least improvement in predicting neighbours, in dB; a frame is not deblurred for less either."""
 LEFT_OVER = (3.25, 0.60, 0.12, 0.38)
 """ln of the squared error that is left in a restored picture, grey levels squared: a constant, and how much it grows
 with the logarithms of what the spectra leave, of the squared change, and of the part that neighbours see left.

@@ -184,12 +184,17 @@ def rings_passed(kernels: KernelField) -> Array:
     return np.asarray(np.bincount(place_ring().ravel(), power.ravel(), RINGS) / counts)
 
 
+def half_size(picture: Image) -> Image:
+    """Means over squares of HALF pixels; a picture of odd sides repeats its last row or column."""
+    height, width = picture.shape[:2]
+    if height % HALF or width % HALF:
+        picture = cv2.copyMakeBorder(picture, 0, height % HALF, 0, width % HALF, cv2.BORDER_REPLICATE)
+    return cv2.resize(picture, (-(-width // HALF), -(-height // HALF)), interpolation=cv2.INTER_AREA)
+
+
 def _halved(source_px: NDArray[np.float32]) -> NDArray[np.float32]:
     """A map (height, width, 2) between pictures of half the size, sides rounded up."""
-    height, width = source_px.shape[:2]
-    even = cv2.copyMakeBorder(source_px, 0, height % HALF, 0, width % HALF, cv2.BORDER_REPLICATE)
-    small = cv2.resize(even, (-(-width // HALF), -(-height // HALF)), interpolation=cv2.INTER_AREA)
-    return (small + np.float32(0.5)) / np.float32(HALF) - np.float32(0.5)
+    return (half_size(source_px) + np.float32(0.5)) / np.float32(HALF) - np.float32(0.5)
 
 
 def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array, float]:

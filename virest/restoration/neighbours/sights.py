@@ -19,7 +19,13 @@ from virest.degradation.neighbour import neighbour_view
 from virest.degradation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
-from virest.restoration.neighbours.joint import HALF, NeighbourPicture, most_telling, neighbour_picture, rings_passed
+from virest.restoration.neighbours.joint import (
+    NeighbourPicture,
+    half_size,
+    most_telling,
+    neighbour_picture,
+    rings_passed,
+)
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import PairTurn, frame_tiles, pair_turn, reduced_light, tile_agreement
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
@@ -194,15 +200,7 @@ def _luma_and_half(sight: Sight) -> tuple[Image, Image]:
     assert sight.motion is not None
     light = cv2.LUT(sight.picture, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
     weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
-    height, width = light.shape[:2]
-    size = (-(-width // HALF), -(-height // HALF))
-    even = (
-        cv2.copyMakeBorder(light, 0, height % HALF, 0, width % HALF, cv2.BORDER_REPLICATE)
-        if height % HALF or width % HALF
-        else light
-    )
-    half = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.transform(light, weights), np.float32), half
+    return np.asarray(cv2.transform(light, weights), np.float32), half_size(light)
 
 
 @lru_cache(maxsize=4)
