@@ -18,7 +18,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
-from virest.degradation.row_motion import FrameTranslation, RowMotion, row_motion
+from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 

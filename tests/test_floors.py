@@ -7,13 +7,14 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "virest"
 FLOOR = {
-    "app": 9,
-    "report": 8,
-    "evaluation": 8,
-    "diagnosis": 7,
-    "restoration": 6,
-    "calibration": 6,
-    "degradation": 5,
+    "app": 10,
+    "report": 9,
+    "evaluation": 9,
+    "diagnosis": 8,
+    "restoration": 7,
+    "calibration": 7,
+    "inference": 6,
+    "image_formation": 5,
     "simulation": 5,
     "motion": 4,
     "capture": 3,
@@ -21,8 +22,9 @@ FLOOR = {
     "errors": 1,
 }
 STRANGERS = {
-    "simulation": {"degradation", "motion", "restoration"},
-    "degradation": {"simulation"},
+    "simulation": {"image_formation", "inference", "motion", "restoration"},
+    "image_formation": {"simulation"},
+    "inference": {"simulation"},
 }
 """The judge does not read the accused's notes."""
 ROOT_FILES = {"__init__.py", "__main__.py", "errors.py"}

@@ -1,4 +1,4 @@
-"""The row clock is written once: nobody above motion/row_clock.py adds readout and exposure to a start by hand."""
+"""The row clock is written once: nobody above image_formation/row_clock.py adds readout and exposure to a start by hand."""
 
 import ast
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 from test_floors import FILES, FLOOR, PACKAGE, identify, parse, room_of
 
-HOME = "motion/row_clock.py"
+HOME = "image_formation/row_clock.py"
 READERS = [
     path
     for path in FILES
@@ -117,10 +117,10 @@ def row_clocks(tree: ast.AST) -> Iterator[ast.expr]:
 
 
 def test_the_row_clock_is_written_in_one_place() -> None:
-    """Files ask motion/row_clock.py (or RowMotion, which does) when a row is exposed."""
+    """Files ask image_formation/row_clock.py (or RowMotion, which does) when a row is exposed."""
     assert len(READERS) > 100
     found = [f"{identify(p)}:{node.lineno}: {ast.unparse(node)}" for p in READERS for node in row_clocks(parse(p))]
-    assert not found, "the row clock by hand; use motion/row_clock.py:\n" + "\n".join(found)
+    assert not found, "the row clock by hand; use image_formation/row_clock.py:\n" + "\n".join(found)
 
 
 @pytest.mark.parametrize("written", BY_HAND.values(), ids=BY_HAND)

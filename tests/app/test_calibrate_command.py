@@ -20,7 +20,7 @@ from virest.camera.profile import CameraProfile, read_profile, write_profile
 from virest.capture.folder import read_capture
 from virest.capture.profile_source import read_any_profile
 from virest.errors import CalibrationError, OutputError
-from virest.motion import frame_selection
+from virest.inference import frame_selection
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 OFFSET_S, READOUT_S, ROTATION, BIAS = 0.031, 0.0236, (0.012, -0.017, 0.021), (0.018, -0.011, 0.006)

@@ -24,7 +24,7 @@ from virest.diagnosis.findings import (
     Rung,
 )
 from virest.errors import CalibrationError, OutputError
-from virest.motion.parallel import ParallelMap
+from virest.inference.parallel import ParallelMap
 
 CAUSE_KEYS = {"name", "parameters", "held_out", "rivals", "p_value", "sentence", "figures"}
 TOP_KEYS = {"schema", "verdict", "nominal", "causes", "fields", "unexplained", "restoration_gain", "extended_profile"}

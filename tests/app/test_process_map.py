@@ -10,7 +10,7 @@ import time
 import pytest
 
 from virest.app.process_map import _SharedOut, process_map
-from virest.motion.parallel import one_by_one
+from virest.inference.parallel import one_by_one
 
 
 def die_elsewhere(parent: int, value: float) -> float:

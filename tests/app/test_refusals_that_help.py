@@ -13,8 +13,8 @@ from virest.app.calibrate import _require_offset
 from virest.app.calibrate_curve import calibrate_curve
 from virest.calibration.geometry import ROUGH_OFFSET_S, CalibratedValue, GeometryCalibration, _rough
 from virest.errors import CalibrationError, OutputError
-from virest.motion.profile_terms import TIME_OFFSET
-from virest.motion.track_fit import TrackFit, fit_tracks
+from virest.inference.profile_terms import TIME_OFFSET
+from virest.inference.track_fit import TrackFit, fit_tracks
 
 
 def fit_of(recording) -> TrackFit:

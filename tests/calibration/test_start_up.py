@@ -11,7 +11,7 @@ from motion.synthetic_tracks import Recording, Setup
 
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, CaptureMetadata, Frame
-from virest.motion.recorder_lag import EXTRA_PERIODS, fit_start_up_lag, lag_schedules
+from virest.inference.recorder_lag import EXTRA_PERIODS, fit_start_up_lag, lag_schedules
 
 PERIOD_S = 0.04
 

@@ -19,8 +19,8 @@ from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
-from virest.motion.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
-from virest.motion.track_fit import Term
+from virest.inference.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
+from virest.inference.track_fit import Term
 
 HAND = Setup(
     seed=71, frames=61, points=20, width=640, height=480, centre_px=(323.0, 236.0), readout_direction="top_to_bottom",

@@ -24,8 +24,8 @@ from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import Trial, _best_single, _significant
 from virest.diagnosis.photometry_effects import Vignetting
 from virest.diagnosis.photometry_fit import HeldOut, fit_photometry, judge, time_blocks
-from virest.motion import profile_terms as terms_of
-from virest.motion.parallel import one_by_one
+from virest.inference import profile_terms as terms_of
+from virest.inference.parallel import one_by_one
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
 EFFECT = {effect.name: effect for effect in GEOMETRIC_EFFECTS}

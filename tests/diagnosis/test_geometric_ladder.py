@@ -25,7 +25,7 @@ from virest.diagnosis.geometric_evidence import (
     make_evidence,
 )
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_of, rotation_between, total_change
-from virest.motion import profile_terms as terms_of
+from virest.inference import profile_terms as terms_of
 from virest.motion.scene_motion import DirectedMotion, InertialMotion
 
 EFFECT = {effect.name: effect for effect in GEOMETRIC_EFFECTS}

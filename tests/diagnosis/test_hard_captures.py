@@ -29,7 +29,7 @@ from virest.diagnosis.photometry_effects import GainDrift
 from virest.diagnosis.photometry_fit import fit_photometry, significance
 from virest.diagnosis.picture_ladder import changes_of, frames_of, values_of
 from virest.diagnosis.tracking_stage import with_null_values
-from virest.motion import profile_terms as terms_of
+from virest.inference import profile_terms as terms_of
 from virest.motion.integration import integrate_gyro
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)

@@ -20,7 +20,7 @@ from virest.diagnosis.restoration_gain import (
     pairs_to_keep_back,
     shared_gradient,
 )
-from virest.motion.tracking import track_pairs
+from virest.inference.tracking import track_pairs
 
 WHOLE = (0, 0, 320, 240)
 

@@ -12,9 +12,9 @@ from virest.diagnosis.cross_validation import chance_of
 from virest.diagnosis.findings import GEOMETRY, HeldOutGain
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import _lag_std_s, climb, findings_of
-from virest.motion.comparable_noise import residual_px, tracking_noise_px
-from virest.motion.track_fit import many_directions, start_scene
-from virest.motion.track_model import ground
+from virest.image_formation.point_model import ground
+from virest.inference.comparable_noise import residual_px, tracking_noise_px
+from virest.inference.track_fit import many_directions, start_scene
 from virest.report.words import remaining_words, residual_words
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)

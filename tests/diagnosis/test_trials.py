@@ -12,7 +12,7 @@ from virest.diagnosis.candidates import FarClock, candidates_of
 from virest.diagnosis.cross_validation import FOLDS, GLANCE, RACED, RACED_STARTS, best_of_each, race, screen
 from virest.diagnosis.geometric_evidence import ITERATIONS, Model, make_evidence
 from virest.diagnosis.geometric_ladder import SearchContext
-from virest.motion.parallel import one_by_one
+from virest.inference.parallel import one_by_one
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
 CAMERA = Recording(HAND)

@@ -5,7 +5,7 @@ import pytest
 
 from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
 from virest.evaluation.schubert2018 import PictureVelocity, fit_velocity, velocity_map
-from virest.motion.tracking import TrackPair
+from virest.inference.tracking import TrackPair
 
 WIDTH, HEIGHT = 320, 240
 MIDDLE_S = {4: 0.1332, 5: 0.1668, 6: 0.1999}

@@ -17,8 +17,8 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
-from virest.motion.observed_tracks import ObservedTracks
-from virest.motion.tracking import TrackPair
+from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = np.array([1.2, 9.7, -0.8]) * 9.81 / np.linalg.norm([1.2, 9.7, -0.8])

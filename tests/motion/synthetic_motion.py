@@ -16,7 +16,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
-from virest.motion.tracking import TrackPair
+from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
 R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))

@@ -19,11 +19,11 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
-from virest.motion.frame_rotations import FrameRotations
-from virest.motion.observed_tracks import ObservedTracks
+from virest.image_formation.point_model import TrackTable
+from virest.inference.frame_rotations import FrameRotations
+from virest.inference.observed_tracks import ObservedTracks, track_table
+from virest.inference.tracking import TrackPair
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.track_model import TrackTable, track_table
-from virest.motion.tracking import TrackPair
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]

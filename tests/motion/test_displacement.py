@@ -11,9 +11,9 @@ from synthetic_tracks import GRAVITY_M_S2, Recording, Setup, recorded
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.image_formation.point_model import centre
 from virest.motion.displacement import Displacement, integrate_accelerometer
 from virest.motion.integration import integrate_gyro
-from virest.motion.track_model import centre
 
 SWAYING = Setup(seed=4, sway_m=0.06, velocity_m_s=(0.1, -0.2, 0.15), arm_m=(0.03, -0.05, 0.01), plane_per_m=(0, 0, 0.5))
 TIMES_S, ORIGIN_S = np.array([0.213, 0.55, 0.8, 1.131]), np.full(4, 0.62)

@@ -11,11 +11,11 @@ import pytest
 from swaying_camera import CENTRE_PX, Sway, SwayingCamera
 
 from virest.camera.intrinsics import Intrinsics
-from virest.motion.depth import Sightings, TriangulatedPoints
+from virest.inference.depth import Sightings, TriangulatedPoints
+from virest.inference.relief import measure_roughness, picture_grid
+from virest.inference.visual_inertial import FrameMotion, VisualInertialAlignment, align
 from virest.motion.optics import MovingLens
-from virest.motion.relief import measure_roughness, picture_grid
 from virest.motion.relief_surface import Relief, angles
-from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align
 
 SCENE = Sway(seed=9, depth_m=1.5, sway_m=0.09, points=220, panel=0.6)
 LENS = MovingLens(Intrinsics(640, 480, 500.0, 500.0, 310.0, 236.0))

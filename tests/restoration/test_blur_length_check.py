@@ -10,7 +10,7 @@ import pytest
 from blurred_scene import camera, record
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blur_length_check import (
     BEST_PATH_PX,
     LEAST_FRAMES,

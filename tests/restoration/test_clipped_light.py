@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-from virest.degradation.kernels import KernelField
+from virest.image_formation.kernels import KernelField
 from virest.restoration.clipped_light import _along_paths
 
 WIDTH, HEIGHT, LENGTH = 160, 120, 12.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from blurred_scene import FRAME, camera, record
 
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.row_motion import RowMotion
 from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.frame import restore_frame
 from virest.restoration.settings import PRESETS

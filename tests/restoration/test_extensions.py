@@ -23,7 +23,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture, Frame
 from virest.capture.video import probe_movie, read_frames
-from virest.degradation.row_motion import FrameTranslation, frame_times_s
+from virest.image_formation.row_motion import FrameTranslation, frame_times_s
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS

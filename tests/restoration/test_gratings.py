@@ -12,7 +12,7 @@ from laws import TurningCamera, psnr_db, texture
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import kernel_field
+from virest.image_formation.kernels import kernel_field
 from virest.restoration.frame import blurred_part, restore_frame
 from virest.restoration.settings import PRESETS, RestorationSettings
 from virest.restoration.statistics.measure import measure_picture

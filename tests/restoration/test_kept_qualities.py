@@ -11,8 +11,8 @@ import pytest
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.degradation.light import FrameLight
-from virest.motion.alignment import OffsetEstimate
+from virest.image_formation.light import FrameLight
+from virest.inference.alignment import OffsetEstimate
 from virest.restoration import capture_estimation
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.frame import _relit

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import KernelField
+from virest.image_formation.kernels import KernelField
 from virest.restoration import blurred, clipped_light, colour, tile_layout
 from virest.restoration.settings import PRESETS
 from virest.restoration.statistics.records import PictureStatistics

@@ -13,7 +13,7 @@ from laws import TurningCamera, phone, psnr_db
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.row_motion import FrameTranslation, row_motion
+from virest.image_formation.row_motion import FrameTranslation, row_motion
 from virest.restoration.frame import (
     RestoredFrame,
     copied_frame,

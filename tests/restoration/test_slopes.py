@@ -7,7 +7,7 @@ import pytest
 from blurred_scene import camera
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import kernel_field
+from virest.image_formation.kernels import kernel_field
 from virest.restoration.blurred import BlurredPicture, blurred_picture
 from virest.restoration.statistics.measure import measure_picture
 

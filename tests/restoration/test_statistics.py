@@ -9,7 +9,7 @@ from laws import texture
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import KernelField
+from virest.image_formation.kernels import KernelField
 from virest.restoration.statistics import ring_fit, tile_power
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.on_tiles import on_spectrum

@@ -8,7 +8,7 @@ from blurred_scene import camera
 from laws import RADTAN, TurningCamera, phone
 from numpy.typing import NDArray
 
-from virest.degradation.warp import corner_points, recorded_points, straightened_points
+from virest.image_formation.warp import corner_points, recorded_points, straightened_points
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
 
 

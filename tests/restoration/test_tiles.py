@@ -10,7 +10,7 @@ import pytest
 from laws import psnr_db, random_picture, texture
 from numpy.typing import NDArray
 
-from virest.degradation.blur import Image, fast_size, tile_grid
+from virest.image_formation.blur import Image, fast_size, tile_grid
 from virest.restoration.statistics.on_tiles import packed_frequency
 from virest.restoration.tiles import (
     TileDeconvolution,

@@ -10,7 +10,7 @@ from laws import TurningCamera, phone
 
 from virest.camera.profile import CameraProfile, Extensions
 from virest.capture.records import NO_IMU, STARTUP, Frame
-from virest.degradation.row_motion import FrameTranslation, row_motion
+from virest.image_formation.row_motion import FrameTranslation, row_motion
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.capture_estimation import applied_extensions, resting_points

@@ -11,9 +11,9 @@ from laws import FISHEYE, RADTAN, TurningCamera, phone
 from numpy.typing import NDArray
 
 from virest.camera.intrinsics import Intrinsics
-from virest.degradation.row_motion import RowMotion
-from virest.degradation.warp import corner_points, recorded_points, straightened_points
 from virest.errors import SettingsError
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import corner_points, recorded_points, straightened_points
 from virest.restoration.shutter import perspective_map, rowwise_map
 from virest.restoration.undistortion import require_undistortable, undistortion_map
 

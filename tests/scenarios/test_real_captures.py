@@ -13,7 +13,7 @@ from story import Result, process
 
 from virest.capture.video import probe_movie, read_frames
 from virest.evaluation.fidelity import point_distances_px
-from virest.motion.tracking import TrackingSettings, TrackPair, track_pairs
+from virest.inference.tracking import TrackingSettings, TrackPair, track_pairs
 
 pytestmark = pytest.mark.scenario
 

@@ -23,8 +23,8 @@ from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_frames, read_gray
-from virest.degradation.row_motion import FrameTranslation, frame_times_s
 from virest.evaluation.fidelity import psnr_db
+from virest.image_formation.row_motion import FrameTranslation, frame_times_s
 from virest.restoration.capture import RestorationPlan, restore_frames
 from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame import RestoredFrame

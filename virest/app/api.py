@@ -22,8 +22,8 @@ from virest.capture.profile_source import read_any_profile
 from virest.capture.records import Capture as CaptureRecord
 from virest.capture.records import Note
 from virest.capture.video import MovieIndex, probe_movie, read_frames, read_gray
-from virest.degradation.row_motion import FrameTranslation, row_motion
 from virest.errors import CaptureError, SettingsError
+from virest.image_formation.row_motion import FrameTranslation, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.motion.trajectory import Trajectory

@@ -21,9 +21,9 @@ from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import CalibrationError, OutputError
-from virest.motion.frame_selection import high_motion_frames
-from virest.motion.guide_choice import track_guided
-from virest.motion.parallel import ParallelMap, one_by_one
+from virest.inference.frame_selection import high_motion_frames
+from virest.inference.guide_choice import track_guided
+from virest.inference.parallel import ParallelMap, one_by_one
 from virest.report.words import residual_words
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))

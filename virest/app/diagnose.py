@@ -31,7 +31,7 @@ from virest.diagnosis.restoration_gain import (
     pairs_to_keep_back,
 )
 from virest.errors import OutputError, VirestError
-from virest.motion.parallel import ParallelMap, one_by_one
+from virest.inference.parallel import ParallelMap, one_by_one
 from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
 from virest.report.words import residual_words

@@ -20,7 +20,6 @@ from virest.app.console import table
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, read_picture, write_png
 from virest.app.simulate import simulate_command
 from virest.camera.response import ResponseCurve
-from virest.degradation.row_motion import RowMotion
 from virest.errors import CaptureError
 from virest.evaluation.baselines import BASELINES, baseline_pictures
 from virest.evaluation.burst import BURSTS, REACHES, align_frames
@@ -34,6 +33,7 @@ from virest.evaluation.fidelity import (
     shift_px,
 )
 from virest.evaluation.matching import METHOD, count_matches
+from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import moving_lens
 from virest.restoration.settings import PRESETS, RestorationSettings
 

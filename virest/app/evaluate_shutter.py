@@ -22,8 +22,8 @@ from virest.evaluation.board_scenes import BoardSetting, board_session
 from virest.evaluation.boards import Board, find_board, matched, plane_lattice
 from virest.evaluation.fidelity import difference_map, fidelity, psnr_of
 from virest.evaluation.schubert2018 import fit_velocity, velocity_map
-from virest.motion.row_clock import ROW_MIDDLE, RowClock
-from virest.motion.tracking import track_pairs
+from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
+from virest.inference.tracking import track_pairs
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import warp
 from virest.simulation.recording import RecordingOptions, write_recording

@@ -17,8 +17,8 @@ from virest.app.outputs import write_whole
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
 from virest.capture.video import MovieIndex, probe_movie, read_frames, read_gray
-from virest.degradation.row_motion import RowMotion, row_motion
 from virest.errors import CaptureError, OutputError
+from virest.image_formation.row_motion import RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames

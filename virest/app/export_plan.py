@@ -20,7 +20,7 @@ from virest.capture.files import label, scan_text
 from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile
 from virest.capture.records import STALL
 from virest.errors import CaptureError, OutputError
-from virest.motion.row_clock import RowClock
+from virest.image_formation.row_clock import RowClock
 from virest.restoration.capture import at_true_times
 
 if TYPE_CHECKING:

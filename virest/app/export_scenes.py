@@ -22,9 +22,9 @@ from virest.app.outputs import plain
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
-from virest.degradation.kernels import angle_and_length, blur_chords
-from virest.degradation.row_motion import RowMotion, row_motion
 from virest.errors import CaptureError, SettingsError
+from virest.image_formation.kernels import angle_and_length, blur_chords
+from virest.image_formation.row_motion import RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.motion.trajectory import Trajectory

@@ -22,11 +22,11 @@ from virest.app.outputs import write_whole
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture
-from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import blur_chords, kernel_field
-from virest.degradation.row_motion import row_motion
+from virest.image_formation.blur import tile_grid
+from virest.image_formation.kernels import blur_chords, kernel_field
+from virest.image_formation.row_clock import ROW_MIDDLE, row_time_s
+from virest.image_formation.row_motion import row_motion
 from virest.motion.integration import integrate_gyro
-from virest.motion.row_clock import ROW_MIDDLE, row_time_s
 from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_figure
 
 Picture = NDArray[np.uint8]

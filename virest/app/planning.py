@@ -27,7 +27,7 @@ from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_gray
 from virest.errors import CaptureError, VirestError
-from virest.motion.recorder_stall import at_shown_times, fit_stall, stall_window
+from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_window
 from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.capture_estimation import plan_restoration

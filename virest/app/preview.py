@@ -14,7 +14,7 @@ from virest.app import api
 from virest.app.outputs import write_whole
 from virest.capture.folder import Frame
 from virest.errors import CaptureError, OutputError
-from virest.motion.row_clock import RowClock
+from virest.image_formation.row_clock import RowClock
 from virest.report.concepts import preview_figure
 from virest.restoration.frame import RestoredFrame
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from virest.app.jobs import process_pool, submit_uninterrupted
-from virest.motion.parallel import ParallelMap, one_by_one
+from virest.inference.parallel import ParallelMap, one_by_one
 
 log = logging.getLogger(__name__)
 

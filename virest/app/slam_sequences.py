@@ -29,10 +29,10 @@ from virest.capture.euroc import format_picture_list
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_frames
-from virest.degradation.row_motion import frame_times_s
 from virest.errors import CaptureError, SettingsError
 from virest.evaluation.structure_from_motion import SfmSettings, find_path, match_pictures
 from virest.evaluation.trajectories import CameraPath, match_times, parse_tum, tum_text
+from virest.image_formation.row_motion import frame_times_s
 from virest.restoration.capture import at_true_times
 from virest.restoration.settings import RestorationSettings
 

@@ -22,18 +22,18 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
 from virest.errors import CalibrationError
-from virest.motion import profile_terms as terms_of
-from virest.motion.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
-from virest.motion.comparable_noise import residual_px, tracking_noise_px
+from virest.image_formation.point_model import TrackTable, ground
+from virest.image_formation.row_clock import row_time_s
+from virest.inference import profile_terms as terms_of
+from virest.inference.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
+from virest.inference.comparable_noise import residual_px, tracking_noise_px
+from virest.inference.observed_tracks import ObservedTracks, observe_tracks
+from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
+from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
+from virest.inference.tracking import TrackPair
+from virest.inference.tracking_bias import bias_std
 from virest.motion.displacement import drift_std_m
-from virest.motion.observed_tracks import ObservedTracks, observe_tracks
-from virest.motion.recorder_lag import StartUpLag, fit_start_up_lag
-from virest.motion.row_clock import row_time_s
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
-from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
-from virest.motion.track_model import TrackTable, ground
-from virest.motion.tracking import TrackPair
-from virest.motion.tracking_bias import bias_std
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ A fit that ends at such a limit, or beyond it, describes no camera; it compensat
 from __future__ import annotations
 
 from virest.camera.profile import CameraProfile
-from virest.motion.profile_terms import GYRO_SCALE_OFF
+from virest.inference.profile_terms import GYRO_SCALE_OFF
 
 LEAST_READOUT_S = 1e-3
 """The fastest rolling shutters (stacked sensors, 960 frames/s) read a frame in about 1 ms; a global shutter has 0."""

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from virest.calibration.physical_limits import CLOCK_SKEW
 from virest.capture.imu import ImuSamples
-from virest.motion import profile_terms as terms_of
-from virest.motion.track_fit import TrackFit, fit_tracks
-from virest.motion.track_model import TrackTable
-from virest.motion.tracking_bias import bias_std
+from virest.image_formation.point_model import TrackTable
+from virest.inference import profile_terms as terms_of
+from virest.inference.track_fit import TrackFit, fit_tracks
+from virest.inference.tracking_bias import bias_std
 
 OPTIONAL = {
     "focal": terms_of.FOCAL,

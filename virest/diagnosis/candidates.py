@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import Evidence, Model, free_scene
-from virest.motion.recorder_lag import Schedule
+from virest.image_formation.point_model import TrackTable, ground, predict
+from virest.inference.recorder_lag import Schedule
+from virest.inference.track_fit import Term
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.track_fit import Term
-from virest.motion.track_model import TrackTable, ground, predict
 
 Array = NDArray[np.float64]
 SCREEN_POINTS = 1500

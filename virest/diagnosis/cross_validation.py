@@ -21,9 +21,9 @@ from virest.diagnosis.geometric_evidence import (
     loss,
     relief_loss,
 )
-from virest.motion.parallel import ParallelMap
-from virest.motion.track_fit import Term
-from virest.motion.track_model import TrackTable
+from virest.image_formation.point_model import TrackTable
+from virest.inference.parallel import ParallelMap
+from virest.inference.track_fit import Term
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -35,8 +35,8 @@ from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, Indices, Mask
 from virest.diagnosis.photometry_fit import HeldOut
 from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
-from virest.motion.parallel import ParallelMap, one_by_one
-from virest.motion.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock
+from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock
+from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
 Gray = NDArray[np.uint8]

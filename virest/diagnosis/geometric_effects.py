@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import READOUT_DIRECTIONS, STAMP_FRACTION
 from virest.diagnosis.findings import ParameterChange
-from virest.motion import profile_terms as terms_of
-from virest.motion.track_fit import Term
+from virest.inference import profile_terms as terms_of
+from virest.inference.track_fit import Term
 
 Array = NDArray[np.float64]
 INF = float("inf")

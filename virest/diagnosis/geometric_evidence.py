@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from virest.calibration.physical_limits import impossible
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.motion.comparable_noise import noise_distances
-from virest.motion.observed_tracks import ObservedTracks
+from virest.image_formation.point_model import TrackTable, centre, ground, seen_s
+from virest.inference.comparable_noise import noise_distances
+from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
-from virest.motion.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
-from virest.motion.track_model import TrackTable, centre, ground, seen_s
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -46,12 +46,12 @@ from virest.diagnosis.geometric_evidence import (
     capped_rms,
     depth_of,
 )
-from virest.motion import profile_terms as terms_of
-from virest.motion.parallel import ParallelMap, one_by_one
-from virest.motion.recorder_lag import Schedule
-from virest.motion.track_fit import Term, TrackFit
-from virest.motion.track_model import TrackTable
-from virest.motion.tracking_bias import bias_std
+from virest.image_formation.point_model import TrackTable
+from virest.inference import profile_terms as terms_of
+from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.recorder_lag import Schedule
+from virest.inference.track_fit import Term, TrackFit
+from virest.inference.tracking_bias import bias_std
 
 log = logging.getLogger(__name__)
 

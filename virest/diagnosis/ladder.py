@@ -40,14 +40,14 @@ from virest.diagnosis.tracking_stage import (
     with_null_values,
 )
 from virest.errors import CaptureError
-from virest.motion.guide_choice import find_guide, track_guided
+from virest.image_formation.point_model import predict
+from virest.inference.guide_choice import find_guide, track_guided
+from virest.inference.observed_tracks import observe_tracks
+from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.recorder_lag import lag_schedules
+from virest.inference.tracking import TrackPair, track_pairs
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import observe_tracks
-from virest.motion.parallel import ParallelMap, one_by_one
-from virest.motion.recorder_lag import lag_schedules
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.track_model import predict
-from virest.motion.tracking import TrackPair, track_pairs
 
 Progress = Callable[[str, float], None]
 MOST_TRAVEL_PX = 0.35

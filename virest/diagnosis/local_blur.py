@@ -40,7 +40,7 @@ from virest.diagnosis.local_blur_spectra import (
     observe_pair,
     ring_of_bin,
 )
-from virest.motion.parallel import ParallelMap, one_by_one
+from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]

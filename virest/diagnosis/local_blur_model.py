@@ -1,7 +1,7 @@
 """What the profile predicts for the local blur: the one forward model's paths, across edges and in spectra.
 
 A fit asks for the paths of some hundred frames again and again, so they are worked out for all frames together, from
-the trajectory and the moving lens that `degradation.kernel_field` goes by as well; a test holds the two to each other.
+the trajectory and the moving lens that `image_formation.kernel_field` goes by as well; a test holds the two to each other.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from virest.camera.profile import CameraProfile
-from virest.degradation.kernels import angle_and_length, blur_chords
-from virest.degradation.row_motion import row_motion
 from virest.diagnosis.local_blur_edges import STEP_PX, fit_steps
 from virest.diagnosis.local_blur_spectra import MEMORY, SpectrumRatios, spectral_weights
+from virest.image_formation.kernels import angle_and_length, blur_chords
+from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
+from virest.image_formation.row_motion import row_motion
 from virest.motion.optics import MovingLens, moving_lens
-from virest.motion.row_clock import ROW_MIDDLE, ROW_START, RowClock
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]

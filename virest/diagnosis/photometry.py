@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.degradation.light import flicker, vignetting_at_radius
-from virest.motion.row_clock import ROW_MIDDLE, ROW_START, RowClock
+from virest.image_formation.light import flicker, vignetting_at_radius
+from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -10,7 +10,7 @@ import numpy as np
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import Array, PhotometricObservations, predict
-from virest.motion.row_clock import ROW_MIDDLE
+from virest.image_formation.row_clock import ROW_MIDDLE
 
 _SCAN_OBSERVATIONS = 7_000
 """Enough to find a frequency; larger temporaries are fetched from the system anew each time, ten times slower."""

@@ -18,7 +18,7 @@ from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
-from virest.motion.parallel import ParallelMap, one_by_one
+from virest.inference.parallel import ParallelMap, one_by_one
 
 _CAUCHY = 2.5
 """Residuals, in noises, at which the weight has fallen to a half."""

@@ -22,8 +22,8 @@ from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, PhotometricObservations
 from virest.diagnosis.photometry_noise import measured_noise
-from virest.motion.row_clock import ROW_MIDDLE, RowClock
-from virest.motion.tracking import TrackingSettings, find_corners
+from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
+from virest.inference.tracking import TrackingSettings, find_corners
 from virest.motion.trajectory import Trajectory
 
 Picture = NDArray[np.uint8]

@@ -32,7 +32,7 @@ from virest.diagnosis.photometry import PhotometricObservations, normalised_rms,
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
 from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
-from virest.motion.parallel import ParallelMap, one_by_one
+from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)

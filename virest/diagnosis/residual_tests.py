@@ -13,7 +13,7 @@ from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_ladder import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
-from virest.motion.track_model import seen_s
+from virest.image_formation.point_model import seen_s
 
 log = logging.getLogger(__name__)
 

@@ -29,14 +29,14 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
-from virest.degradation.row_motion import frame_times_s
-from virest.motion.alignment import choose_pairs
-from virest.motion.guidance import GyroGuide, MapBetween, map_between
-from virest.motion.guide_choice import find_guide
+from virest.image_formation.row_motion import frame_times_s
+from virest.inference.alignment import choose_pairs
+from virest.inference.guidance import GyroGuide, MapBetween, map_between
+from virest.inference.guide_choice import find_guide
+from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.tracking import Guide, TrackPair, track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
-from virest.motion.parallel import ParallelMap, one_by_one
-from virest.motion.tracking import Guide, TrackPair, track_pairs
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.capture_estimation import plan_restoration

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
-from virest.degradation.light import flicker
 from virest.diagnosis.candidates import FarClock
 from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges, with_description
 from virest.diagnosis.field.search import with_fields
@@ -19,17 +18,18 @@ from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
 from virest.diagnosis.picture_ladder import Reader
-from virest.motion import profile_terms as terms_of
-from virest.motion.coarse_alignment import align_coarsely, align_with_skew
-from virest.motion.frame_rotations import gyro_turns
-from virest.motion.frame_selection import high_motion_frames
+from virest.image_formation.light import flicker
+from virest.image_formation.row_clock import RowClock
+from virest.inference import profile_terms as terms_of
+from virest.inference.coarse_alignment import align_coarsely, align_with_skew
+from virest.inference.frame_rotations import gyro_turns
+from virest.inference.frame_selection import high_motion_frames
+from virest.inference.observed_tracks import CELLS, ObservedTracks
+from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.recorder_lag import Schedule
+from virest.inference.track_fit import Term
+from virest.inference.track_noise import step_noise_px
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import CELLS, ObservedTracks
-from virest.motion.parallel import ParallelMap, one_by_one
-from virest.motion.recorder_lag import Schedule
-from virest.motion.row_clock import RowClock
-from virest.motion.track_fit import Term
-from virest.motion.track_noise import step_noise_px
 
 Array = NDArray[np.float64]
 WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240

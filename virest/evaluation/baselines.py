@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import KernelField, blur_chords, kernel_field
-from virest.degradation.row_motion import RowMotion
 from virest.evaluation.dong2020 import Weights, filtered, poisson_tv_l0
+from virest.image_formation.kernels import KernelField, blur_chords, kernel_field
+from virest.image_formation.row_motion import RowMotion
 from virest.restoration.encoding import encode_picture
 from virest.restoration.shutter import rowwise_map, warp
 

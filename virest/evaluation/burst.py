@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.neighbour import neighbour_view
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.neighbour import neighbour_view
+from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.encoding import encode_picture

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.motion.tracking import TrackingSettings, find_corners
+from virest.inference.tracking import TrackingSettings, find_corners
 
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.shutter import Shutter
-from virest.motion.row_clock import row_time_s
-from virest.motion.tracking import TrackPair
+from virest.image_formation.row_clock import row_time_s
+from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
 MIN_POINTS = 12

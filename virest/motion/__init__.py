@@ -1,1 +1,1 @@
-"""How the camera moved: orientation from the gyroscope, tracked points, and the two brought together."""
+"""How the camera moved: orientation and displacement from the inertial samples, and the lens that moves with them."""

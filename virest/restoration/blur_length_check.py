@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import blur_chords, smooth_field
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.kernels import blur_chords, smooth_field
+from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import CLIPPED_LEVELS
 from virest.restoration.statistics.ring_fit import ROUNDING_POWER, RingCells
 from virest.restoration.statistics.rings import RINGS, SIDE

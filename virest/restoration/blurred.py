@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.blur import Image
-from virest.degradation.kernel_spread import KernelSpread
-from virest.degradation.kernels import KernelField
+from virest.image_formation.blur import Image
+from virest.image_formation.kernel_spread import KernelSpread
+from virest.image_formation.kernels import KernelField
 from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 

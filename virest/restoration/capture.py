@@ -13,7 +13,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s, outside_reason
-from virest.degradation.row_motion import FrameTranslation, RowMotion, row_motion
+from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.trajectory import Trajectory

@@ -16,8 +16,9 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import Capture, Frame
-from virest.degradation.row_motion import FrameTranslation, frame_times_s
-from virest.motion.alignment import (
+from virest.image_formation.row_clock import RowClock
+from virest.image_formation.row_motion import FrameTranslation, frame_times_s
+from virest.inference.alignment import (
     AGREEMENT_SLACK_S,
     COARSE_STEP_S,
     OffsetEstimate,
@@ -25,14 +26,13 @@ from virest.motion.alignment import (
     choose_pairs,
     estimate_time_offset,
 )
-from virest.motion.coarse_alignment import align_coarsely
-from virest.motion.guide_choice import find_guide
+from virest.inference.coarse_alignment import align_coarsely
+from virest.inference.guide_choice import find_guide
+from virest.inference.observed_tracks import GUESSED_FOCAL, observe_tracks
+from virest.inference.tracking import TrackPair, track_pairs
+from virest.inference.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import GUESSED_FOCAL, observe_tracks
 from virest.motion.optics import MovingLens, moving_lens
-from virest.motion.row_clock import RowClock
-from virest.motion.tracking import TrackPair, track_pairs
-from virest.motion.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.restoration.blur_length_check import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.conflict_plan import MAX_FOCAL_SPREAD, MAX_OFFSET_STD_S, explains_points, settle

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.degradation.blur import Image
+from virest.image_formation.blur import Image
 from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
 from virest.restoration.row_chunks import RowRenderer
 

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from virest.degradation.blur import Image
+from virest.image_formation.blur import Image
 from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
 from virest.restoration.encoding import grey_levels
 from virest.restoration.neighbours.joint import HALF, NeighbourPicture

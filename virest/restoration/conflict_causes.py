@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
-from virest.motion import profile_terms as terms_of
-from virest.motion.track_fit import Term
-from virest.motion.track_model import TrackTable
+from virest.image_formation.point_model import TrackTable
+from virest.inference import profile_terms as terms_of
+from virest.inference.track_fit import Term
 
 Array = NDArray[np.float64]
 SOURCE = "tracked points against the gyroscope, which contradict the profile's value"

@@ -9,12 +9,12 @@ import numpy as np
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
-from virest.motion.coarse_alignment import SKEWS
-from virest.motion.frame_rotations import scan_offsets
+from virest.inference.coarse_alignment import SKEWS
+from virest.inference.frame_rotations import scan_offsets
+from virest.inference.observed_tracks import ObservedTracks, guessed_lens, observe_tracks
+from virest.inference.tracking import TrackPair
+from virest.inference.visual_inertial import VisualInertialAlignment
 from virest.motion.integration import integrate_gyro
-from virest.motion.observed_tracks import ObservedTracks, guessed_lens, observe_tracks
-from virest.motion.tracking import TrackPair
-from virest.motion.visual_inertial import VisualInertialAlignment
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan
 from virest.restoration.profile_conflict import CONTRADICTED, MIN_PAIRS, Settled, settle_conflict
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.degradation.kernels import blur_chords
-from virest.degradation.row_motion import RowMotion
-from virest.degradation.warp import straightened_points
+from virest.image_formation.kernels import blur_chords
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import straightened_points
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.blur import Image
+from virest.image_formation.blur import Image
 from virest.restoration.row_chunks import bands
 
 _STEPS = 65535

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
-from virest.degradation.blur import tile_grid
-from virest.degradation.kernel_spread import kernel_spread
-from virest.degradation.kernels import KernelField, blur_chords, smooth_field
-from virest.degradation.light import FrameLight, equivalent_length_px, frame_light
-from virest.degradation.row_motion import RowMotion
-from virest.degradation.warp import corner_points, straightened_points
+from virest.image_formation.blur import tile_grid
+from virest.image_formation.kernel_spread import kernel_spread
+from virest.image_formation.kernels import KernelField, blur_chords, smooth_field
+from virest.image_formation.light import FrameLight, equivalent_length_px, frame_light
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
 from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture
 from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
-from virest.motion.observed_tracks import observe_tracks
-from virest.motion.recorder_lag import StartUpLag, fit_start_up_lag
-from virest.motion.tracking import track_pairs
+from virest.inference.observed_tracks import observe_tracks
+from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
+from virest.inference.tracking import track_pairs
 from virest.restoration.capture import RestorationPlan, at_true_times
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]

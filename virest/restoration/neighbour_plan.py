@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from virest.capture.folder import Capture
 from virest.capture.join import outside_reason
-from virest.degradation.blur import Image
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.blur import Image
+from virest.image_formation.row_motion import RowMotion
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame

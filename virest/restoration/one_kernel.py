@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import KernelField
 from virest.errors import SettingsError
+from virest.image_formation.blur import tile_grid
+from virest.image_formation.kernels import KernelField
 from virest.restoration.blurred import blurred_picture, clipped_anywhere
 from virest.restoration.clipped_light import unseen_kept
 from virest.restoration.deblur import deblur

@@ -8,11 +8,11 @@ import numpy as np
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.degradation.blur import tile_grid
-from virest.degradation.kernels import angle_and_length, blur_chords
-from virest.degradation.row_motion import RowMotion
-from virest.degradation.warp import corner_points, straightened_points
-from virest.motion.row_clock import ROW_END, ROW_MIDDLE, ROW_START
+from virest.image_formation.blur import tile_grid
+from virest.image_formation.kernels import angle_and_length, blur_chords
+from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
 from virest.restoration.settings import RestorationSettings
 

@@ -17,13 +17,13 @@ from scipy import stats
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.motion import profile_terms as terms_of
-from virest.motion.observed_tracks import ObservedTracks
-from virest.motion.profile_terms import CLOCK_SKEW, shift_offset
+from virest.image_formation.point_model import TrackTable, ground
+from virest.inference import profile_terms as terms_of
+from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.profile_terms import CLOCK_SKEW, shift_offset
+from virest.inference.track_fit import RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
+from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import DirectedMotion, Motion
-from virest.motion.track_fit import RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
-from virest.motion.track_model import TrackTable, ground
-from virest.motion.tracking_bias import bias_std
 from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
 
 log = logging.getLogger(__name__)

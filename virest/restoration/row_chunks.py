@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from virest.degradation.blur import Image
+from virest.image_formation.blur import Image
 
 BAND_ROWS = 64
 RowRenderer = Callable[[slice], Image]

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.degradation.row_motion import RowMotion
-from virest.degradation.warp import (
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import (
     PIXELS_WITHIN_PX,
     corner_points,
     dense_map,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from virest.degradation.blur import Image
+from virest.image_formation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.blurred import BlurredPicture
 from virest.restoration.neighbours.joint import NeighbourPicture

@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from virest.degradation.blur import Image
+from virest.image_formation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.blurred import BlurredPicture, luma_of, reduced
 from virest.restoration.clipped_light import measured_part

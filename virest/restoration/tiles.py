@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.degradation.blur import FAST_SIZES, Image, TileGrid, fast_size, tile_grid
+from virest.image_formation.blur import FAST_SIZES, Image, TileGrid, fast_size, tile_grid
 from virest.restoration.deconvolution import richardson_lucy
 
 LEAST_SIDE, LARGEST_SIDE = 0.8, 1.15

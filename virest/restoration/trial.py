@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.blur import Image, tile_grid
-from virest.degradation.kernel_spread import kernel_spread
-from virest.degradation.kernels import blur_chords, smooth_field
-from virest.degradation.light import equivalent_length_px
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.blur import Image, tile_grid
+from virest.image_formation.kernel_spread import kernel_spread
+from virest.image_formation.kernels import blur_chords, smooth_field
+from virest.image_formation.light import equivalent_length_px
+from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import blurred_picture
 from virest.restoration.frame import blurred_part, deblur_method, too_little_to_gain, trusted_share
 from virest.restoration.neighbours.refinement import RefinedMotion

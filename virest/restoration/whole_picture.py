@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from virest.degradation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
+from virest.image_formation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
 from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
 from virest.restoration.clipped_light import near_clipped
 from virest.restoration.colour import with_colour

@@ -23,7 +23,7 @@ from virest.calibration.geometry import CalibratedValue, GeometryCalibration, ca
 from virest.camera.profile import CameraProfile, read_profile
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import VirestError
-from virest.motion.guide_choice import track_guided
+from virest.inference.guide_choice import track_guided
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
-from virest.degradation.row_motion import RowMotion, row_motion
 from virest.evaluation.baselines import SCIKIT, Deconvolve, baseline_pictures, centre_psf, deblurred
+from virest.image_formation.row_motion import RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 
 Picture = NDArray[np.uint8]

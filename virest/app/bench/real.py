@@ -18,7 +18,7 @@ from virest.diagnosis.findings import Diagnosis
 from virest.diagnosis.geometric_ladder import shown
 from virest.diagnosis.ladder import diagnose_capture
 from virest.errors import VirestError
-from virest.motion.guide_choice import track_guided
+from virest.inference.guide_choice import track_guided
 
 log = logging.getLogger(__name__)
 

@@ -15,10 +15,10 @@ from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.stretches import Stretch, bridging_form, doubtful_stretches, touching
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
-from virest.motion.observed_tracks import ObservedTracks
+from virest.image_formation.point_model import TrackTable, ground
+from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.track_fit import start_scene
 from virest.motion.scene_motion import InertialMotion
-from virest.motion.track_fit import start_scene
-from virest.motion.track_model import TrackTable, ground
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

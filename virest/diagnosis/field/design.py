@@ -12,10 +12,10 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import varies
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
-from virest.motion import profile_terms as terms_of
+from virest.image_formation.point_model import Prediction, TrackTable, predict, with_profile
+from virest.inference import profile_terms as terms_of
+from virest.inference.track_fit import Term, TrackFit
 from virest.motion.scene_motion import DirectedMotion
-from virest.motion.track_fit import Term, TrackFit
-from virest.motion.track_model import Prediction, TrackTable, predict, with_profile
 
 Array = NDArray[np.float64]
 STABILISER_CUTOFFS_HZ = (0.3, 1.0, 4.0)

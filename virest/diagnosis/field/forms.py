@@ -19,7 +19,7 @@ from virest.camera.field import FORCES, KINDS, RATES, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
-from virest.motion.track_fit import Term
+from virest.inference.track_fit import Term
 
 Array = NDArray[np.float64]
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5

@@ -10,7 +10,7 @@ from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.forms import FieldForm
 from virest.diagnosis.field.stretches import Stretch
-from virest.motion.track_fit import TrackFit
+from virest.inference.track_fit import TrackFit
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from virest.diagnosis.geometric_ladder import (
     p_of,
     total_change,
 )
-from virest.motion.track_fit import Term, TrackFit
+from virest.inference.track_fit import Term, TrackFit
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from virest.camera.field import AXES, Field
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.field.forms import FieldForm
-from virest.motion.observed_tracks import ObservedTracks
+from virest.inference.observed_tracks import ObservedTracks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.degradation.blur import Image
-from virest.degradation.kernels import KernelField
-from virest.degradation.neighbour import NeighbourView
+from virest.image_formation.blur import Image
+from virest.image_formation.kernels import KernelField
+from virest.image_formation.neighbour import NeighbourView
 from virest.restoration.neighbours.registration import TileAgreement
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring

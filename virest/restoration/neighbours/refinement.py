@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from virest.degradation.neighbour import turn_jacobian_px
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.neighbour import turn_jacobian_px
+from virest.image_formation.row_motion import RowMotion
 from virest.restoration.neighbours.registration import PairTurn
 
 Array = NDArray[np.float64]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from virest.degradation.blur import Image
-from virest.degradation.kernels import KernelField, smooth_field
-from virest.degradation.neighbour import NeighbourView, turn_jacobian_px
+from virest.image_formation.blur import Image
+from virest.image_formation.kernels import KernelField, smooth_field
+from virest.image_formation.neighbour import NeighbourView, turn_jacobian_px
 
 Array = NDArray[np.float64]
 TILE = 64

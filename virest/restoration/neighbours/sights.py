@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
-from virest.degradation.blur import Image
-from virest.degradation.kernels import KernelField, kernel_field
-from virest.degradation.neighbour import neighbour_view
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.blur import Image
+from virest.image_formation.kernels import KernelField, kernel_field
+from virest.image_formation.neighbour import neighbour_view
+from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.joint import (

@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.degradation.blur import Image
-from virest.degradation.neighbour import neighbour_view
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.blur import Image
+from virest.image_formation.neighbour import neighbour_view
+from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain

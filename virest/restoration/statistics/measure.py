@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import KernelField
+from virest.image_formation.kernels import KernelField
 from virest.restoration.statistics.place_fit import place_statistics, unevenness
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics, unknown_picture
 from virest.restoration.statistics.ring_fit import RingCells, fit_rings

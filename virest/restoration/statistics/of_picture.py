@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
-from virest.degradation.kernels import KernelField, blur_chords
-from virest.degradation.row_motion import RowMotion
+from virest.image_formation.kernels import KernelField, blur_chords
+from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import clipped_anywhere
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.records import PictureStatistics, falling_power

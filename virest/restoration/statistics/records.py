@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.degradation.kernel_spread import KernelSpread
+from virest.image_formation.kernel_spread import KernelSpread
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 
 Array = NDArray[np.float64]

@@ -1,0 +1,114 @@
+"""Flicker and vignetting: by hand, as means over exposures, and through the kernels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from laws import TurningCamera, phone
+
+from virest.camera.profile import CameraProfile
+from virest.image_formation.kernels import kernel_field
+from virest.image_formation.light import equivalent_length_px, frame_light, row_light, vignetting
+from virest.image_formation.warp import straightened_points
+
+PIXELS = np.array([[0.0, 0.0], [199, 135], [37, 101], [150, 12]])
+
+
+def extended(**extensions: float) -> CameraProfile:
+    """A phone with extensions."""
+    profile = phone()
+    return replace(profile, extensions=replace(profile.extensions, **extensions))
+
+
+def test_the_mean_flicker_of_a_row_is_the_mean_over_its_exposure() -> None:
+    """Each row's factor is the mean of 1 + a sin(2π f t + φ) over [start, start + exposure] of that row."""
+    profile = extended(flicker_amplitude=0.3, flicker_frequency_hz=100.0, flicker_phase_rad=0.7)
+    motion = TurningCamera(profile, exposure_s=0.013).motion
+    instants = motion.row_start_s(PIXELS)[:, None] + (np.arange(4000) + 0.5) / 4000 * 0.013
+    expected = (1 + 0.3 * np.sin(2 * np.pi * 100 * instants + 0.7)).mean(axis=1)
+    np.testing.assert_allclose(row_light(motion, PIXELS), expected, atol=1e-7)
+    assert np.ptp(expected) > 0.02
+    short = TurningCamera(profile, exposure_s=None).motion
+    at_once = 1 + 0.3 * np.sin(2 * np.pi * 100 * short.row_start_s(PIXELS) + 0.7)
+    np.testing.assert_allclose(row_light(short, PIXELS), at_once, atol=1e-12)
+
+
+def test_a_whole_period_of_flicker_leaves_no_bands() -> None:
+    """10 ms at 100 Hz: every row gathers the same light."""
+    profile = extended(flicker_amplitude=0.3, flicker_frequency_hz=100.0)
+    np.testing.assert_allclose(row_light(TurningCamera(profile, exposure_s=0.010).motion, PIXELS), 1.0, atol=1e-12)
+
+
+def test_vignetting_worked_by_hand() -> None:
+    """A loss of 0.4 at half the diagonal; at a quarter of it 0.1; none in the middle of a picture 200 by 136."""
+    profile = extended(vignetting_corner_loss=0.4)
+    quarter = np.hypot(200, 136) / 4
+    x, y = np.array([99.5, 99.5 + quarter, -0.5, 99.5]), np.array([67.5, 67.5, -0.5, 67.5 - quarter])
+    np.testing.assert_allclose(vignetting(profile, x, y), [1.0, 0.9, 0.6, 0.9], atol=1e-12)
+
+
+def test_vignetting_goes_where_the_pixel_goes() -> None:
+    """What is recorded at p and belongs at q loses p's vignetting and gets q's."""
+    profile = extended(vignetting_corner_loss=0.5)
+    motion = TurningCamera(profile, rate_rad_s=(0.5, -3.0, 0.4)).motion
+    light = frame_light(motion, 0.5, straighten=True)
+    assert light is not None
+    x, y = 171, 88
+    there = straightened_points(motion, np.array([[x, y]], float), 0.5)
+    assert light.kept[y, x] == pytest.approx(vignetting(profile, *there[0]), abs=1e-4)
+    assert light.recorded[y, x] == pytest.approx(vignetting(profile, x, y), abs=1e-6)
+    assert light.most_change > 0.005
+    still = frame_light(motion, 0.5, straighten=False)
+    assert still is not None
+    assert still.most_change == 0.0
+    assert frame_light(TurningCamera(phone()).motion, 0.5, straighten=True) is None
+
+
+def test_clipped_light_is_not_darkened_for_a_bright_row() -> None:
+    """A clipped pixel in a row that flicker made brighter stays as bright as clipping; a measured one is evened."""
+    profile = extended(flicker_amplitude=0.3, flicker_frequency_hz=50.0, flicker_phase_rad=0.4)
+    light = frame_light(TurningCamera(profile, exposure_s=0.002).motion, 0.5, straighten=False)
+    assert light is not None
+    plane = np.ones(light.vignetting.shape, np.float32)
+    evened = light.evened(plane, plane)
+    assert evened.min() == 1.0
+    np.testing.assert_allclose(light.evened(plane, None) * light.recorded, plane, atol=1e-6)
+    assert light.evened(plane, None).min() < 0.9
+
+
+def test_defocus_spreads_a_kernel_by_its_variance() -> None:
+    """The second moments of a kernel grow by σ² along both axes, and its sum and middle stay."""
+    motion = TurningCamera(phone(), rate_rad_s=(0.9, -2.0, 0.6)).motion
+    blurred = TurningCamera(extended(defocus_sigma_px=1.4), rate_rad_s=(0.9, -2.0, 0.6)).motion
+    centres = np.array([[50.0, 100.0], [160.0, 30.0]])
+    field = kernel_field(blurred, centres)
+    before, after = kernel_field(motion, centres).arrays(field.radius_px), field.arrays()
+    offset = np.arange(-field.radius_px, field.radius_px + 1)
+    for axis in (1, 2):
+        sharp, soft = (k.sum(axis=3 - axis) for k in (before, after))
+        np.testing.assert_allclose(soft.sum(1), 1, atol=1e-5)
+        np.testing.assert_allclose(soft @ offset, sharp @ offset, atol=1e-3)
+        grown = (soft @ offset**2 - (soft @ offset) ** 2) - (sharp @ offset**2 - (sharp @ offset) ** 2)
+        np.testing.assert_allclose(grown, 1.4**2, atol=0.03)
+    half = field.scaled(0.5)
+    assert half.defocus_sigma_px == 0.7
+    np.testing.assert_allclose(half.paths_px, field.paths_px / 2)
+    assert equivalent_length_px(blurred.profile, 3.0) == pytest.approx(np.sqrt(9 + 12 * 1.4**2))
+
+
+def test_flicker_weights_the_instants_of_a_path() -> None:
+    """A light that is brighter late in the exposure moves the kernel's centre towards the path's end by that much."""
+    profile = extended(flicker_amplitude=0.8, flicker_frequency_hz=20.0, flicker_phase_rad=0.2)
+    motion = TurningCamera(profile, rate_rad_s=(0.0, -2.0, 0.0)).motion
+    centre = np.array([[104.0, 63.92]])
+    field = kernel_field(motion, centre, 0.0)
+    part = (np.arange(field.paths_px.shape[1]) + 0.5) / field.paths_px.shape[1]
+    light = 1 + 0.8 * np.sin(2 * np.pi * 20 * (motion.row_start_s(centre)[0] + part * motion.exposure_s) + 0.2)
+    expected = (field.paths_px[0, :, 0] * light).sum() / light.sum()
+    kernel = field.arrays()[0]
+    assert kernel.sum() == pytest.approx(1, abs=1e-5)
+    found = kernel.sum(axis=0) @ np.arange(-field.radius_px, field.radius_px + 1)
+    assert found == pytest.approx(expected, abs=1e-3)
+    assert abs(expected - field.paths_px[0, :, 0].mean()) > 0.05

@@ -1,0 +1,236 @@
+"""Predicted points against an independent generator; slopes against difference quotients; times of rows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motion.synthetic_tracks import Setup, recorded
+from scipy.spatial.transform import Rotation
+
+from virest.calibration.geometry import right_way_round
+from virest.camera.profile import CameraProfile
+from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
+from virest.image_formation.point_model import ground, predict, seen_s, with_profile
+from virest.inference import profile_terms as terms_of
+from virest.inference.track_fit import Term
+from virest.motion.integration import integrate_gyro
+from virest.motion.scene_motion import DirectedMotion
+
+LANDSCAPE = {"width": 640, "height": 480, "centre_px": (331.0, 226.0)}
+FAR = {
+    "portrait, read from the right": Setup(noise_px=0.0),
+    "landscape, distorted, stamped at the end": Setup(
+        seed=2, noise_px=0.0, k1=0.05, readout_direction="top_to_bottom", timestamp="exposure_end", **LANDSCAPE
+    ),
+    "skewed clock, scaled gyroscope": Setup(
+        seed=3, noise_px=0.0, readout_direction="left_to_right", clock_skew=0.003, gyro_scale=1.03, **LANDSCAPE
+    ),
+    "refocusing, read upwards, stamped at the middle": Setup(
+        seed=4, noise_px=0.0, readout_direction="bottom_to_top", timestamp="exposure_middle", focal_drift_per_s=0.02
+    ),
+    # the shift's own bend over the exposure is left out of the model: 0.03 px at 8 ms
+    "stabilised, bright light": Setup(
+        seed=5, noise_px=0.0, stabilised=(0.6, 0.7), readout_direction="top_to_bottom", exposure_s=0.001
+    ),
+}
+NEAR = {
+    "swaying": Setup(
+        seed=6, noise_px=0.0, sway_m=0.06, velocity_m_s=(0.1, -0.2, 0.15), plane_per_m=(0.1, -0.15, 0.5)
+    ),
+    "long arm, skewed clock": Setup(
+        seed=7, noise_px=0.0, sway_m=0.05, plane_per_m=(-0.1, 0.2, 0.7), arm_m=(0.03, -0.05, 0.01),
+        clock_skew=-0.002, readout_direction="bottom_to_top", **LANDSCAPE,
+    ),
+    "late accelerations": Setup(seed=8, noise_px=0.0, sway_m=0.05, plane_per_m=(0.1, 0.1, 0.4), accel_delay_s=0.002),
+}  # fmt: skip
+WINDOWS = [list(range(13)), list(range(13, 29))]
+
+
+@pytest.mark.parametrize("setup", FAR.values(), ids=FAR)
+def test_points_far_away_are_predicted_to_a_hundredth_of_a_pixel(setup: Setup) -> None:
+    """Turning only: motion of 13 px a frame, rows, exposures, clock and lens all as the generator makes them."""
+    recording, table = recorded(setup), recorded(setup).table()
+    found = predict(ground(recording.imu, recording.profile, translation=False), table, None)
+    assert np.median(np.linalg.norm(table.second_px - table.first_px, axis=1)) > 5
+    assert np.abs(found.second_px - table.second_px).max() < 0.01
+    np.testing.assert_allclose(found.first_s, recording.seen_s(table.first_px, table.first), atol=1e-9)
+    np.testing.assert_allclose(found.second_s, recording.seen_s(table.second_px, table.second), atol=1e-9)
+
+
+@pytest.mark.parametrize("windows", [None, WINDOWS], ids=["one window", "two windows"])
+@pytest.mark.parametrize("setup", NEAR.values(), ids=NEAR)
+def test_points_on_a_wall_are_predicted_to_a_hundredth_of_a_pixel(
+    setup: Setup, windows: list[list[int]] | None
+) -> None:
+    """Turning and swaying before a wall, with the true velocity, gravity, bias, delay and plane of each window."""
+    recording, table = recorded(setup), recorded(setup).table(windows)
+    known = ground(recording.imu, recording.profile, translation=True)
+    found = predict(known, table, recording.scene(table))
+    assert np.abs(found.second_px - table.second_px).max() < 0.012
+    turning = predict(known, table, None)
+    assert np.median(np.linalg.norm(turning.second_px - table.second_px, axis=1)) > 0.3
+
+
+@pytest.mark.parametrize("setup", NEAR.values(), ids=NEAR)
+def test_slopes_of_the_motion_are_difference_quotients(setup: Setup) -> None:
+    """Each entry of the motion's vector, the planes' to 0.2 %; the others leave out how the path changes depths."""
+    recording, table = recorded(setup), recorded(setup).table(WINDOWS)
+    known, scene = ground(recording.imu, recording.profile, translation=True), recording.scene(table)
+    slopes = predict(known, table, scene, slopes=True).slopes
+    assert slopes is not None
+    assert slopes.shape == (len(table), 2, 7 + 6 * 2)
+    for entry, step in enumerate([1e-3] * 6 + [1e-5] + [1e-4] * 12):
+        change = np.zeros(19)
+        change[entry] = step
+        ahead, back = (predict(known, table, scene.with_vector(scene.vector() + s * change)) for s in (1, -1))
+        quotient = (ahead.second_px - back.second_px) / (2 * step)
+        planes = entry in (10, 11, 12, 16, 17, 18)
+        assert np.abs(slopes[..., entry] - quotient).max() < (0.002 if planes else 0.12) * np.abs(quotient).max(), entry
+
+
+def test_parallax_of_a_direction_lies_along_what_travel_does() -> None:
+    """Points at any depth leave the turning's prediction along the flow of the camera's true direction."""
+    setup = Setup(seed=9, noise_px=0.0, velocity_m_s=(0.4, -0.3, 1.5), inverse_depth_per_m=(0.02, 0.2), about=(0, 0, 0))
+    recording, table = recorded(setup), recorded(setup).table()
+    known = ground(recording.imu, recording.profile, translation=False)
+    way = recording.in_trajectory_axes(np.array(setup.velocity_m_s))
+    along = predict(known, table, DirectedMotion(way[None] / np.linalg.norm(way)), slopes=True).along_px
+    assert along is not None
+    moved = table.second_px - predict(known, table, None).second_px
+    unit = along / np.linalg.norm(along, axis=1, keepdims=True)
+    across = moved[:, 0] * unit[:, 1] - moved[:, 1] * unit[:, 0]
+    assert np.quantile(np.linalg.norm(moved, axis=1), 0.9) > 2
+    assert np.abs(across).max() < 0.02
+    # c₁ − c₂ points back along the travel
+    assert ((moved * unit).sum(axis=1) < 0.01).all()
+
+
+# ── the gyroscope's part ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_angular_acceleration_is_the_slope_of_the_rate() -> None:
+    """Against the generator's rate, differentiated numerically, and nowhere else than in camera axes."""
+    recording = recorded(FAR["portrait, read from the right"])
+    trajectory = integrate_gyro(recording.imu, recording.profile)
+    time_s = np.array([[0.1007, 0.3333], [0.5, 0.9114]])
+    found = trajectory.angular_acceleration_rad_s2(time_s)
+    truth = (recording.rate(time_s.ravel() + 1e-5) - recording.rate(time_s.ravel() - 1e-5)) / 2e-5
+    assert found.shape == (2, 2, 3)
+    np.testing.assert_allclose(found.reshape(-1, 3), truth, atol=2e-3 * np.abs(truth).max())
+    quotient = (trajectory.rate_rad_s(time_s + 1e-6) - trajectory.rate_rad_s(time_s - 1e-6)) / 2e-6
+    np.testing.assert_allclose(found, quotient, atol=1e-4)
+
+
+def test_mean_orientation_is_the_mean_over_the_exposure() -> None:
+    """SciPy's mean of the orientations over 40 ms, to 2 % of what the exposure bends; over no time, the middle's."""
+    recording = recorded(replace(FAR["portrait, read from the right"], rate_rad_s=1.5))
+    trajectory = integrate_gyro(recording.imu, recording.profile)
+    middle_s, exposure_s = np.array([0.21, 0.4, 0.77]), np.array([0.04, 0.03, 0.04])
+    found = Rotation.from_matrix(trajectory.mean_orientation(middle_s, exposure_s))
+    nodes = np.linspace(-0.5, 0.5, 401)[:-1] + 0.5 / 400
+    truth = Rotation.concatenate(
+        [
+            Rotation.from_matrix(trajectory.orientation(m + e * nodes)).mean()
+            for m, e in zip(middle_s, exposure_s, strict=True)
+        ]
+    )
+    plain = Rotation.from_matrix(trajectory.orientation(middle_s))
+    bend = (plain.inv() * truth).magnitude()
+    assert bend.min() > 1e-4
+    assert ((found.inv() * truth).magnitude() < 0.05 * bend).all()
+    np.testing.assert_allclose(trajectory.mean_orientation(middle_s, 0 * exposure_s), plain.as_matrix(), atol=1e-12)
+
+
+# ── times of rows ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def phone(readout_s: float, direction: str) -> CameraProfile:
+    """A phone whose size, stamp and clock are nothing special."""
+    return CameraProfile(
+        480, 640, shutter=Shutter(readout_s, direction, "exposure_end", 0.9), time_offset_s=0.031, clock_skew=0.0
+    )
+
+
+POINTS_PX = np.random.default_rng(5).uniform((0, 0), (480, 640), (50, 2))
+
+
+@pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
+def test_a_readout_below_nought_is_one_the_other_way(direction: str) -> None:
+    """Every point is seen at the same time before and after the profile is put right, and twice changes nothing."""
+    backwards = phone(-0.0193, direction)
+    right = right_way_round(backwards)
+    assert right.shutter.readout_time_s == 0.0193
+    assert right.shutter.readout_direction != direction
+    assert right.shutter.reads_columns == backwards.shutter.reads_columns
+    before, after = (seen_s(p, POINTS_PX, np.full(50, 0.7), np.full(50, 0.011)) for p in (backwards, right))
+    np.testing.assert_allclose(after, before, atol=1e-12)
+    assert np.ptp(before) > 0.015
+    assert right_way_round(right) == right
+
+
+@pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
+def test_the_readouts_step_keeps_the_middle_row(direction: str) -> None:
+    """From +12 ms through nought to −9 ms: the row at half the readout keeps its time, the others turn about it."""
+    before, after = phone(0.012, direction), terms_of.add_readout(phone(0.012, direction), np.array([-0.021]))
+    assert after.shutter.readout_time_s == pytest.approx(-0.009)
+    fraction = before.shutter.readout_fraction(POINTS_PX, 480, 640)
+    change = np.subtract(*(seen_s(p, POINTS_PX, np.full(50, 0.7), np.full(50, 0.011)) for p in (after, before)))
+    np.testing.assert_allclose(change, -0.021 * (fraction - 0.5), atol=1e-12)
+
+
+# ── the table and what is kept ───────────────────────────────────────────────────────────────────────────────────
+
+TERMS = [value for value in vars(terms_of).values() if isinstance(value, Term)]
+
+
+@pytest.mark.parametrize("term", TERMS, ids=lambda term: term.name)
+def test_what_is_kept_from_profile_to_profile_changes_no_prediction(term: Term) -> None:
+    """A ground carried over to a changed profile predicts like one made afresh, with and without translation."""
+    setup = replace(NEAR["long arm, skewed clock"], points=4)
+    recording, table = recorded(setup), recorded(setup).table()
+    known = ground(recording.imu, recording.profile, translation=True)
+    changed = term.change(recording.profile, 3 * np.array(term.quotient))
+    assert changed != recording.profile
+    for scene in (None, recording.scene(table)):
+        carried = predict(with_profile(known, recording.imu, changed), table, scene)
+        fresh = predict(ground(recording.imu, changed, translation=True), table, scene)
+        np.testing.assert_allclose(carried.second_px, fresh.second_px, rtol=0, atol=1e-9)
+        assert np.abs(carried.second_px - predict(known, table, scene).second_px).max() > 1e-4
+
+
+@pytest.mark.parametrize("term", TERMS, ids=lambda term: term.name)
+def test_a_terms_steps_add_up_and_can_be_taken_back(term: Term) -> None:
+    """Each value alone: two steps are one of their sum, and the step back leads home."""
+    setup = replace(NEAR["long arm, skewed clock"], points=4, stabilised=(0.3, 0.8), k1=0.02)
+    recording, table = recorded(setup), recorded(setup).table()
+
+    def predicted(profile: CameraProfile) -> np.ndarray:
+        return predict(ground(recording.imu, profile, translation=False), table, None).second_px
+
+    for k, quotient in enumerate(term.quotient):
+        step = quotient * np.eye(len(term))[k]
+        once = term.change(recording.profile, step)
+        np.testing.assert_allclose(
+            predicted(term.change(once, 2 * step)), predicted(term.change(recording.profile, 3 * step)), atol=1e-6
+        )
+        np.testing.assert_allclose(predicted(term.change(once, -step)), predicted(recording.profile), atol=1e-6)
+
+
+def test_table_lays_out_pairs_in_windows() -> None:
+    """Pairs rise from 0, each with its window; a window's origin is the middle of its pairs' stamps."""
+    recording = recorded(Setup(frames=9, points=5))
+    table = recording.table([[0, 1, 2, 3, 4], [5, 6, 7]])
+    assert table.n_pairs == 8
+    assert table.n_windows == 2
+    assert len(table) == sum(map(len, recording.pairs))
+    np.testing.assert_array_equal(table.window, table.pair >= 5)
+    np.testing.assert_array_equal(table.second, table.first + 1)
+    np.testing.assert_allclose(table.origin_s, [np.mean(recording.stamp_s[:6]), np.mean(recording.stamp_s[5:9])])
+    np.testing.assert_array_equal(table.second_stamp_s, recording.stamp_s[table.pair + 1])
+    np.testing.assert_array_equal(table.first_exposure_s, recording.exposure_s[table.pair])
+    some = table.chosen(table.pair % 3 == 2)
+    assert set(some.pair) == {2, 5}
+    assert some.n_windows == 2
+    np.testing.assert_array_equal(some.first_px, table.first_px[table.pair % 3 == 2])

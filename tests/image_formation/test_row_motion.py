@@ -1,0 +1,163 @@
+"""Rows in time and poses between times, against SciPy's rotations at a constant rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from laws import TurningCamera, phone
+from scipy.spatial.transform import Rotation
+
+from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
+from virest.capture.imu import ImuSamples
+from virest.image_formation.row_motion import FrameTranslation, row_motion
+from virest.motion.integration import integrate_gyro
+from virest.motion.relief_surface import Relief
+
+CAMERA = TurningCamera(phone(), velocity_m_s=(0.4, -0.25, 0.6))
+
+
+def test_poses_are_those_of_a_constant_turn() -> None:
+    """At a constant rate ω, R_t_ref = exp(−ω (t − ref)): through bias, scale, mounting and clock of the gyroscope."""
+    motion = CAMERA.motion
+    time_s = motion.start_s + np.linspace(0, 0.03, 7)
+    rotation, _ = motion.pose(time_s)
+    since = (time_s - motion.reference_s)[:, None]
+    expected = Rotation.from_rotvec(-since * np.array(CAMERA.rate_rad_s)).as_matrix()
+    np.testing.assert_allclose(rotation, expected, atol=1e-9)
+
+
+def test_poses_carry_the_translation() -> None:
+    """A point fixed in the world is at R_t_ref (X − v (t − ref)) in camera axes."""
+    motion = CAMERA.motion
+    point, velocity = np.array([0.3, -0.2, 2.5]), np.array(CAMERA.velocity_m_s)
+    since = 0.0173
+    rotation, translation = motion.pose(motion.reference_s + since)
+    expected = Rotation.from_rotvec(-since * np.array(CAMERA.rate_rad_s)).apply(point - since * velocity)
+    assert translation is not None
+    np.testing.assert_allclose(rotation @ point + translation, expected, atol=1e-6)
+
+
+SWAY = FrameTranslation(
+    np.array([0.4, -0.25, 0.6]), np.array([-3.0, 5.0, 2.0]), np.array([0.08, -0.11, 0.45]), 1 / 0.45, "profile"
+)
+"""A camera that also accelerates, before a plane that leans away."""
+
+
+def test_an_accelerated_camera_is_where_the_law_puts_it() -> None:
+    """The centre is at v (t − ref) + ½ a (t − ref)² in the axes at the reference; its velocity is v + a (t − ref)."""
+    motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=SWAY)
+    since = 0.0231
+    rotation, shift = motion.pose(motion.reference_s + since)
+    assert shift is not None
+    centre = -rotation.T @ shift
+    np.testing.assert_allclose(centre, since * SWAY.velocity_m_s + since**2 / 2 * SWAY.acceleration_m_s2, atol=1e-7)
+    np.testing.assert_allclose(SWAY.velocity_at(0.1), [0.1, 0.25, 0.8])
+
+
+def test_the_plane_stays_where_it_is_while_the_camera_moves() -> None:
+    """A point on the plane has, at any time, the inverse depth that the plane gives on the ray to it."""
+    motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=SWAY)
+    rays = np.array([[0.3, -0.2, 1.0], [-0.4, 0.25, 1.0]])
+    points = rays / (rays @ SWAY.inverse_depth_plane)[:, None]
+    for since in (0.0, 0.011, 0.03):
+        time_s = motion.reference_s + since
+        rotation, shift = motion.pose(time_s)
+        seen = points @ rotation.T + shift
+        np.testing.assert_allclose(motion.inverse_depth(seen / seen[:, 2:], time_s), 1 / seen[:, 2], atol=1e-9)
+    beyond = np.array([[0.0, 9.0, 1.0]])
+    assert motion.inverse_depth(beyond, motion.reference_s).tolist() == [0.0]
+
+
+BUMP = Relief(
+    np.array([-0.6, -0.5]),
+    np.array([1.2, 1.0]),
+    np.array([[0.0, 0.05, 0.0, -0.1], [0.1, 0.4, 0.2, 0.0], [0.0, 0.1, 0.0, 0.05]], np.float32),
+    np.full((2, 2), 0.01, np.float32),
+)
+
+
+def test_a_surface_stays_where_it_is_while_the_camera_moves() -> None:
+    """A point on the surface has, at any time, the inverse depth that the surface gives on the ray to it."""
+    motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=replace(SWAY, relief=BUMP))
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 6))
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=-1)
+    above = BUMP.at(rays)
+    points = rays / (rays @ SWAY.inverse_depth_plane + above)[:, None]
+    assert np.ptp(above) > 0.3
+    for since in (0.0, 0.011, 0.03):
+        time_s = np.full(len(points), motion.reference_s + since)
+        rotation, shift = motion.pose(time_s)
+        seen = np.einsum("nij,nj->ni", rotation, points) + shift
+        np.testing.assert_allclose(motion.inverse_depth(seen / seen[:, 2:], time_s), 1 / seen[:, 2], atol=2e-4)
+
+
+def test_relative_poses_compose() -> None:
+    """From a to b and from b to c is from a to c, in turn and shift; there and back is nothing."""
+    motion = CAMERA.motion
+    a, b, c = motion.start_s + np.array([0.001, 0.0113, 0.0278])
+    (r_ab, t_ab), (r_bc, t_bc), (r_ac, t_ac) = (motion.relative_pose(*p) for p in ((a, b), (b, c), (a, c)))
+    assert t_ab is not None
+    np.testing.assert_allclose(r_bc @ r_ab, r_ac, atol=1e-13)
+    np.testing.assert_allclose(r_bc @ t_ab + t_bc, t_ac, atol=1e-13)
+    r_ba, t_ba = motion.relative_pose(b, a)
+    np.testing.assert_allclose(r_ba @ r_ab, np.eye(3), atol=1e-13)
+    np.testing.assert_allclose(r_ba @ t_ab + t_ba, 0, atol=1e-13)
+
+
+def test_the_reference_is_at_rest_with_itself() -> None:
+    """At the reference time nothing has moved, whichever reference was asked for."""
+    for reference in ("exposure-start", "frame-middle"):
+        motion = replace(CAMERA, reference=reference).motion
+        rotation, translation = motion.pose(motion.reference_s)
+        np.testing.assert_allclose(rotation, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(translation, 0, atol=1e-7)
+
+
+def test_without_a_velocity_only_the_rotation_is_known() -> None:
+    """An unknown translation is None, never a silent zero."""
+    motion = TurningCamera(phone()).motion
+    assert motion.translation_m is None
+    assert motion.relative_pose(motion.start_s, motion.start_s + 0.01)[1] is None
+
+
+def test_times_of_a_frame_worked_by_hand() -> None:
+    """Stamp 2 s at the exposure's end, 10 ms logged x 1.2 = 12 ms: start 1.988 s, then skew 1e-3 and offset 0.05 s."""
+    shutter = Shutter(0.02, "bottom_to_top", "exposure_end", 1.2)
+    profile = phone(shutter=shutter, clock_skew=1e-3, time_offset_s=0.05)
+    camera = TurningCamera(profile, stamp_s=2.0, exposure_s=0.010, reference="frame-middle")
+    motion = camera.motion
+    assert motion.start_s == pytest.approx(1.988 * 1.001 + 0.05)
+    assert motion.exposure_s == pytest.approx(0.012)
+    assert motion.reference_s == pytest.approx(motion.start_s + 0.010 + 0.006)
+    assert replace(camera, reference="exposure-start").motion.reference_s == motion.start_s
+
+
+def test_an_unknown_exposure_counts_as_none() -> None:
+    """Without an exposure time the rows' starts are still known, and the exposure is 0."""
+    motion = TurningCamera(phone(), exposure_s=None).motion
+    assert motion.exposure_s == 0.0
+    assert motion.start_s == pytest.approx(0.1 * (1 + 2e-4) + 0.0031)
+
+
+@pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
+def test_rows_start_at_their_own_times(direction: str) -> None:
+    """A row's start is the first row's plus its part of the readout, in all four directions."""
+    camera = TurningCamera(phone(readout_direction=direction))
+    points = np.array([[0, 0], [199, 135], [37, 101], [-5, 140]], float)
+    motion = camera.motion
+    np.testing.assert_allclose(motion.row_start_s(points), camera.row_start_s(points, motion.start_s), atol=1e-12)
+
+
+def test_the_table_follows_a_shaking_hand() -> None:
+    """At 6 Hz and 3 rad/s the tabulated pose is the trajectory's to a micro-radian, between the grid's points too."""
+    time_s = np.arange(-0.2, 0.5, 0.0025)
+    rate = 3.0 * np.sin(2 * np.pi * 6 * time_s[:, None] + np.array([0.3, 1.9, 4.0]))
+    profile = phone()
+    samples = ImuSamples(time_s, rate @ profile.rotation_cam_imu, np.full((len(time_s), 3), np.nan))
+    trajectory = integrate_gyro(samples, profile)
+    motion = row_motion(trajectory, profile, 0.13, 0.015)
+    at = motion.start_s + np.random.default_rng(0).uniform(0, 0.036, 200)
+    expected = np.swapaxes(trajectory.orientation(at), -1, -2) @ trajectory.orientation(motion.reference_s)
+    np.testing.assert_allclose(motion.pose(at)[0], expected, atol=1e-6)

@@ -1,0 +1,334 @@
+"""Time offset and agreement: tracks made from an analytic motion, a small rendered capture, and measured ones."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motion.synthetic_motion import R_CAM_IMU, Setup, Synthetic, hand_motion, make
+
+from virest.camera.profile import CameraProfile, read_profile
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Frame
+from virest.inference.alignment import Agreement, OffsetEstimate, check_agreement, choose_pairs, estimate_time_offset
+from virest.inference.tracking import TrackPair, track_pairs
+
+DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
+
+
+def estimate(setup: Setup) -> OffsetEstimate:
+    """Record and estimate."""
+    return estimate_time_offset(*make(setup).arguments)
+
+
+def agreement(recorded: Synthetic, time_offset_s: float) -> Agreement:
+    """Check a recording against its own profile with this offset."""
+    profile = replace(recorded.profile, time_offset_s=time_offset_s)
+    return check_agreement(*recorded.arguments[:4], profile)
+
+
+# ── what is found ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("time_offset_s", [0.0, 0.013, -0.4])
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_offset_and_bias_come_back(time_offset_s: float, direction: str) -> None:
+    """For all readout directions and near or far offsets the offset returns to 0.1 ms, the bias to 1 mrad/s."""
+    stamp = ("exposure_start", "exposure_middle", "exposure_end")[DIRECTIONS.index(direction) % 3]
+    setup = Setup(
+        hand_motion(DIRECTIONS.index(direction)),
+        time_offset_s=time_offset_s,
+        readout_direction=direction,
+        timestamp=stamp,
+        frames=30,
+        points=60,
+    )
+    found = estimate(setup)
+    assert found.determined, found.reason
+    assert abs(found.time_offset_s - time_offset_s) < 1e-4
+    assert found.std_s < 3e-4
+    np.testing.assert_allclose(found.bias_rad_s, setup.bias_rad_s, atol=1e-3)
+    assert found.translation == "rotation"
+    assert 0.08 < found.noise_px < 0.13
+
+
+@pytest.mark.parametrize("error_s", [0.007, -0.012])
+def test_an_offset_a_little_wrong_agrees_but_not_best(error_s: float) -> None:
+    """Pictures and gyroscope belong together, and where they agree clearly better is told, coarsely."""
+    recorded = make(Setup(hand_motion(2), time_offset_s=0.011, frames=30, points=60))
+    right, wrong = agreement(recorded, 0.011), agreement(recorded, 0.011 + error_s)
+    assert right.agrees
+    assert wrong.agrees
+    assert wrong.best_offset_s == pytest.approx(0.011, abs=3e-3)
+    assert right.best_offset_s is None or abs(right.best_offset_s - 0.011) < 3e-3
+
+
+@pytest.mark.parametrize(
+    ("velocity_m_s", "depth_m"), [((0.1, -0.1, 3.0), (5.0, 60.0)), ((0.2, 0.1, 0.0), (1.5, 12.0))], ids=["car", "sway"]
+)
+def test_parallax_is_told_from_rotation(velocity_m_s: tuple[float, float, float], depth_m: tuple[float, float]) -> None:
+    """A camera that also moves gives its offset within three standard deviations, and within half a millisecond."""
+    for seed in range(3):
+        motion = hand_motion(30 + seed, 0.25, velocity_m_s=velocity_m_s)
+        setup = Setup(motion, time_offset_s=-0.005, depth_m=depth_m, points=100, seed=seed)
+        found = estimate(setup)
+        assert found.determined, found.reason
+        assert found.translation != "rotation"
+        assert abs(found.time_offset_s + 0.005) < min(3 * found.std_s, 5e-4)
+
+
+def test_moving_objects_are_outvoted() -> None:
+    """A quarter of the points on an object that moves by itself changes nothing."""
+    found = estimate(Setup(hand_motion(6, 0.3), time_offset_s=-0.021, outliers=0.25))
+    assert found.determined, found.reason
+    assert abs(found.time_offset_s + 0.021) < 1.5e-4
+
+
+def test_errors_fit_their_standard_deviations() -> None:
+    """Over twelve recordings with few noisy points, errors divided by standard deviations stay sane."""
+    ratios = []
+    for seed in range(12):
+        found = estimate(
+            Setup(hand_motion(seed, 0.15), time_offset_s=0.02, points=20, frames=20, noise_px=0.4, seed=seed)
+        )
+        assert found.determined, found.reason
+        ratios.append((found.time_offset_s - 0.02) / found.std_s)
+    assert 0.2 < np.std(ratios) < 1.6
+    assert np.max(np.abs(ratios)) < 4
+
+
+def test_wrong_readout_shows_in_the_standard_deviation() -> None:
+    """With a readout 6 % off, the middle row's time is right, and the deviation covers what the first row's is off."""
+    setup = Setup(hand_motion(80, 0.3), readout_time_s=0.0207)
+    recorded = make(setup)
+    wrong = replace(recorded.profile, shutter=replace(recorded.profile.shutter, readout_time_s=0.022))
+    found = estimate_time_offset(*recorded.arguments[:4], wrong)
+    assert abs(found.centre_offset_s - 0.5 * 0.0207) < 2e-4
+    assert abs(found.time_offset_s) < 2 * found.std_s
+
+
+def test_unknown_readout_is_a_nuisance() -> None:
+    """An unknown readout is fitted beside the offset; the deviation says that only their sum is sure."""
+    setup = Setup(hand_motion(60, 0.3), time_offset_s=0.1)
+    recorded = make(setup)
+    unknown = replace(
+        recorded.profile, readout_known=False, shutter=replace(recorded.profile.shutter, readout_time_s=0.0)
+    )
+    found = estimate_time_offset(*recorded.arguments[:4], unknown)
+    assert found.determined
+    assert abs(found.readout_s - setup.readout_time_s) < 1e-3
+    assert 1e-3 < found.std_s < 5e-3
+    assert abs(found.at_readout(0.0) - (0.1 + 0.5 * setup.readout_time_s)) < 2e-4
+    assert "readout unknown" in found.reason
+
+
+def test_unknown_focal_length_is_found_with_the_offset() -> None:
+    """Without intrinsics the motion gives the focal length to a percent, and the offset all the same."""
+    recorded = make(Setup(hand_motion(71, 0.3), time_offset_s=0.1))
+    found = estimate_time_offset(*recorded.arguments[:4], replace(recorded.profile, intrinsics=None))
+    assert found.determined, found.reason
+    assert found.focal_px is not None
+    assert abs(found.focal_px / 980.0 - 1) < 0.01
+    assert abs(found.time_offset_s - 0.1) < 1e-3
+
+
+def test_drifting_clock_is_named() -> None:
+    """A clock skew that the profile lacks is reported, and the deviation widens to hold the first stamp's offset."""
+    recorded = make(Setup(hand_motion(50, 0.3), time_offset_s=0.1, clock_skew=0.004, frames=60, points=50))
+    found = estimate_time_offset(*recorded.arguments[:4], replace(recorded.profile, clock_skew=0.0))
+    assert abs(found.drift_s_per_s - 0.004) < 5e-4
+    assert abs(found.time_offset_s - 0.1) < 2 * found.std_s
+    assert "drifts" in found.reason
+
+
+# ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("motion", "word"),
+    [(hand_motion(1, 0.0004), "hardly turn"), (hand_motion(1, 1e-7, pan_rad_s=(0.1, 0.5, 0.05)), "hardly turn")],
+    ids=["still", "steady pan"],
+)
+def test_motion_that_tells_nothing_is_refused(motion: object, word: str) -> None:
+    """A still camera, and one that turns at a constant rate, look the same at every offset."""
+    recorded = make(Setup(motion, frames=20, points=40))  # type: ignore[arg-type]
+    found = estimate_time_offset(*recorded.arguments)
+    assert not found.determined
+    assert word in found.reason
+    assert not np.isfinite(found.std_s)
+    still = agreement(recorded, 0.0)
+    assert still.agrees
+    assert "too little motion" in still.reason
+
+
+def foreign(recorded: Synthetic, seed: int) -> ImuSamples:
+    """Make the gyroscope of another hand."""
+    return replace(recorded.imu, gyro_rad_s=hand_motion(900 + seed).rate(recorded.imu.time_s) @ np.array(R_CAM_IMU))
+
+
+def shuffled(recorded: Synthetic, seed: int) -> ImuSamples:
+    """Cut the gyroscope's table into twelve pieces and mix them."""
+    pieces = np.array_split(recorded.imu.gyro_rad_s, 12)
+    order = np.random.default_rng(seed).permutation(12)
+    return replace(recorded.imu, gyro_rad_s=np.concatenate([pieces[k] for k in order]))
+
+
+def backwards(recorded: Synthetic, seed: int) -> ImuSamples:
+    """Play the gyroscope's table backwards."""
+    return replace(recorded.imu, gyro_rad_s=recorded.imu.gyro_rad_s[::-1])
+
+
+@pytest.mark.parametrize(("spoil", "frames"), [(foreign, 12), (foreign, 30), (backwards, 30)])
+def test_strange_gyroscopes_are_refused(spoil: Callable[[Synthetic, int], ImuSamples], frames: int) -> None:
+    """The gyroscope of another recording, or one played backwards, gives no offset and no agreement."""
+    for seed in range(8):
+        recorded = make(Setup(hand_motion(seed), frames=frames, points=25, seed=seed))
+        recorded = replace(recorded, imu=spoil(recorded, seed))
+        found = estimate_time_offset(*recorded.arguments)
+        assert not found.determined
+        assert "gyroscope" in found.reason or "equally well" in found.reason
+        assert not agreement(recorded, 0.0).agrees
+
+
+def test_shuffled_gyroscope_is_never_taken_at_a_wrong_offset() -> None:
+    """Pieces of the right recording in the wrong order: refused."""
+    for seed in range(6):
+        recorded = make(Setup(hand_motion(seed), points=25, seed=seed))
+        recorded = replace(recorded, imu=shuffled(recorded, seed))
+        assert not estimate_time_offset(*recorded.arguments).determined
+
+
+def test_few_tracks_are_refused() -> None:
+    """Pairs with a handful of points, or a handful of pairs, determine nothing."""
+    recorded = make(Setup(hand_motion(2), points=8, frames=20))
+    assert "tracked points" in estimate_time_offset(*recorded.arguments).reason
+    recorded = make(Setup(hand_motion(2), points=40, frames=6))
+    assert not estimate_time_offset(*recorded.arguments).determined
+    assert not estimate_time_offset([], *recorded.arguments[1:]).determined
+
+
+def test_gyroscope_elsewhere_in_time_is_refused() -> None:
+    """Inertial data that end before the frames begin are said to not cover them."""
+    recorded = make(Setup(hand_motion(2), points=40, frames=20))
+    late = [*recorded.arguments]
+    late[1] = recorded.frame_time_s + 50.0
+    assert "cover" in estimate_time_offset(*late).reason  # type: ignore[arg-type]
+
+
+def test_offset_beyond_the_search_is_refused() -> None:
+    """An offset outside the search is not replaced by the best one inside."""
+    recorded = make(Setup(hand_motion(3), time_offset_s=0.4, points=40))
+    assert not estimate_time_offset(*recorded.arguments, search_s=0.2).determined
+
+
+def test_agreement_names_a_better_offset() -> None:
+    """At a wrong offset the pictures do not agree, and the offset at which they would is said."""
+    recorded = make(Setup(hand_motion(4), time_offset_s=-0.3, points=40))
+    assert agreement(recorded, -0.3).agrees
+    wrong = agreement(recorded, 0.0)
+    assert not wrong.agrees
+    assert wrong.best_offset_s == pytest.approx(-0.3, abs=0.02)
+
+
+# ── which frames ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_chosen_frames_are_few_lively_and_spread() -> None:
+    """From a long capture at most 60 frames come, in runs, preferring motion, none of those to be skipped."""
+    frames = [Frame(k, k, k / 30, skip_reason="start-up" if k < 12 else None) for k in range(3000)]
+    time_s = np.arange(-1, 101, 0.005)
+    lively = np.where((time_s % 20 > 8) & (time_s % 20 < 9), 1.0, 0.01)
+    imu = ImuSamples(
+        time_s, lively[:, None] * np.sin(20 * time_s)[:, None] * np.ones(3), np.full((len(time_s), 3), np.nan)
+    )
+    chosen = choose_pairs(frames, imu)
+    assert 40 <= len(chosen) <= 60
+    assert chosen == sorted(set(chosen))
+    assert min(chosen) >= 12
+    assert sum(np.diff(chosen) == 1) >= 0.8 * len(chosen)
+    assert max(chosen) - min(chosen) > 1500
+    assert np.mean([7.5 < (k / 30) % 20 < 9.5 for k in chosen]) > 0.6
+
+
+def test_short_captures_are_taken_whole() -> None:
+    """Up to the cap every usable frame is taken."""
+    frames = [Frame(k, k, k / 30) for k in range(25)]
+    imu = ImuSamples(np.arange(0, 1, 0.01), np.ones((100, 3)), np.full((100, 3), np.nan))
+    assert choose_pairs(frames, imu) == list(range(25))
+
+
+# ── measured captures ────────────────────────────────────────────────────────────────────────────────────────────
+
+Measured = tuple[list[TrackPair], list[float], list[float | None], ImuSamples, CameraProfile]
+
+
+def measured(name: str) -> Measured:
+    """Track a measured capture; skipped where there are none."""
+    root = os.environ.get("VIREST_REALDATA")
+    if not root or not (Path(root) / name).is_dir():
+        pytest.skip("VIREST_REALDATA does not point to the measured captures")
+    from virest.capture.folder import read_capture
+    from virest.capture.video import probe_movie, read_gray
+
+    folder = Path(root) / name
+    capture = read_capture(folder, look_at_pictures=False)
+    chosen = choose_pairs(capture.frames, capture.imu)
+    pairs = track_pairs(read_gray(capture.movie, probe_movie(capture.movie), chosen))
+    stamps = [frame.time_s for frame in capture.frames]
+    return (
+        pairs,
+        stamps,
+        [frame.exposure_s for frame in capture.frames],
+        capture.imu,
+        read_profile(folder / "camera.yaml"),
+    )
+
+
+def test_car_recording_gives_its_offset() -> None:
+    """lhaippp_car: −5.1 ms within two deviations though the nominal readout is 5 % long; its middle row to 0.4 ms."""
+    recorded = measured("lhaippp_car")
+    found = estimate_time_offset(*recorded)
+    assert found.determined, found.reason
+    assert abs(found.time_offset_s + 0.0051) < 2 * found.std_s
+    assert found.std_s < 2e-3
+    middle_row_mid_exposure_s = found.centre_offset_s + 0.5 * 0.00535
+    assert abs(middle_row_mid_exposure_s - 0.0134) < 4e-4
+    assert check_agreement(*recorded[:4], replace(recorded[4], time_offset_s=found.time_offset_s)).agrees
+
+
+def test_shaken_phone_gives_nearly_half_a_second() -> None:
+    """nexus5_162941: the offset is found from zero, its drift and its unknown exposure and readout are said."""
+    recorded = measured("nexus5_162941")
+    found = estimate_time_offset(*recorded)
+    assert found.determined, found.reason
+    assert 0.39 < found.time_offset_s < 0.47
+    assert abs(found.centre_offset_s - 0.461) < 0.006
+    assert found.std_s > 0.005
+    assert "drifts" in found.reason
+    assert found.drift_s_per_s > 0.001
+    assert check_agreement(*recorded[:4], replace(recorded[4], time_offset_s=found.time_offset_s)).agrees
+
+
+def test_gimballed_drone_gives_its_offset() -> None:
+    """gopro_karma: −20 to −30 ms, with a deviation above a millisecond since the readout is unknown."""
+    recorded = measured("gopro_karma")
+    found = estimate_time_offset(*recorded)
+    assert found.determined, found.reason
+    assert -0.032 < found.time_offset_s < -0.018
+    assert found.std_s > 1e-3
+    assert check_agreement(*recorded[:4], replace(recorded[4], time_offset_s=found.time_offset_s)).agrees
+
+
+def test_pictures_stabilised_in_the_camera_are_refused() -> None:
+    """gopro_hero7: no offset, no agreement, at any offset."""
+    recorded = measured("gopro_hero7")
+    found = estimate_time_offset(*recorded)
+    assert not found.determined
+    assert "do not follow" in found.reason
+    verdict = check_agreement(*recorded[:4], replace(recorded[4], time_offset_s=0.0))
+    assert not verdict.agrees
+    assert verdict.best_offset_s is None

@@ -1,0 +1,1 @@
+"""The forward model: how motion, shutter and exposure form a picture. Nobody keeps a second one."""

@@ -1,0 +1,67 @@
+"""How well kernels are known: the spread of their spectra where the blur path's end is uncertain.
+
+A path d(t) that is known up to a + a constant speed, d(t) + a τ(t) with a of covariance C (pixels over the exposure)
+and τ the part of the exposure since the anchor, has a kernel whose spectrum K(f) has a mean and a variance.  The
+expected data term ‖K x − g‖² is then (|E K|² + Var K)|x|² − …: where the phase of K is not known, E K is small beside
+Var K, and nothing is restored.  Var is found exactly at the four points ±√2 σ along the axes of C, which have its mean
+and covariance (Julier & Uhlmann 1997, doi:10.1117/12.280797), and not by a slope, which would grow without bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.image_formation.kernels import KernelField
+
+Array = NDArray[np.float64]
+PLACES = 3
+"""Places each way at which the spread is looked at; it changes as slowly over a picture as the motion does."""
+
+
+@dataclass(frozen=True, slots=True)
+class KernelSpread:
+    """Kernels at some places, as they would be with the path's end moved."""
+
+    fields: tuple[KernelField, ...]
+    """One for each of the points."""
+
+    def scaled(self, scale: float) -> KernelSpread:
+        """The same in a picture ``scale`` times as large."""
+        return KernelSpread(tuple(field.scaled(scale) for field in self.fields))
+
+    def variance(self, size: int, scale: float = 1.0) -> NDArray[np.float32]:
+        """Var K over a spectrum (size, size), mean over the places; of a picture ``scale`` times as large."""
+        fields = [field.scaled(scale) for field in self.fields]
+        radius = min(max(field.radius_px for field in fields), (size - 1) // 2)
+        spectra = np.stack([np.fft.fft2(_wrapped(field.arrays(radius), size)) for field in fields])
+        variance = (np.abs(spectra) ** 2).mean(axis=0) - np.abs(spectra.mean(axis=0)) ** 2
+        return np.asarray(variance.mean(axis=0), np.float32)
+
+
+def kernel_spread(
+    field: Callable[[Array], KernelField], width: int, height: int, covariance_px2: Array
+) -> KernelSpread | None:
+    """The spread of a picture's kernels; None where the covariance (2, 2) of the path's end is nil."""
+    variances, axes = np.linalg.eigh(covariance_px2)
+    if variances.max() <= 0:
+        return None
+    x, y = ((np.arange(PLACES) + 0.5) * length / PLACES for length in (width, height))
+    at = field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+    samples = at.paths_px.shape[1]
+    since = ((np.arange(samples) + 0.5) / samples - at.anchor)[:, None]
+    ends = [
+        sign * np.sqrt(2 * max(v, 0.0)) * axis for v, axis in zip(variances, axes.T, strict=True) for sign in (1, -1)
+    ]
+    return KernelSpread(tuple(replace(at, paths_px=at.paths_px + since * end) for end in ends))
+
+
+def _wrapped(kernels: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Kernels (n, k, k) in (n, size, size) with their middle at the first place."""
+    radius = kernels.shape[1] // 2
+    padded = np.zeros((len(kernels), size, size), np.float32)
+    padded[:, : 2 * radius + 1, : 2 * radius + 1] = kernels
+    return np.roll(padded, (-radius, -radius), (1, 2))

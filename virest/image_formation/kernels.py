@@ -1,0 +1,217 @@
+"""Blur paths and kernels (eqs 3, 12-18; forward_model, sections 5 and 6).
+
+The sharp picture f that restoration looks for shows each row at its *anchor*, a fixed part of its own exposure.
+What pixel p gathers during its row's exposure lies in f along a path:  g(p) = mean over t of f(p + d(p, t)).
+A kernel is that path splatted onto the pixel grid; g is the *correlation* of f with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from virest.image_formation.light import flicker
+from virest.image_formation.row_clock import ROW_END, ROW_START
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
+
+Array = NDArray[np.float64]
+SAMPLES_PER_PX = 2.0
+MIN_SAMPLES = 16
+NODE_STEP_S = 2e-3
+"""Instants at which a path is worked out, with a cubic spline between: at 100 Hz off by 0.7 % of the vibration."""
+MIN_NODES = 8
+ACROSS_PX, MIN_KNOTS = 160, 5
+"""Knots of splines over the picture: largest spacing in pixels, and least number each way."""
+
+
+@dataclass(frozen=True, slots=True)
+class KernelField:
+    """One blur kernel per tile."""
+
+    centres_px: Array
+    """(n, 2) where each kernel holds exactly."""
+    paths_px: Array
+    """(n, m, 2) displacement d into the anchored picture, at m instants evenly over the exposure."""
+    anchor: float
+    """Part of the exposure that the sharp picture shows."""
+    light: Array | None = None
+    """(n, m) relative brightness of the light at those instants; None: even."""
+    defocus_sigma_px: float = 0.0
+    """Standard deviation of a Gaussian that comes on top of the paths."""
+
+    @property
+    def radius_px(self) -> int:
+        """Half size of an array that holds every kernel with its splatting margin."""
+        return int(np.ceil(np.abs(self.paths_px).max(initial=0.0) + 3.5 * self.defocus_sigma_px)) + 2
+
+    @property
+    def length_px(self) -> Array:
+        """(n,) length of each path, along it."""
+        return np.linalg.norm(np.diff(self.paths_px, axis=1), axis=-1).sum(axis=1)
+
+    def arrays(self, radius_px: int | None = None, positive: bool = False) -> NDArray[np.float32]:
+        """Kernels (n, 2r + 1, 2r + 1), each summing to 1, indexed [row, column] with d = 0 in the middle.
+
+        Splatted by cubic convolution (Keys 1981, doi:10.1109/TASSP.1981.1163711), whose spectrum stays flat where
+        bilinear splatting would blur by another 0.4 px; ``positive`` takes the bilinear one, for methods that need it.
+        """
+        taps = _linear_taps if positive else _cubic_taps
+        kernels = splat_paths(self.paths_px, radius_px or self.radius_px, taps, self.light)
+        return _defocused(kernels, self.defocus_sigma_px) if self.defocus_sigma_px else kernels
+
+    def chosen(self, numbers: NDArray[np.intp]) -> KernelField:
+        """The field of some of the tiles."""
+        light = None if self.light is None else self.light[numbers]
+        return replace(self, centres_px=self.centres_px[numbers], paths_px=self.paths_px[numbers], light=light)
+
+    def scaled(self, scale: float) -> KernelField:
+        """The same blur in a picture that is ``scale`` times as large; the centres stay."""
+        return replace(self, paths_px=self.paths_px * scale, defocus_sigma_px=self.defocus_sigma_px * scale)
+
+
+def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inverse_depth: Any = None) -> KernelField:
+    """Blur paths of the tiles centred at pixels (n, 2), exact to the rows' own times on both sides.
+
+    inverse_depth: (n,) of each tile, 1/m; None: that of the frame's plane.  Flicker and defocus are the profile's.
+    """
+    return field_along(motion, centres_px, _path_nodes(motion, centres_px, anchor, inverse_depth), anchor)
+
+
+def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], KernelField]:
+    """:func:`kernel_field` of any centres inside the picture, from paths worked out once at the knots of splines.
+
+    Before relief paths bend at depth edges, where splines would swing: each is worked out.
+    """
+    if motion.translation is not None and motion.translation.relief is not None:
+        return lambda centres_px: kernel_field(motion, centres_px, anchor)
+    at = splined_nodes(motion, lambda centres_px: _path_nodes(motion, centres_px, anchor))
+    return lambda centres_px: field_along(motion, centres_px, at(centres_px), anchor)
+
+
+def splined_nodes(motion: RowMotion, nodes: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """Path nodes (n, k, 2) of any centres (n, 2) inside the picture, by splines over a few at which they are found.
+
+    A knot for every ACROSS_PX pixels, and for every NODE_STEP_S of the readout.
+    """
+    profile = motion.profile
+    least = [-(-length // ACROSS_PX) + 1 for length in (profile.width, profile.height)]
+    along = 0 if profile.shutter.reads_columns else 1
+    least[along] = max(least[along], int(np.ceil(motion.readout_time_s / NODE_STEP_S)) + 1)
+    across, down = (_spline(n, max(k, MIN_KNOTS)) for n, k in zip((profile.width, profile.height), least, strict=True))
+    at_knots = nodes(np.stack(np.meshgrid(across.x, down.x), -1).reshape(-1, 2))
+    flat = at_knots.reshape(len(at_knots), -1)
+
+    def splined(centres_px: Array) -> Array:
+        x, y = across(centres_px[:, 0]), down(centres_px[:, 1])
+        weights = (y[:, :, None] * x[:, None, :]).reshape(len(centres_px), -1)
+        return np.asarray((weights @ flat).reshape(len(centres_px), *at_knots.shape[1:]))
+
+    return splined
+
+
+def instants(motion: RowMotion, points_px: Array) -> Array:
+    """(n, k) evenly spaced instants, ends included, of the exposures of the rows through pixels (n, 2)."""
+    count = max(MIN_NODES, int(np.ceil(motion.exposure_s / NODE_STEP_S)) + 1)
+    return motion.row_time_s(points_px[:, None], np.linspace(0.0, 1.0, count))
+
+
+def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float, inverse_depth: Any = None) -> Array:
+    """Displacements (n, k, 2) at evenly spaced instants of the exposure, ends included: a spline's nodes."""
+    gathered_s = instants(motion, centres_px)
+    count = gathered_s.shape[1]
+    points = np.broadcast_to(centres_px[:, None], (len(centres_px), count, 2))
+    if inverse_depth is not None:
+        inverse_depth = np.broadcast_to(np.asarray(inverse_depth, float)[..., None], gathered_s.shape)
+    return seen_by_rows(motion, points, gathered_s, anchor, inverse_depth, PIXELS_WITHIN_PX) - points
+
+
+def field_along(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: float) -> KernelField:
+    """Kernels along given path nodes (n, k, 2) of :func:`instants`; flicker and defocus are the profile's."""
+    length = np.linalg.norm(np.diff(nodes_px, axis=1), axis=-1).sum(axis=1).max(initial=0.0)
+    samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_PX * 1.3 * length)))
+    paths_px = _between(nodes_px.shape[1], samples) @ nodes_px
+    light, sigma_px = _light(motion, centres_px, samples), motion.profile.extensions.defocus_sigma_px
+    return KernelField(centres_px, paths_px, anchor, light, sigma_px)
+
+
+@lru_cache(maxsize=8)
+def _spline(length: int, knots: int) -> CubicSpline:
+    """Weights of evenly spaced knots from the first pixel to the last, as functions of the place."""
+    return CubicSpline(np.linspace(0.0, length - 1.0, knots), np.eye(knots))
+
+
+def _light(motion: RowMotion, centres_px: Array, samples: int) -> Array | None:
+    """Flicker (n, samples) over equal pieces of the exposure of the rows through pixels (n, 2); None without."""
+    if not motion.profile.extensions.flicker_amplitude:
+        return None
+    middles_s = motion.row_time_s(centres_px[:, None], (np.arange(samples) + 0.5) / samples)
+    return flicker(motion.profile, middles_s, motion.exposure_s / samples)
+
+
+@lru_cache(maxsize=64)
+def _between(count: int, samples: int) -> Array:
+    """Weights (samples, count) of a cubic spline's evenly spaced nodes in the middles of ``samples`` equal pieces."""
+    middles = (np.arange(samples) + 0.5) / samples
+    return np.asarray(CubicSpline(np.linspace(0.0, 1.0, count), np.eye(count))(middles))
+
+
+def blur_chords(motion: RowMotion, points_px: Array, inverse_depth: Any = None) -> Array:
+    """Motion (n, 2) in pixels of image points over the exposure of their own rows, start to end (eqs 12-14).
+
+    Its angle and length are the paper's degradation parameters (eqs 15, 16); see :func:`angle_and_length`.
+    """
+    start_s, end_s = (motion.row_time_s(points_px, share) for share in (ROW_START, ROW_END))
+    return moved_between(motion, points_px, start_s, end_s, inverse_depth) - points_px
+
+
+def angle_and_length(chords_px: Array) -> tuple[Array, Array]:
+    """Angle in (−π, π], x right and y down, and length in pixels of chords (..., 2) (eqs 15, 16)."""
+    angle = np.arctan2(chords_px[..., 1], chords_px[..., 0])
+    return np.where(angle <= -np.pi, np.pi, angle), np.linalg.norm(chords_px, axis=-1)
+
+
+def splat_paths(paths_px: Array, radius_px: int, taps: Any, light: Array | None = None) -> NDArray[np.float32]:
+    """Paths (n, m, 2), with the light (n, m) at their instants, as arrays (n, 2r + 1, 2r + 1) whose sums are 1."""
+    count, samples, _ = paths_px.shape
+    size = 2 * radius_px + 1
+    base = np.floor(paths_px).astype(np.intp)
+    offsets, wx = taps(paths_px[..., 0] - base[..., 0])
+    _, wy = taps(paths_px[..., 1] - base[..., 1])
+    columns = np.clip(base[..., 0, None] + offsets + radius_px, 0, size - 1)
+    rows = np.clip(base[..., 1, None] + offsets + radius_px, 0, size - 1)
+    flat = (np.arange(count)[:, None, None, None] * size + rows[..., :, None]) * size + columns[..., None, :]
+    weights = wy[..., :, None] * wx[..., None, :] / samples
+    if light is not None:
+        weights *= (light / light.mean(axis=1, keepdims=True))[..., None, None]
+    kernels = np.bincount(flat.ravel(), weights.ravel(), count * size * size)
+    return kernels.reshape(count, size, size).astype(np.float32)
+
+
+def _defocused(kernels: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    """Kernels (n, k, k) with a Gaussian on top; light outside the arrays is none."""
+    blurred = [cv2.GaussianBlur(k, (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT) for k in kernels]
+    sums = [k.sum() for k in blurred]
+    return np.stack([k / s for k, s in zip(blurred, sums, strict=True)])
+
+
+def _linear_taps(part: Array) -> tuple[NDArray[np.intp], Array]:
+    return np.arange(0, 2), np.stack([1 - part, part], -1)
+
+
+def _cubic_taps(part: Array) -> tuple[NDArray[np.intp], Array]:
+    rest = 1 - part
+    weights = [
+        -0.5 * part * rest**2,
+        1 + part**2 * (1.5 * part - 2.5),
+        1 + rest**2 * (1.5 * rest - 2.5),
+        -0.5 * rest * part**2,
+    ]
+    return np.arange(-1, 3), np.stack(weights, -1)

@@ -1,0 +1,107 @@
+"""How bright: flicker over the rows and vignetting over the picture (contract, section 4).
+
+Light is what reaches the sensor, before the curve.  Flicker: light × (1 + amplitude sin(2π frequency t + phase)) at
+every instant t of an exposure, IMU clock from stamp_0.  Vignetting: light × (1 − corner_loss (r / r_corner)²) about
+the picture's centre.  A gain common to a whole frame goes through every linear step unchanged and is not undone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.image_formation.row_clock import ROW_MIDDLE
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import grid_filled, straightened_points
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+LEAST_LIGHT = 0.05
+"""Less than this part of the light is not brought back: it would be noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLight:
+    """Factors on the light of one frame, (height, width) each."""
+
+    recorded: Image
+    """What each pixel's light was multiplied by when it was recorded."""
+    vignetting: Image
+    """The part of it that belongs to the place in the picture."""
+    kept: Image
+    """Vignetting of the place to which straightening takes each recorded pixel."""
+
+    def evened(self, light: Image, clipped: Image | None) -> Image:
+        """The light of a channel without flicker and vignetting; clipped light is not darkened for a bright row."""
+        even = light / self.recorded
+        if clipped is None:
+            return even
+        return np.where(clipped > 0, np.maximum(even, light / self.vignetting), even)
+
+    @property
+    def most_change(self) -> float:
+        """Greatest relative change of light between what was recorded and what the restored picture shows."""
+        return float(np.abs(self.kept / self.recorded - 1).max())
+
+
+def frame_light(motion: RowMotion, anchor: float, straighten: bool) -> FrameLight | None:
+    """The factors of one frame, whose rows are seen at their anchor; None where the profile knows of none."""
+    extensions = motion.profile.extensions
+    if not extensions.flicker_amplitude and not extensions.vignetting_corner_loss:
+        return None
+    width, height = motion.profile.width, motion.profile.height
+    here = vignetting(motion.profile, np.arange(width)[None, :], np.arange(height)[:, None]).astype(np.float32)
+    there = here
+    if straighten and extensions.vignetting_corner_loss:
+        placed = grid_filled(motion, lambda points: straightened_points(motion, points, anchor))
+        there = vignetting(motion.profile, placed[..., 0], placed[..., 1])
+    rows = np.maximum(row_light(motion, _along_readout(motion.profile)), LEAST_LIGHT).astype(np.float32)
+    return FrameLight(here * rows, here, there)
+
+
+def _along_readout(profile: CameraProfile) -> Array:
+    """One pixel of each row (height, 1, 2), or of each column (1, width, 2) where columns are read."""
+    if profile.shutter.reads_columns:
+        x, y = np.meshgrid(np.arange(profile.width, dtype=float), [0.0])
+    else:
+        x, y = np.meshgrid([0.0], np.arange(profile.height, dtype=float))
+    return np.stack([x, y], -1)
+
+
+def flicker(profile: CameraProfile, middle_s: Any, lasting_s: Any = 0.0) -> Array:
+    """Mean factor on the light (...) over spans of ``lasting_s``, one or (...), about times (...)."""
+    extensions = profile.extensions
+    # the mean of a sine over a span is the sine at its middle times sin(x) / x of half the span
+    amplitude = extensions.flicker_amplitude * np.sinc(extensions.flicker_frequency_hz * lasting_s)
+    phase = 2 * np.pi * extensions.flicker_frequency_hz * np.asarray(middle_s, float) + extensions.flicker_phase_rad
+    return np.asarray(1.0 + amplitude * np.sin(phase))
+
+
+def row_light(motion: RowMotion, points_px: Array) -> Array:
+    """Mean flicker over the exposure of the rows through pixels (..., 2)."""
+    return flicker(motion.profile, motion.row_time_s(points_px, ROW_MIDDLE), motion.exposure_s)
+
+
+def vignetting(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:
+    """Part of the light that is left at pixels (x, y); float32 stays float32."""
+    x, y = np.subtract(x_px, 0.5 * (profile.width - 1)), np.subtract(y_px, 0.5 * (profile.height - 1))
+    corner_squared = 0.25 * (profile.width**2 + profile.height**2)
+    return _left(profile.extensions.vignetting_corner_loss / corner_squared, x * x + y * y)
+
+
+def vignetting_at_radius(profile: CameraProfile, radius: Array) -> Array:
+    """The same at distances (...) from the picture's centre, 1 in its corners."""
+    return np.asarray(_left(profile.extensions.vignetting_corner_loss, radius**2))
+
+
+def _left(loss: float, radius_squared: Any) -> Any:
+    return np.maximum(1.0 - loss * radius_squared, LEAST_LIGHT)
+
+
+def equivalent_length_px(profile: CameraProfile, length_px: Any) -> Any:
+    """Length (...) of an even path that spreads light as much as a path of ``length_px`` and the defocus together."""
+    return np.hypot(length_px, np.sqrt(12.0) * profile.extensions.defocus_sigma_px)

@@ -1,0 +1,417 @@
+"""Where tracked points should be: one model of clock, gyroscope, lens, readout, translation and depth (eqs 4-14, 28).
+
+A point seen at p₁ in one frame is seen in the next at
+
+    p₂ = project(R(t₂)ᵀ (R(t₁) r₁ + (c(t₁) − c(t₂)) ρ)),   r₁ = rays(p₁),
+
+with R, c the camera's orientation and centre in world axes and each t the middle of the exposure of the point's row.
+A point's blurred image sits at the mean of its path, so R is taken as the mean over the exposure, R exp(ω' E²/24).
+ρ is the inverse depth of r₁ on the plane m · X = 1, whose origin is the camera's centre at the window's middle:
+ρ = m · R r₁ / (1 − m · c).  Windows are stretches of a few seconds, each with its own velocity and plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+
+from virest.camera.field import Field
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.image_formation.row_clock import RowClock
+from virest.motion.displacement import Displacement, force_at_samples, integrate_accelerometer
+from virest.motion.integration import gyro_polynomials, integrate_gyro
+from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
+from virest.motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+SMALLEST_DEPTH = 0.05
+"""Points are held at least this part of the typical depth before the camera."""
+RAY_STEP = 1e-5
+SHIFT_STEP_S = 2e-3
+"""Grid of a stabiliser's path: at 10 rad/s² a straight line over it is off by 5e-6 rad, far below tracking's noise."""
+
+
+_PER_POINT = (
+    "pair",
+    "window",
+    "first",
+    "second",
+    "first_px",
+    "second_px",
+    "first_stamp_s",
+    "second_stamp_s",
+    "first_exposure_s",
+    "second_exposure_s",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackTable:
+    """All tracked points of all pairs in one table."""
+
+    pair: Index
+    """(n,) number of the pair, rising from 0."""
+    window: Index
+    """(n,) number of the pair's window."""
+    first: Index
+    """(n,) movie index of the first frame."""
+    second: Index
+    first_px: Array
+    """(n, 2)."""
+    second_px: Array
+    """(n, 2)."""
+    first_stamp_s: Array
+    """(n,) the frame's stamp from stamp_0, camera clock."""
+    second_stamp_s: Array
+    first_exposure_s: Array
+    """(n,) as logged; 0 where unknown."""
+    second_exposure_s: Array
+    origin_s: Array
+    """(windows,) middle of each window, camera clock from stamp_0."""
+    noise_px: Array
+    """(pairs,) standard deviation of a tracked step per coordinate, measured without any camera model."""
+
+    def __len__(self) -> int:
+        return len(self.pair)
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs."""
+        return int(self.pair[-1]) + 1 if len(self.pair) else 0
+
+    @property
+    def n_windows(self) -> int:
+        """Number of windows."""
+        return len(self.origin_s)
+
+    def chosen(self, rows: NDArray[np.bool_]) -> TrackTable:
+        """The table with some of its points; pairs keep their numbers."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _PER_POINT})
+
+
+@dataclass(frozen=True, slots=True)
+class IntegratedMotion:
+    """What a profile makes of the inertial samples: kept while its gyroscope and lens stay the same."""
+
+    profile: CameraProfile
+    trajectory: Trajectory
+    displacement: Displacement | None
+    lens: MovingLens
+    measured: Measured
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the inertial samples say whatever the profile: the work that is done once."""
+
+    gyro: Array
+    """As :func:`gyro_polynomials` gives it."""
+    force: tuple[Array, Array] | None
+    """As :func:`force_at_samples` gives it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """When the points were seen and how the camera was turned then: the same for every lens and scene."""
+
+    trajectory: Trajectory
+    exposure_scale: float
+    first_s: Array
+    """(n,) IMU clock."""
+    second_s: Array
+    before: Array
+    """(n, 3, 3) R_world_cam at the first sight."""
+    back: Array
+    """(n, 3, 3) R_cam_world at the second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Rays through the first points with the stabiliser at rest: the same for every motion of one lens."""
+
+    lens: Intrinsics
+    rays: Array
+    """(n, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Points as the model sees them, and how they depend on the scene and on the camera's translation."""
+
+    second_px: Array
+    """(n, 2)."""
+    poses: Poses
+    along_px: Array | None = None
+    """(n, 2) change of second_px per unit of inverse depth; None without translation."""
+    slopes: Array | None = None
+    """(n, 2, k) change per entry of the motion's vector."""
+    moved: Moved | None = None
+    """How the camera moved between the two sights; None without translation."""
+    per_step: Array | None = None
+    """(n, 2, 3) change of second_px per unit of the camera's step over a point's depth, world axes; where asked for."""
+    sights: Sightings | None = None
+    """Through which the first points are seen."""
+
+    @property
+    def first_s(self) -> Array:
+        """(n,) when the first points were seen, IMU clock."""
+        return self.poses.first_s
+
+    @property
+    def second_s(self) -> Array:
+        """(n,) when the second points were seen, IMU clock."""
+        return self.poses.second_s
+
+
+def ground(
+    imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None
+) -> IntegratedMotion:
+    """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier ground."""
+    measured = measured or Measured(gyro_polynomials(imu), force_at_samples(imu) if translation else None)
+    trajectory = integrate_gyro(imu, profile, measured.gyro)
+    displacement = integrate_accelerometer(imu, profile, trajectory, measured.force) if translation else None
+    return IntegratedMotion(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S), measured)
+
+
+def with_profile(known: IntegratedMotion, imu: ImuSamples, profile: CameraProfile) -> IntegratedMotion:
+    """Return the ground for another profile; what does not depend on the change is kept."""
+    before, kept = known.profile, known
+    same = ("gyro_bias_rad_s", "gyro_scale", "p_cam_imu_m")
+    if any(getattr(before, name) != getattr(profile, name) for name in same) or _rates(before) != _rates(profile):
+        return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
+    if before.r_cam_imu != profile.r_cam_imu:
+        known = _turned_about(known, profile.rotation_cam_imu @ before.rotation_cam_imu.T)
+    turned_along = known.trajectory is not kept.trajectory
+    if turned_along or before.intrinsics != profile.intrinsics or _moves(before, profile):
+        like = None if turned_along else kept.lens
+        known = replace(known, lens=moving_lens(known.trajectory, profile, SHIFT_STEP_S, like))
+    return replace(known, profile=profile)
+
+
+def _rates(profile: CameraProfile) -> list[Field]:
+    return [field for field in profile.extensions.field if field.kind == "rate"]
+
+
+def _moves(before: CameraProfile, after: CameraProfile) -> bool:
+    """Whether two profiles' lenses move differently."""
+    names = (
+        "focal_drift_per_s",
+        "stabilisation_fraction",
+        "stabilisation_cutoff_hz",
+        "stabilisation_lean_rad",
+        "field",
+    )
+    return any(getattr(before.extensions, name) != getattr(after.extensions, name) for name in names)
+
+
+def _turned_about(known: IntegratedMotion, turn: Array) -> IntegratedMotion:
+    """The ground with the camera's axes turned on the IMU, (3, 3): everything in camera and world axes turns along."""
+    way = known.trajectory
+    trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, turn @ way.rate_polynomials)
+    if known.displacement is None:
+        return replace(known, trajectory=trajectory)
+    old = known.displacement
+    path, per_bias, per_delay = (_turned_spline(spline, turn) for spline in (old.path, old.per_bias, old.per_delay))
+    moved = Displacement(trajectory, path, per_bias, per_delay, old.arm_cam_m)
+    return replace(known, trajectory=trajectory, displacement=moved)
+
+
+def _turned_spline(spline: CubicHermiteSpline, turn: Array) -> CubicHermiteSpline:
+    """A spline of vectors (m, 3), or of matrices' rows (m, 9), in turned axes."""
+    pieces = spline.c.reshape(*spline.c.shape[:2], 3, -1)
+    turned_pieces = np.einsum("ij,pmjk->pmik", turn, pieces).reshape(spline.c.shape)
+    return CubicHermiteSpline.construct_fast(turned_pieces, spline.x, spline.extrapolate, spline.axis)
+
+
+def seen_s(profile: CameraProfile, points_px: Array, stamp_s: Array, exposure_s: Array) -> Array:
+    """Middle of the exposure of the points' rows, IMU clock (n,); under pulsing lamps the mean time of the light."""
+    middle_s = RowClock(profile).seen_s(points_px, stamp_s, exposure_s)
+    if not profile.extensions.flicker_amplitude:
+        return middle_s
+    return middle_s + pulse_delay_s(profile, middle_s, np.asarray(profile.shutter.true_exposure_s(exposure_s)))
+
+
+def pulse_delay_s(profile: CameraProfile, middle_s: Array, exposure_s: Array) -> Array:
+    """How much later than its middle the light of an exposure arrives on the mean, (n,), under pulsing lamps.
+
+    Mean of τ over |τ| < E/2 weighted by 1 + a sin(ω(t + τ) + φ): a cos(ωt + φ) (sin x − x cos x) 2/ω² over the light,
+    E + a sin(ωt + φ) 2 sin(x)/ω, x = ωE/2.
+    """
+    extensions = profile.extensions
+    omega, amplitude = 2 * np.pi * extensions.flicker_frequency_hz, extensions.flicker_amplitude
+    angle, half = omega * middle_s + extensions.flicker_phase_rad, 0.5 * omega * exposure_s
+    moment = amplitude * np.cos(angle) * 2 * (np.sin(half) - half * np.cos(half)) / omega**2
+    light = exposure_s + amplitude * np.sin(angle) * 2 * np.sin(half) / omega
+    return np.asarray(moment / np.maximum(light, 1e-6))
+
+
+def predict(
+    known: IntegratedMotion,
+    table: TrackTable,
+    scene: Motion | None,
+    *,
+    slopes: bool = False,
+    like: Prediction | None = None,
+) -> Prediction:
+    """Predict the second points (n, 2); scene None: rotation only.
+
+    like: an earlier prediction of the same table; what it shares with this one is not worked out again.
+    """
+    poses, sights = _poses(known, table, like), _sights(known.lens, table, like)
+    at_rest = known.lens.rays_at_rest(table.first_px, poses.first_s) if sights is None else sights.rays
+    world = turned(poses.before, known.lens.from_rest(at_rest, poses.first_s))
+    if scene is None or isinstance(scene, DirectedMotion):
+        rays = turned(poses.back, world)
+        expected = known.lens.project(rays, poses.second_s)
+        if scene is None:
+            return Prediction(expected, poses, sights=sights)
+        per_step = _lens_slope(known, rays, poses.second_s, expected) @ poses.back
+        step = scene.direction[scene.group(table.pair)]
+        along = np.squeeze(per_step @ step[..., None], -1)
+        return Prediction(expected, poses, along, per_step=per_step, sights=sights)
+    paths = like.moved.paths if like is not None and like.moved is not None and like.poses is poses else None
+    paths = paths or _paths(known, table, scene, poses)
+    seen = _seen_again(known, world, poses, _moved_inertially(table, scene, world, paths, slopes))
+    return replace(seen, sights=sights)
+
+
+def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sightings | None:
+    """Rays through the first points where they do not depend on the time, an earlier prediction's if the lens is its.
+
+    None: the focal length changes.
+    """
+    if lens.focal_drift_per_s or lens.zoom:
+        return None
+    if like is not None and like.sights is not None and like.sights.lens == lens.lens:
+        return like.sights
+    return Sightings(lens.lens, lens.lens.rays(table.first_px))
+
+
+def _lens_slope(known: IntegratedMotion, rays: Array, second_s: Array, expected: Array) -> Array:
+    """Change (n, 2, 3) of pixels per unit of each part of rays (n, 3)."""
+    steps = (known.lens.project(rays + RAY_STEP * axis, second_s) for axis in np.eye(3))
+    return np.stack([(step - expected) / RAY_STEP for step in steps], axis=-1)
+
+
+def _poses(known: IntegratedMotion, table: TrackTable, like: Prediction | None) -> Poses:
+    """Sightings and turns of the points; those of an earlier prediction where they are the same."""
+    profile, scale = known.profile, known.profile.shutter.exposure_scale
+    first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
+    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    if like is not None:
+        old = like.poses
+        same = old.trajectory is known.trajectory and old.exposure_scale == scale
+        if same and np.array_equal(first_s, old.first_s) and np.array_equal(second_s, old.second_s):
+            return old
+    before = known.trajectory.mean_orientation(first_s, scale * table.first_exposure_s)
+    after = known.trajectory.mean_orientation(second_s, scale * table.second_exposure_s)
+    return Poses(known.trajectory, scale, first_s, second_s, before, np.swapaxes(after, -1, -2))
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """What the accelerometer knows of the camera's centre at one sight of each point, from its window's middle."""
+
+    since_s: Array
+    """(n,) from the window's middle."""
+    path: Array
+    """(n, 3) without velocity, gravity, bias and delay, world axes."""
+    per_bias: Array
+    """(n, 3, 3)."""
+    per_delay: Array
+    """(n, 3)."""
+
+    def centre(self, scene: InertialMotion, velocity: Array) -> Array:
+        """Camera's centre (n, 3), world axes."""
+        moved = self.path + velocity * self.since_s[:, None] + 0.5 * scene.gravity_m_s2 * self.since_s[:, None] ** 2
+        return moved - self.per_bias @ scene.accel_bias_m_s2 + self.per_delay * scene.accel_delay_s
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """Displacement c(t₁) − c(t₂) of the camera and the inverse depth of each point, world axes."""
+
+    step: Array
+    """(n, 3)."""
+    paths: tuple[Paths, Paths] | None
+    """At both sights, of a path by the accelerometer."""
+    inverse_depth: Array
+    """(n,)."""
+    per_entry: Array | None
+    """(n, 3, k) change of step · inverse depth per entry of the motion's vector."""
+
+
+def _paths(known: IntegratedMotion, table: TrackTable, scene: InertialMotion, poses: Poses) -> tuple[Paths, Paths]:
+    assert known.displacement is not None
+    origin_s = np.asarray(known.profile.imu_time_s(table.origin_s))[table.window]
+    first, second = (
+        Paths(time_s - origin_s, *known.displacement.at(time_s, origin_s)) for time_s in (poses.first_s, poses.second_s)
+    )
+    return first, second
+
+
+def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Moved) -> Prediction:
+    back, second_s = poses.back, poses.second_s
+    rays = turned(back, world + moved.step * moved.inverse_depth[:, None])
+    rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)
+    expected = known.lens.project(rays, second_s)
+    if moved.per_entry is None:
+        ahead = rays + RAY_STEP * turned(back, moved.step)
+        return Prediction(
+            expected, poses, (known.lens.project(ahead, second_s) - expected) / RAY_STEP, None, moved
+        )  # fmt: skip
+    per_world = _lens_slope(known, rays, second_s, expected) @ back
+    along = np.squeeze(per_world @ moved.step[..., None], -1)
+    return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
+
+
+def _moved_inertially(
+    table: TrackTable, scene: InertialMotion, world: Array, paths: tuple[Paths, Paths], slopes: bool
+) -> Moved:
+    window, plane = table.window, scene.plane_per_m[table.window]
+    centre_1, centre_2 = (path.centre(scene, scene.velocity_m_s[window]) for path in paths)
+    clearance = np.maximum(1 - (plane * centre_1).sum(axis=-1), SMALLEST_DEPTH)
+    inverse_depth = np.maximum((plane * world).sum(axis=-1) / clearance, 0.0)
+    step = centre_1 - centre_2
+    if not slopes:
+        return Moved(step, paths, inverse_depth, None)
+    since_1, since_2, each = paths[0].since_s, paths[1].since_s, np.eye(3)[None]
+    nearer = (inverse_depth / clearance)[:, None] * plane  # change of the inverse depth per metre of the first centre
+    per_plane = world / clearance[:, None] + (inverse_depth / clearance)[:, None] * centre_1
+    if scene.plane_axes is not None:
+        per_plane = np.einsum("ni,nij->nj", per_plane, scene.plane_axes[window])
+    first, second = (_shared_slopes(each, path.since_s, path.per_bias, path.per_delay) for path in paths)
+    shared = (first - second) * inverse_depth[:, None, None]
+    shared = shared + step[:, :, None] * np.einsum("ni,nik->nk", nearer, first)[:, None, :]
+    own = np.zeros((len(world), 3, scene.windows, 6))
+    rows = np.arange(len(world))
+    own[rows, :, window, :3] = each * ((since_1 - since_2) * inverse_depth)[:, None, None]
+    own[rows, :, window, :3] += step[:, :, None] * (nearer * since_1[:, None])[:, None, :]
+    own[rows, :, window, 3:] = step[:, :, None] * per_plane[:, None, :]
+    per_entry = np.concatenate([shared, own.reshape(len(world), 3, -1)], axis=-1)
+    return Moved(step, paths, inverse_depth, per_entry)
+
+
+def _shared_slopes(each: Array, since: Array, bias: Array, delay: Array) -> Array:
+    """Change (n, 3, 7) of the camera's centre per gravity, accelerometer bias and delay."""
+    return np.concatenate([each * (0.5 * since**2)[:, None, None], -bias, delay[..., None]], axis=-1)
+
+
+def centre(
+    displacement: Displacement, scene: InertialMotion, velocity: Array, time_s: Array, origin_s: Array
+) -> tuple[Array, Array, Array]:
+    """Camera centre (n, 3) from its place at origin_s, world axes, and its changes per bias (n, 3, 3), delay (n, 3)."""
+    path = Paths(time_s - origin_s, *displacement.at(time_s, origin_s))
+    return path.centre(scene, velocity), path.per_bias, path.per_delay
+
+
+def turned(rotation: Array, rays: Array) -> Array:
+    """Apply rotations (n, 3, 3) to rays (n, 3)."""
+    return np.einsum("nij,nj->ni", rotation, rays)

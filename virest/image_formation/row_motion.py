@@ -1,0 +1,253 @@
+"""How the camera moved while one frame was taken, row by row (forward_model, sections 1, 2 and 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock, row_time_s
+from virest.motion.optics import MovingLens, moving_lens
+from virest.motion.relief_surface import Relief
+from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
+
+Array = NDArray[np.float64]
+STEP_S = 2e-4
+"""Grid of the tabulated motion: at 50 rad/s² a straight line over it is off by 2.5e-7 rad."""
+OUTSIDE_FRACTION = 0.25
+"""The table reaches this part of the readout beyond the first and last row, for points outside the picture."""
+
+_LEAST_DISTANCE = 0.05
+"""The camera never comes nearer to the scene than this part of its distance at the reference time."""
+_RELIEF_STEPS = 3
+"""Where a point lies on the surface depends on its depth: each step shrinks the error by surface's slope × parallax."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTranslation:
+    """How the camera's centre moved while one frame was taken, and what it looked at.
+
+    All in camera axes at the frame's reference time t_ref: the centre is at v (t − t_ref) + ½ a (t − t_ref)².
+    """
+
+    velocity_m_s: Array
+    """(3,) at the reference time."""
+    acceleration_m_s2: Array
+    """(3,) constant over the frame, without gravity."""
+    inverse_depth_plane: Array
+    """(3,) 1/m: the inverse depth along the optical axis of a ray r with z = 1 is plane · r, floored at 0."""
+    depth_m: float | None = None
+    """At the picture's centre, for the log; None: unknown."""
+    source: str = "none"
+    """Where the depth is from: ``triangulated``, ``profile`` or ``none``."""
+    relief: Relief | None = None
+    """What stands out of the plane, at the reference time; None: nothing is known to."""
+    in_metres: bool = True
+    """False: only velocity over depth is known; lengths are in a common unit that no log may call metres."""
+
+    def position_m(self, since_reference_s: Array) -> Array:
+        """Centre (..., 3) at times (...) from the reference."""
+        since = np.asarray(since_reference_s, float)[..., None]
+        return since * (np.asarray(self.velocity_m_s) + 0.5 * since * np.asarray(self.acceleration_m_s2))
+
+    def inverse_depth(self, rays: Array) -> Array:
+        """1 / depth (...) along the optical axis at the reference time, of what rays (..., 3), z = 1, meet."""
+        plane = rays @ np.asarray(self.inverse_depth_plane, float)
+        return np.maximum(plane if self.relief is None else plane + self.relief.at(rays), 0.0)
+
+    def velocity_at(self, since_reference_s: Any) -> Array:
+        """Velocity (..., 3) of the centre at times (...) from the reference, still in the axes at the reference."""
+        since = np.asarray(since_reference_s, float)[..., None]
+        return np.asarray(self.velocity_m_s) + since * np.asarray(self.acceleration_m_s2)
+
+
+@dataclass(frozen=True, slots=True)
+class RowMotion:
+    """The camera's pose over one frame, against its pose at the reference time.
+
+    x_t = R_t_ref x_ref + t_t_ref takes camera coordinates at the reference time to those at time t.
+    """
+
+    time_s: Array
+    """(m,) evenly spaced, IMU clock."""
+    rotation_vector: Array
+    """(m, 3) log of R_t_ref."""
+    translation_m: Array | None
+    """(m, 3) t_t_ref; None: unknown, rotation only."""
+    start_s: float
+    """Start of the first row's exposure, IMU clock."""
+    exposure_s: float
+    """True exposure of each row; 0 where unknown."""
+    readout_time_s: float
+    reference_s: float
+    """The time that the restored picture shows, IMU clock."""
+    profile: CameraProfile
+    lens: MovingLens | None = None
+    """At every instant of the frame; None: no focal length, no geometry."""
+    translation: FrameTranslation | None = None
+    """What translation_m was tabulated from; None: unknown, rotation only."""
+
+    @property
+    def optics(self) -> MovingLens:
+        """The lens; raises ValueError where there is none."""
+        if self.lens is None:
+            raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
+        return self.lens
+
+    @property
+    def middle_s(self) -> float:
+        """Middle of the frame: of the exposure of the row halfway through the readout."""
+        return float(row_time_s(self.start_s, self.readout_time_s, 0.5, self.exposure_s, ROW_MIDDLE))
+
+    @property
+    def end_s(self) -> float:
+        """End of the exposure of the row after the last one."""
+        return float(row_time_s(self.start_s, self.readout_time_s, 1.0, self.exposure_s, ROW_END))
+
+    def row_time_s(self, points_px: Array, exposure_share: Any) -> Array:
+        """When the rows through pixels (..., 2) are exposed to a share of their exposure."""
+        fraction = RowClock(self.profile).readout_fraction(points_px)
+        return np.asarray(row_time_s(self.start_s, self.readout_time_s, fraction, self.exposure_s, exposure_share))
+
+    def row_start_s(self, points_px: Array) -> Array:
+        """Start of exposure of the rows through pixels (..., 2)."""
+        return self.row_time_s(points_px, ROW_START)
+
+    def pose(self, time_s: Any) -> tuple[Array, Array | None]:
+        """(R_t_ref (..., 3, 3), t_t_ref (..., 3) or None) at times (...)."""
+        position = np.clip((np.asarray(time_s, float) - self.time_s[0]) / self._step_s, 0, len(self.time_s) - 1.001)
+        index = position.astype(np.intp)
+        part = (position - index)[..., None]
+        vector = self.rotation_vector[index] * (1 - part) + self.rotation_vector[index + 1] * part
+        if self.translation_m is None:
+            return rotation_from_vector(vector), None
+        shift = self.translation_m[index] * (1 - part) + self.translation_m[index + 1] * part
+        return rotation_from_vector(vector), shift
+
+    def relative_pose(self, from_s: Any, to_s: Any) -> tuple[Array, Array | None]:
+        """(R_to_from, t_to_from): camera coordinates at one time to those at another."""
+        r_from, t_from = self.pose(from_s)
+        r_to, t_to = self.pose(to_s)
+        rotation = r_to @ np.swapaxes(r_from, -1, -2)
+        if t_from is None or t_to is None:
+            return rotation, None
+        return rotation, t_to - np.squeeze(rotation @ t_from[..., None], -1)
+
+    def inverse_depth(self, rays: Array, time_s: Any) -> Array:
+        """1 / depth (...) along the optical axis at times (...) of where rays (..., 3), z = 1, meet the scene.
+
+        0 without a plane.  n · X = 1 at the reference becomes (R n) · X = 1 + (R n) · t at another time.  With relief
+        the place on the plane is the first guess of where the point is seen at the reference time.
+        """
+        rotation, shift = self.pose(time_s)
+        if self.translation is None or shift is None:
+            return np.zeros(rays.shape[:-1])
+        turned = rotation @ np.asarray(self.translation.inverse_depth_plane, float)
+        nearer = np.maximum(1 + (turned * shift).sum(-1), _LEAST_DISTANCE)
+        nearness = np.maximum((turned * rays).sum(-1) / nearer, 0.0)
+        for _ in range(_RELIEF_STEPS if self.translation.relief is not None else 0):
+            back = np.squeeze(np.swapaxes(rotation, -1, -2) @ (rays - shift * nearness[..., None])[..., None], -1)
+            seen = back / np.maximum(back[..., 2:], _LEAST_DISTANCE)
+            at_reference = self.translation.inverse_depth(seen)
+            ahead = (rotation[..., 2, :] * seen).sum(-1) + shift[..., 2] * at_reference
+            nearness = at_reference / np.maximum(ahead, _LEAST_DISTANCE)
+        return nearness
+
+    def turned(self, rate_rad_s: Array, slope_rad_s2: Array) -> RowMotion:
+        """The motion with a further turn of the camera: x' = exp(rate τ + ½ slope τ²) x, τ from the reference time.
+
+        rate_rad_s, slope_rad_s2: (3,), camera axes.  Travel stays as it is.
+        """
+        since_s = (self.time_s - self.reference_s)[:, None]
+        further = rotation_from_vector(since_s * (rate_rad_s + 0.5 * since_s * slope_rad_s2))
+        turned = further @ rotation_from_vector(self.rotation_vector)
+        shift = self.translation_m
+        if shift is not None:
+            shift = np.squeeze(further @ shift[..., None], -1)
+        return replace(self, rotation_vector=vector_from_rotation(turned), translation_m=shift)
+
+    @property
+    def _step_s(self) -> float:
+        return float(self.time_s[1] - self.time_s[0])
+
+
+def row_motion(
+    trajectory: Trajectory,
+    profile: CameraProfile,
+    stamp_s: float,
+    logged_exposure_s: float | None,
+    reference: str = "exposure-start",
+    translation: FrameTranslation | None = None,
+    lens: MovingLens | None = None,
+) -> RowMotion:
+    """Tabulate the motion around one frame.
+
+    stamp_s: the frame's stamp, camera clock from stamp_0.  reference: ``exposure-start`` of the first row read, or
+    ``frame-middle`` = that + readout/2 + exposure/2.  translation: of the camera's centre; None: unknown.  lens: of the
+    whole trajectory, where that is at hand; it is worked out otherwise.
+    """
+    exposure_s = profile.shutter.true_exposure_s(logged_exposure_s or 0.0)
+    start_s, reference_s = frame_times_s(profile, stamp_s, logged_exposure_s, reference)
+    if lens is None and profile.intrinsics is not None:
+        lens = moving_lens(trajectory, profile)
+    span_s = start_s, float(RowClock(profile).end_s(stamp_s, logged_exposure_s or 0.0))
+    return _tabulated(trajectory, span_s, start_s, exposure_s, reference_s, profile, lens, translation)
+
+
+def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, lens: MovingLens) -> RowMotion:
+    """The motion of one frame, tabulated over the rows of another frame too; its row clock and reference stay.
+
+    lens: of the whole trajectory.  Travel goes on with the frame's own acceleration.
+    """
+    span_s = min(motion.start_s, other.start_s), max(motion.end_s, other.end_s)
+    return _tabulated(
+        trajectory, span_s, motion.start_s, motion.exposure_s, motion.reference_s, motion.profile, lens,
+        motion.translation,
+    )  # fmt: skip
+
+
+def with_row_clock_of(motion: RowMotion, other: RowMotion) -> RowMotion:
+    """The same motion about the same reference time, its rows read and exposed when another frame's are."""
+    return replace(motion, start_s=other.start_s, exposure_s=other.exposure_s, readout_time_s=other.readout_time_s)
+
+
+def _tabulated(
+    trajectory: Trajectory,
+    span_s: tuple[float, float],
+    start_s: float,
+    exposure_s: float,
+    reference_s: float,
+    profile: CameraProfile,
+    lens: MovingLens | None,
+    translation: FrameTranslation | None,
+) -> RowMotion:
+    """A motion's table over a span, and what points just outside the picture need."""
+    readout_s = profile.shutter.readout_time_s
+    first_s = span_s[0] - OUTSIDE_FRACTION * readout_s - STEP_S
+    last_s = span_s[1] + OUTSIDE_FRACTION * readout_s + STEP_S
+    steps = np.arange(int(np.ceil((last_s - first_s) / STEP_S)) + 2, dtype=np.float64)
+    time_s = first_s + STEP_S * steps
+    r_world_ref = trajectory.orientation(reference_s)
+    r_world_t = trajectory.orientation(time_s)
+    r_t_ref = np.swapaxes(r_world_t, -1, -2) @ r_world_ref
+    shift = None
+    if translation is not None:
+        shift = -np.squeeze(r_t_ref @ translation.position_m(time_s - reference_s)[..., None], -1)
+    if lens is not None:
+        lens = lens.between(float(time_s[0]), float(time_s[-1]))
+    vector = vector_from_rotation(r_t_ref)
+    return RowMotion(
+        time_s, vector, shift, start_s, exposure_s, readout_s, reference_s, profile, lens, translation
+    )  # fmt: skip
+
+
+def frame_times_s(
+    profile: CameraProfile, stamp_s: float, logged_exposure_s: float | None, reference: str
+) -> tuple[float, float]:
+    """(start of the first row's exposure, reference time) of a frame, IMU clock; arguments as :func:`row_motion`."""
+    clock, logged = RowClock(profile), logged_exposure_s or 0.0
+    start_s = float(clock.time_s(stamp_s, logged))
+    return start_s, start_s if reference != "frame-middle" else float(clock.middle_s(stamp_s, logged))

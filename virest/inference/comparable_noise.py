@@ -1,0 +1,87 @@
+"""Tracking noise as a fit's residual counts it, so that the two can stand beside each other.
+
+What a free smooth flow of each pair leaves holds tracking noise and the scene's relief.  A fit allows for relief along
+the parallax; here the same is allowed for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.image_formation.point_model import predict
+from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.track_fit import ANY_DEPTH, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, TrackFit
+from virest.inference.track_noise import (
+    CAUCHY,
+    ORDERS,
+    POINTS_PER_TERM,
+    REWEIGHTINGS,
+    flow_basis,
+    smooth_flow_residual,
+)
+from virest.inference.tracking import TrackPair
+from virest.motion.scene_motion import DirectedMotion
+
+Array = NDArray[np.float64]
+
+
+def noise_distances(observed: ObservedTracks, fitted: TrackFit) -> Array:
+    """Whitened lengths (n,) of what smooth flows leave of all points, relief along the parallax as in the fit."""
+    if fitted.scene is None:
+        pairs = zip(observed.pairs, observed.noise_px, strict=True)
+        residual = np.concatenate([smooth_flow_residual(pair) / noise for pair, noise in pairs])
+        return np.asarray(np.linalg.norm(residual, axis=-1))
+    table = observed.table(observed.tracks)
+    along_px = predict(fitted.ground, table, fitted.scene).along_px
+    assert along_px is not None
+    length = np.linalg.norm(along_px, axis=-1)
+    way = along_px / np.maximum(length, 1e-12)[:, None]
+    spread = ANY_DEPTH if isinstance(fitted.scene, DirectedMotion) else fitted.depth_spread_per_m
+    kept = 1 / np.sqrt(1 + (spread * length / table.noise_px[table.pair]) ** 2)
+    ends = np.cumsum([len(pair) for pair in observed.pairs])[:-1]
+    parts = zip(observed.pairs, np.split(way, ends), np.split(kept, ends), observed.noise_px, strict=True)
+    return np.concatenate([_flow_beside_relief(pair, w, k) / noise for pair, w, k, noise in parts])
+
+
+def _flow_beside_relief(pair: TrackPair, way: Array, kept: Array) -> Array:
+    """Lengths (n,) of what a smooth flow leaves of a pair's steps, the part along ways (n, 2) counted by kept (n,).
+
+    The flow is fitted with that weight too: otherwise relief would leak across where ways differ between points.
+    """
+    step = pair.points_second_px - pair.points_first_px
+    sides = np.stack([way * kept[:, None], np.stack([-way[:, 1], way[:, 0]], axis=-1)], axis=1)
+    told = len(pair) + float((kept**2).sum())
+    order = next((k for k in ORDERS if told >= POINTS_PER_TERM * (k + 1) * (k + 2)), 0)
+    basis = flow_basis(pair.points_first_px, order)
+    rows = (sides[..., None] * basis[:, None, None, :]).reshape(len(pair), 2, -1)
+    wanted = (sides * step[:, None, :]).sum(axis=-1)
+    freedom = max(1 - rows.shape[-1] / told, 0.25)
+    left, weight = wanted, np.ones(len(pair))
+    for _ in range(REWEIGHTINGS):
+        root = np.sqrt(weight)[:, None]
+        matrix = (rows * root[..., None]).reshape(-1, rows.shape[-1])
+        left = wanted - rows @ np.linalg.lstsq(matrix, (wanted * root).ravel(), rcond=None)[0]
+        squared = (left**2).sum(axis=-1)
+        scale = max(float(np.sqrt(np.median(squared))) / NORMAL_MEDIAN / freedom**0.5, 1e-3)
+        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+    return np.asarray(np.linalg.norm(left, axis=-1) / np.sqrt(freedom))
+
+
+def robust_std(lengths: Array, fitted: TrackFit) -> float:
+    """Standard deviation per coordinate of differences whose lengths (n,) these are, by their median.
+
+    Across a direction of travel one coordinate is left of two.
+    """
+    one_way = isinstance(fitted.scene, DirectedMotion)
+    return float(np.median(lengths)) / (NORMAL_MEDIAN if one_way else RAYLEIGH_MEDIAN)
+
+
+def tracking_noise_px(observed: ObservedTracks, fitted: TrackFit) -> float:
+    """Tracking noise, px per coordinate, beside the residual of :func:`residual_px`."""
+    return robust_std(noise_distances(observed, fitted), fitted) * float(np.median(observed.noise_px))
+
+
+def residual_px(fitted: TrackFit) -> float:
+    """What a fit leaves of the points, px per coordinate, relief along the parallax allowed for."""
+    return robust_std(np.linalg.norm(fitted.across_relief_px(), axis=-1), fitted)

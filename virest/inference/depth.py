@@ -1,0 +1,262 @@
+"""How far the scene is (eq 11): matched points triangulated by the camera's metric displacement between their rows.
+
+Both sights of a point have their own row's time.  A point seen along r at inverse depth ρ from c₁ is expected at
+project(R₂ᵀ (R₁ r + (c₁ − c₂) ρ)); ρ is what brings it to where it was tracked.  A frame's depth is a plane through the
+points about it, ρ(r) = m · r, drawn to the plane of its whole window where the points tell less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, TrackTable, centre, seen_s, turned
+from virest.motion.optics import MovingLens
+from virest.motion.relief_surface import Relief
+from virest.motion.scene_motion import InertialMotion
+
+Array = NDArray[np.float64]
+PASSES = 3
+RELIEF_PASSES, RELIEF_REACH = 6, 3.0
+FARTHEST = 0.02
+"""Points are held no farther than this part of the plane's inverse depth."""
+MAX_ACROSS = 4.0
+"""Standard deviations of the tracking noise."""
+QUOTIENT = 1e-3
+"""Step of the difference quotient, part of the inverse depth."""
+MAX_RELATIVE_STD = 0.5
+"""Points whose inverse depth is known no better than this part of it tell nothing."""
+MIN_POINTS = 20
+NEAR_S = 1.0
+"""Points seen within this time of a frame speak for it."""
+OUTSIDE = 0.05
+"""Points up to this part of the picture beyond its edge speak for it too."""
+CAUCHY = 2.4
+REWEIGHTINGS = 6
+FEWEST_SPREAD = 0.02
+"""A plane fitted to a whole window is trusted no better than to this part of its inverse depth at one frame."""
+NORMAL_MEDIAN = 0.6745
+
+
+@dataclass(frozen=True, slots=True)
+class TriangulatedPoints:
+    """Points of the scene, each from one pair of frames."""
+
+    window: NDArray[np.intp]
+    """(n,)."""
+    place_m: Array
+    """(n, 3) world axes, from the camera's centre at the window's middle."""
+    time_s: Array
+    """(n,) when first seen, IMU clock."""
+    inverse_depth_per_m: Array
+    """(n,) along the optical axis of the first sight."""
+    std_per_m: Array
+    """(n,)."""
+
+    def __len__(self) -> int:
+        return len(self.window)
+
+    def chosen(self, use: NDArray[np.bool_]) -> TriangulatedPoints:
+        """Some of the points."""
+        return TriangulatedPoints(
+            self.window[use], self.place_m[use], self.time_s[use], self.inverse_depth_per_m[use], self.std_per_m[use]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Triangulated points with how they were seen first."""
+
+    points: TriangulatedPoints
+    pair: NDArray[np.intp]
+    """(n,) number of the pair of frames."""
+    from_m: Array
+    """(n, 3) the camera's centre, world axes, from its place at the window's middle."""
+    rays: Array
+    """(n, 3) with z = 1, camera axes at the sight."""
+    above_per_m: Array
+    """(n,) inverse depth above the window's plane."""
+    across: Array
+    """(n,) how far the second sight lies off the parallax, in standard deviations of the tracking noise."""
+
+    def __len__(self) -> int:
+        return len(self.pair)
+
+    def chosen(self, use: NDArray[np.bool_]) -> Sightings:
+        """Some of the points."""
+        return Sightings(
+            self.points.chosen(use), self.pair[use], self.from_m[use], self.rays[use], self.above_per_m[use],
+            self.across[use],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDepth:
+    """The scene before one frame."""
+
+    plane_per_m: Array
+    """(3,) camera axes at the frame's time: the inverse depth of a ray r with z = 1 is plane · r."""
+    depth_m: float
+    """Along the optical axis at the picture's centre."""
+    std_m: float
+    """Includes the metric scale's."""
+    points: int
+    """Triangulated points that the plane goes through; 0: the window's plane."""
+    reason: str = ""
+    """Why the frame's own points were not used."""
+    relief: Relief | None = None
+    """What stands out of the plane; None: nothing that the points tell."""
+
+    def with_relief(self, relief: Relief, middle: Array, relative_std: float) -> FrameDepth:
+        """The same scene with a surface on its plane; middle (3,): the ray through the picture's centre."""
+        inverse = max(float(self.plane_per_m @ middle + relief.at(middle)), 1e-6)
+        relative = float(np.hypot(relief.std_at(middle) / inverse, relative_std))
+        return replace(self, depth_m=1 / inverse, std_m=relative / inverse, relief=relief)
+
+
+def triangulate(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> TriangulatedPoints:
+    """Find the inverse depth of every matched point whose parallax tells it and that lies about the plane.
+
+    Points before which the camera hardly moved, or with an absurd depth, are left out.
+    """
+    sights = _sights(known, scene, table, PASSES, 1.0)
+    depth, expected = sights.points.inverse_depth_per_m, sights.points.inverse_depth_per_m - sights.above_per_m
+    near = (np.abs(sights.above_per_m) < expected) & (depth > 0.1 * expected)
+    return sights.points.chosen(near & (sights.points.std_per_m < MAX_RELATIVE_STD * expected))
+
+
+def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> Sightings:
+    """Find the inverse depth of every matched point whose parallax tells it, however far from the plane.
+
+    A point that leaves the line of its parallax is a mismatch or moves on its own.
+    """
+    sights = _sights(known, scene, table, RELIEF_PASSES, RELIEF_REACH)
+    expected = sights.points.inverse_depth_per_m - sights.above_per_m
+    std = sights.points.std_per_m
+    good = (std < MAX_RELATIVE_STD * expected) & (sights.points.inverse_depth_per_m > -2 * std)
+    good &= sights.across < MAX_ACROSS
+    sights, expected = sights.chosen(good), expected[good]
+    depth = sights.points.inverse_depth_per_m
+    far = np.maximum(depth, FARTHEST * expected)
+    place = sights.from_m + (sights.points.place_m - sights.from_m) * (depth / far)[:, None]
+    return replace(sights, points=replace(sights.points, place_m=place, inverse_depth_per_m=far))
+
+
+def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, passes: int, reach: float) -> Sightings:
+    """Gauss-Newton on one unknown a point, from the plane of its window, at most ``reach`` of it in a pass.
+
+    The standard deviation is the pair's tracking noise over the parallax.
+    """
+    assert known.displacement is not None
+    profile = known.profile
+    first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
+    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    origin_s = np.asarray(profile.imu_time_s(table.origin_s))[table.window]
+    velocity, plane = scene.velocity_m_s[table.window], scene.plane_per_m[table.window]
+    centre_1 = centre(known.displacement, scene, velocity, first_s, origin_s)[0]
+    centre_2 = centre(known.displacement, scene, velocity, second_s, origin_s)[0]
+    scale = profile.shutter.exposure_scale
+    before = known.trajectory.mean_orientation(first_s, scale * table.first_exposure_s)
+    back = np.swapaxes(known.trajectory.mean_orientation(second_s, scale * table.second_exposure_s), -1, -2)
+    rays = known.lens.rays(table.first_px, first_s)
+    way = turned(before, rays)
+    clearance = np.maximum(1 - (plane * centre_1).sum(axis=-1), SMALLEST_DEPTH)
+    expected = np.maximum((plane * way).sum(axis=-1) / clearance, 0.0)
+    view = _Parallax(known.lens, turned(back, way), turned(back, centre_1 - centre_2), table, second_s)
+    depth, std, across = view.inverse_depths(expected, passes, reach)
+    safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
+    points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], first_s, depth, std)
+    return Sightings(points, table.pair, centre_1, rays, depth - expected, across)
+
+
+@dataclass(frozen=True, slots=True)
+class _Parallax:
+    """Where points are seen the second time, by their inverse depths."""
+
+    lens: MovingLens
+    far: Array
+    """(n, 3) the point at infinity."""
+    step: Array
+    """(n, 3) its shift a unit of inverse depth."""
+    table: TrackTable
+    second_s: Array
+
+    def seen(self, inverse_depth: Array) -> Array:
+        """Pixels (n, 2)."""
+        rays = self.far + self.step * inverse_depth[:, None]
+        rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)
+        return self.lens.project(rays, self.second_s)
+
+    def inverse_depths(self, start: Array, passes: int, reach: float) -> tuple[Array, Array, Array]:
+        """(n,) inverse depths, their standard deviations, and what is left across in those of the tracking noise."""
+        depth, noise = start.copy(), self.table.noise_px[self.table.pair]
+        for _ in range(passes):
+            quotient = QUOTIENT * np.maximum(start, 1e-3)
+            at = self.seen(depth)
+            slope = (self.seen(depth + quotient) - at) / quotient[:, None]
+            power = np.maximum((slope**2).sum(axis=-1), 1e-12)
+            left = self.table.second_px - at
+            change = (slope * left).sum(axis=-1) / power
+            depth = depth + np.clip(change, -reach * start, reach * start)
+        across = np.abs(left[:, 0] * slope[:, 1] - left[:, 1] * slope[:, 0]) / np.sqrt(power)
+        return depth, noise / np.sqrt(power), across / noise
+
+
+def frame_depth(
+    points: TriangulatedPoints,
+    window: int,
+    time_s: float,
+    rotation_world_cam: Array,
+    centre_m: Array,
+    lens: MovingLens,
+    plane_per_m: Array,
+    spread_per_m: float,
+    relative_std: float,
+) -> FrameDepth:
+    """Lay a plane through the points about a frame.
+
+    rotation_world_cam (3, 3), centre_m (3,): the camera at time_s, from the window's middle.  plane_per_m: the window's
+    plane in camera axes at time_s; spread_per_m: standard deviation of inverse depths about it; relative_std: of the
+    metric scale.
+    """
+    size = np.array([lens.lens.width, lens.lens.height], float)
+    middle = lens.rays(0.5 * (size - 1), time_s)
+    near = (points.window == window) & (np.abs(points.time_s - time_s) < NEAR_S)
+    local = (points.place_m[near] - centre_m) @ rotation_world_cam
+    ahead = local[:, 2] > SMALLEST_DEPTH / max(float(np.linalg.norm(plane_per_m)), 1e-6)
+    local = local[ahead]
+    rays = local / local[:, 2:]
+    seen = lens.project(rays, np.full(len(rays), time_s)) if len(rays) else np.zeros((0, 2))
+    inside = (np.abs(seen - 0.5 * size) < (0.5 + OUTSIDE) * size).all(axis=-1)
+    rays, inverse = rays[inside], 1.0 / local[inside, 2]
+    std = points.std_per_m[near][ahead][inside] * (inverse / points.inverse_depth_per_m[near][ahead][inside]) ** 2
+    prior = max(spread_per_m, FEWEST_SPREAD * float(np.linalg.norm(plane_per_m)))
+    if len(rays) < MIN_POINTS:
+        own = FrameDepth(plane_per_m, 0.0, 0.0, 0, f"{len(rays)} points with parallax: the window's plane")
+        variance = 0.0 if spread_per_m == 0 else spread_per_m**2
+        return _concluded(own, middle, variance, relative_std)
+    plane, covariance, used = _robust_plane(rays, inverse, np.hypot(std, spread_per_m), plane_per_m, prior)
+    return _concluded(FrameDepth(plane, 0.0, 0.0, used), middle, float(middle @ covariance @ middle), relative_std)
+
+
+def _concluded(found: FrameDepth, middle: Array, variance: float, relative_std: float) -> FrameDepth:
+    """Depth at the picture's middle; variance of its inverse from the points alone."""
+    inverse = max(float(found.plane_per_m @ middle), 1e-6)
+    relative = float(np.hypot(np.sqrt(variance) / inverse, relative_std))
+    return FrameDepth(found.plane_per_m, 1 / inverse, relative / inverse, found.points, found.reason)
+
+
+def _robust_plane(rays: Array, inverse: Array, std: Array, start: Array, prior_std: float) -> tuple[Array, Array, int]:
+    """Plane (3,), its covariance, and the number of points that go with it: Cauchy weights about the start."""
+    plane, information = start, np.eye(3) / prior_std**2
+    rows, left = rays / std[:, None], inverse / std
+    for _ in range(REWEIGHTINGS):
+        squared = (left - rows @ plane) ** 2
+        scale = max(float(np.sqrt(np.median(squared))) / NORMAL_MEDIAN, 1.0)
+        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+        weighted = rows * (weight / scale**2)[:, None]
+        covariance = np.linalg.inv(weighted.T @ rows + information)
+        plane = covariance @ (weighted.T @ left + information @ start)
+    return np.asarray(plane), np.asarray(covariance), int((weight > 0.25).sum())

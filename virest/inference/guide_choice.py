@@ -1,0 +1,269 @@
+"""Whether the pictures follow the gyroscope, so that it may guide the tracking: asked before any point is followed.
+
+Tiles of a sample of pictures are compared with the pictures after them at every shift within reach (normalised
+cross-correlation), without the gyroscope.  What the tiles score where the gyroscope puts them is its support.  Texture
+that repeats scores at many shifts, but over many pairs only the right motion finds them all.
+
+The same log with its axes interchanged (the 24 axis maps) and played backwards is as fast, as smooth in time and as
+often tried, and knows nothing of the pictures.  Its supports, each the best of the same offsets, follow Gumbel's
+distribution of extremes; the gyroscope guides where its own lies beyond what they reach once in 1 / FALSE_ALARMS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.capture.join import median_period_s
+from virest.capture.records import Capture, Frame
+from virest.image_formation.row_clock import RowClock, row_time_s
+from virest.inference.alignment import choose_pairs
+from virest.inference.coarse_alignment import axis_maps
+from virest.inference.frame_rotations import gyro_turns
+from virest.inference.guidance import GyroGuide, gyro_guide
+from virest.inference.observed_tracks import frame_times
+from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.tracking import Picture, TrackPair, track_frames
+from virest.motion.integration import integrate_gyro
+from virest.motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Reader = Callable[[Sequence[int]], Iterable[tuple[int, Picture | None]]]
+SAMPLE_FRAMES, RUN_FRAMES = 32, 8
+"""Four runs of frames where the gyroscope is liveliest."""
+MIN_PAIRS = 8
+LONG_SIDE_PX, TILE_PX, REACH_PX = 192, 33, 48
+"""Of the shrunk pictures: a quarter of the longer side a frame is within reach, 480 px of 1920."""
+TILES = 3
+"""Each way."""
+FLAT_LEVELS = 1.5
+"""A tile whose grey levels spread less shows nothing."""
+STEP_S, NEAR_S, SEARCH_S = 0.008, 0.04, 1.0
+"""Offsets tried: about the profile's first, then all."""
+FINE_STEP_S = 0.002
+FALSE_ALARMS = 1e-3
+SAME_PX = 2.0
+"""Logs that put the tiles as near to each other as this (rms) are one."""
+MIN_RIVALS = 20
+STRETCH_PAIRS, LASTING, MOST = 4, 2.0, 0.75
+"""Most stretches of this many pairs must each support the gyroscope, by this many deviations of its rivals there: one
+moment of a log may fit by chance, or be the only one that belongs."""
+GUMBEL_MEAN, GUMBEL_STD = 0.5772, 1.2825
+
+
+def find_guide(capture: Capture, profile: CameraProfile, gray: Reader, frames: Sequence[int]) -> GyroGuide | None:
+    """The gyroscope as a guide through frames (movie indices); None where the pictures do not say that they follow it.
+
+    gray: gives (index, picture) of the frames asked for.  At the profile's offset; where it has none, or the pictures
+    follow the gyroscope elsewhere, at the offset where they do best.
+    """
+    if profile.intrinsics is None or len(capture.imu) < 8:
+        return None
+    wanted = set(frames)
+    usable = [frame for frame in capture.frames if frame.index in wanted]
+    if not _lively(usable, capture, profile):
+        return None
+    sample = choose_pairs(usable, capture.imu, SAMPLE_FRAMES, RUN_FRAMES, profile.time_offset_s or 0.0)
+    scores = _matched(gray(sample), profile) if len(sample) > MIN_PAIRS else None
+    if scores is None or len(scores.first) < MIN_PAIRS:
+        return None
+    stated_s = profile.time_offset_s
+    found = None if stated_s is None else _Trial(capture, profile, scores).support(stated_s, NEAR_S)
+    if found is None:
+        few = scores.of_tiles(slice(None, None, 2))
+        found = _Trial(capture, profile, few).support(stated_s or 0.0, SEARCH_S)
+    if found is None:
+        return None
+    offset_s, turn = found
+    if stated_s is not None and abs(offset_s - stated_s) <= STEP_S:
+        offset_s = stated_s
+    mounted = tuple(map(tuple, (turn @ profile.rotation_cam_imu).tolist()))
+    return gyro_guide(capture, replace(profile, time_offset_s=offset_s, r_cam_imu=mounted))
+
+
+def track_guided(
+    capture: Capture,
+    profile: CameraProfile,
+    gray: Reader,
+    frames: Sequence[int],
+    each: ParallelMap = one_by_one,
+    progress: Callable[[int], None] | None = None,
+) -> list[TrackPair]:
+    """Follow points through frames (movie indices, rising) as :func:`track_frames` does, guided where that may be."""
+    return track_frames(gray, frames, each, progress, find_guide(capture, profile, gray, frames))
+
+
+def _lively(frames: Sequence[Frame], capture: Capture, profile: CameraProfile) -> bool:
+    """Whether the gyroscope turns enough from frame to frame for its rivals to be told from it."""
+    if profile.intrinsics is None or len(frames) <= MIN_PAIRS:
+        return False
+    period_s = median_period_s(np.array([frame.time_s for frame in frames]))
+    rate_rad_s = np.linalg.norm(capture.imu.gyro_rad_s - profile.gyro_bias_rad_s, axis=1)
+    shrunk_focal_px = profile.intrinsics.fx_px * LONG_SIDE_PX / max(profile.width, profile.height)
+    turned_px = float(np.sqrt(np.mean(rate_rad_s**2))) * (period_s or 0.0) * shrunk_focal_px
+    return turned_px > SAME_PX
+
+
+@dataclass(frozen=True, slots=True)
+class _Scores:
+    """How well tiles of first pictures match the second ones at every shift."""
+
+    first: NDArray[np.intp]
+    """(p,) movie index."""
+    second: NDArray[np.intp]
+    values: NDArray[np.float32]
+    """(p, tiles, 2 r + 3, 2 r + 3) correlation at shifts (y, x) from -r - 1; 0 out of reach and where nothing shows."""
+    centres_px: Array
+    """(tiles, 2) of the stored picture."""
+    scale: float
+    """Stored pixels in one of the shrunk picture."""
+
+    def at(self, shift_px: Array) -> Array:
+        """Mean over tiles (..., p) at shifts (..., p, tiles, 2) of the stored picture."""
+        side = self.values.shape[-1]
+        place = np.rint(shift_px / self.scale).astype(np.int32) + (side - 1) // 2
+        place = np.clip(place, 0, side - 1)
+        surface = np.arange(self.values.shape[0] * self.values.shape[1]).reshape(self.values.shape[:2])
+        flat = (surface * side + place[..., 1]) * side + place[..., 0]
+        return np.asarray(self.values.ravel()[flat].mean(axis=-1))
+
+    def of_tiles(self, chosen: slice) -> _Scores:
+        """Of some of the tiles."""
+        return replace(self, values=np.ascontiguousarray(self.values[:, chosen]), centres_px=self.centres_px[chosen])
+
+
+def _matched(pictures: Iterable[tuple[int, Picture | None]], profile: CameraProfile) -> _Scores | None:
+    """Scores of each two consecutive pictures; a repeated one shows another time than its stamp."""
+    scale = max(profile.width, profile.height) / LONG_SIDE_PX
+    size = round(profile.width / scale), round(profile.height / scale)
+    if min(size) < TILE_PX + 2:
+        return None
+    corners = [np.linspace(0, length - TILE_PX, TILES).round().astype(int) for length in size]
+    tiles = [(x, y) for y in corners[1] for x in corners[0]]
+    found: list[tuple[int, int, NDArray[np.float32]]] = []
+    before: tuple[int, Picture] | None = None
+    for index, picture in pictures:
+        if picture is None:
+            before = None
+            continue
+        small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        if before is not None and before[0] == index - 1 and not np.array_equal(before[1], small):
+            found.append((before[0], index, np.stack([_surface(before[1], small, x, y) for x, y in tiles])))
+        before = (index, small)
+    if not found:
+        return None
+    first, second = np.array([one[:2] for one in found], np.intp).T
+    values = np.stack([one[2] for one in found])
+    middle = (TILE_PX - 1) / 2
+    centres = (np.array(tiles, float) + middle + 0.5) * scale - 0.5
+    return _Scores(first, second, values, centres, scale)
+
+
+def _surface(first: Picture, second: Picture, x: int, y: int) -> NDArray[np.float32]:
+    """Correlation of one tile at all shifts; the outermost ring, out of reach, stays 0."""
+    side = 2 * REACH_PX + 3
+    scores = np.zeros((side, side), np.float32)
+    tile = first[y : y + TILE_PX, x : x + TILE_PX]
+    if tile.std() < FLAT_LEVELS:
+        return scores
+    left, top = max(x - REACH_PX, 0), max(y - REACH_PX, 0)
+    area = second[top : y + TILE_PX + REACH_PX, left : x + TILE_PX + REACH_PX]
+    found = cv2.matchTemplate(area, tile, cv2.TM_CCOEFF_NORMED)
+    row, column = top - y + REACH_PX + 1, left - x + REACH_PX + 1
+    scores[row : row + found.shape[0], column : column + found.shape[1]] = np.nan_to_num(found, posinf=0, neginf=0)
+    return scores
+
+
+class _Trial:
+    """The gyroscope and its like before the pictures."""
+
+    def __init__(self, capture: Capture, profile: CameraProfile, scores: _Scores) -> None:
+        assert profile.intrinsics is not None
+        self.lens: Intrinsics = profile.intrinsics
+        self.scores = scores
+        self.trajectory: Trajectory = integrate_gyro(capture.imu, profile)
+        stamp_s, exposure_s, _ = frame_times(capture)
+        self.clock = RowClock(replace(profile, time_offset_s=0.0))
+        self.first_s, self.second_s = (
+            self.clock.seen_s(scores.centres_px, stamp_s[index, None], exposure_s[index, None])
+            for index in (scores.first, scores.second)
+        )
+        self.maps = axis_maps()
+        own = np.abs(self.maps - np.eye(3)).max(axis=(1, 2)) == 0
+        self.maps = np.concatenate([self.maps[own], self.maps[~own]])
+
+    def support(self, centre_s: float, search_s: float) -> tuple[float, Array] | None:
+        """Offset within ± search_s of the centre and axis map (3, 3) that the pictures support beyond chance."""
+        steps = int(np.ceil(search_s / STEP_S))
+        offsets = centre_s + STEP_S * np.arange(-steps, steps + 1, dtype=float)
+        ways = self._turns(offsets), -self._turns(offsets, backwards=True)
+        contest = [self._best(way @ turn.T) for way in ways for turn in self.maps]
+        by_pair, shifts = (np.array([one[k] for one in contest]) for k in (1, 2))
+        chosen = int(np.argmax(by_pair[: len(self.maps)].mean(axis=1)))
+        away_px = np.sqrt(((shifts - shifts[chosen]) ** 2).sum(axis=-1).mean(axis=(1, 2)))
+        still = float(self.scores.at(np.zeros_like(shifts[chosen])).mean())
+        rivals = by_pair[away_px > SAME_PX * self.scores.scale]
+        if by_pair[chosen].mean() <= still or not _beyond_chance(by_pair[chosen], rivals):
+            return None
+        return self._refined(float(offsets[contest[chosen][0]]), self.maps[chosen]), self.maps[chosen]
+
+    def _best(self, vector: Array) -> tuple[int, Array, Array]:
+        """Number of the offset at which turns (offsets, p, tiles, 3) score best, scores (p,) and shifts there."""
+        shifts = self._shifts(vector)
+        by_pair = self.scores.at(shifts)
+        best = int(np.argmax(by_pair.mean(axis=-1)))
+        return best, by_pair[best], shifts[best]
+
+    def _refined(self, offset_s: float, turn: Array) -> float:
+        near = offset_s + np.arange(-STEP_S, STEP_S + FINE_STEP_S / 2, FINE_STEP_S)
+        support = self.scores.at(self._shifts(self._turns(near) @ turn.T)).mean(axis=-1)
+        return float(near[support >= support.max() - 1e-9].mean())
+
+    def _turns(self, offsets_s: Array, backwards: bool = False) -> NDArray[np.float32]:
+        """Rotation vectors (offsets, p, tiles, 3) of the pictures, each tile at its row's time."""
+        first_s, second_s = (time_s + offsets_s[:, None, None] for time_s in (self.first_s, self.second_s))
+        if backwards:
+            ends = sum(self.trajectory.span_s)
+            first_s, second_s = ends - second_s, ends - first_s
+        return gyro_turns(self.trajectory, first_s, second_s).astype(np.float32)
+
+    def _shifts(self, vector: Array) -> Array:
+        """Shifts (..., p, tiles, 2) of the tiles, stored pixels, turned by vectors (..., p, tiles, 3): second order.
+
+        A tile that moves down the picture is read later: its shift goes on at the same rate.
+        """
+        rays = self.lens.rays(self.scores.centres_px).astype(np.float32)
+        once = np.cross(vector, rays)
+        turned = rays + once + 0.5 * np.cross(vector, once)
+        moved = self.lens.project(turned) - self.scores.centres_px
+        lasting = np.maximum(self.second_s - self.first_s, 1e-6)
+        return np.asarray(moved * (1 + self._late_s(moved) / lasting)[..., None])
+
+    def _late_s(self, moved: Array) -> Array:
+        """By how much (..., p, tiles) the tiles are read later than where they were."""
+        before_px, fraction = self.scores.centres_px, self.clock.readout_fraction
+        later = fraction(before_px + moved) - fraction(before_px)
+        return np.asarray(row_time_s(0.0, self.clock.profile.shutter.readout_time_s, later))
+
+
+def _beyond_chance(own: Array, rivals: Array) -> bool:
+    """Whether scores of pairs (p,) lie beyond what rivals' (k, p) reach by chance, and do so most of the time."""
+    if len(rivals) < MIN_RIVALS:
+        return False
+    surest = -np.log(-np.log1p(-FALSE_ALARMS))
+    if _deviations(own.mean(), rivals.mean(axis=1)) < (surest - GUMBEL_MEAN) / GUMBEL_STD:
+        return False
+    stretches = np.array_split(np.arange(len(own)), max(len(own) // STRETCH_PAIRS, 1))
+    lasting = [_deviations(own[part].mean(), rivals[:, part].mean(axis=1)) > LASTING for part in stretches]
+    return float(np.mean(lasting)) >= MOST
+
+
+def _deviations(value: float, others: Array) -> float:
+    """By how many standard deviations of the others (n,) a value lies above their mean."""
+    return float((value - others.mean()) / max(float(others.std(ddof=1)), 1e-6))

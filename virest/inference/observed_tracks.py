@@ -1,0 +1,206 @@
+"""From tracked pairs to what a geometric fit needs: pairs worth using, their noise, turns, windows and table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Capture
+from virest.image_formation.point_model import TrackTable
+from virest.image_formation.row_clock import RowClock
+from virest.inference.frame_rotations import FrameRotations, picture_turns
+from virest.inference.track_noise import step_noise_px
+from virest.inference.tracking import TrackPair
+
+Array = NDArray[np.float64]
+MIN_TRACKS = 15
+"""A pair with fewer tells too little."""
+WINDOW_S = 3.5
+"""Longest stretch over which the accelerometer's path is followed; its noise grows with the power 1.5."""
+IMU_PAUSE_PERIODS = 3.0
+MARGIN_S = 0.02
+CELLS, LEAST_IN_CELL, ASTRAY, MOST_ASTRAY = 8, 10, 2.5, 0.5
+GUESSED_FOCAL = 0.8
+"""Of the longer side: a phone's main camera; where nothing is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedTracks:
+    """Pairs that are worth something, and when their frames were stamped."""
+
+    pairs: tuple[TrackPair, ...]
+    stamp_s: Array
+    """(frames,) by movie index, camera clock from stamp_0."""
+    exposure_s: Array
+    """(frames,) as logged; 0 where unknown."""
+    exposure_known: bool
+    noise_px: Array
+    """(pairs,) standard deviation of a step per coordinate."""
+    lens: Intrinsics
+    """The profile's, or a guess."""
+
+    @property
+    def tracks(self) -> int:
+        """Number of tracked points."""
+        return sum(map(len, self.pairs))
+
+    def turns(self, profile: CameraProfile) -> FrameRotations:
+        """Rotation of every pair, at the middle of the readout and exposure, camera clock."""
+        clock = RowClock(profile)
+        middle = clock.camera_time_s(clock.middle_s(self.stamp_s, self.exposure_s))
+        first, second = ([getattr(pair, name) for pair in self.pairs] for name in ("first", "second"))
+        return picture_turns(self.lens, self.pairs, middle[first], middle[second])
+
+    def chosen(self, use: NDArray[np.bool_]) -> ObservedTracks:
+        """Some of the pairs."""
+        kept = tuple(pair for pair, u in zip(self.pairs, use, strict=True) if u)
+        return replace(self, pairs=kept, noise_px=self.noise_px[use])
+
+    def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
+        """The pairs whose two pictures lie inside the inertial data, with no pause or untrusted stretch between."""
+        shutter = profile.shutter
+        start = np.asarray(RowClock(profile).time_s(self.stamp_s, self.exposure_s))
+        last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s) + MARGIN_S
+        begin = np.array([start[pair.first] - MARGIN_S for pair in self.pairs])
+        end = np.array([start[pair.second] + last[pair.second] for pair in self.pairs])
+        use = (begin > imu.time_s[0]) & (end < imu.time_s[-1])
+        steps = np.diff(imu.time_s)
+        for gap in np.flatnonzero(steps > max(MARGIN_S, IMU_PAUSE_PERIODS * float(np.median(steps)))):
+            use &= (end < imu.time_s[gap]) | (begin > imu.time_s[gap + 1])
+        for from_s, to_s in profile.unbridged_s:
+            use &= (end < from_s) | (begin > to_s)
+        return self.chosen(use)
+
+    def without_astray(self, first_px: Array, distance: Array) -> tuple[ObservedTracks, float]:
+        """Leave out the parts of the picture that go their own way, and say how many of the points that takes."""
+        astray = self.astray_cells(first_px, distance)
+        if not astray.any():
+            return self, 0.0
+        return self.without_cells(astray), float(astray[self.cells(first_px)].mean())
+
+    def astray_cells(self, first_px: Array, distance: Array) -> NDArray[np.bool_]:
+        """Which cells (CELLS²,) of the picture go their own way: a dashboard, a passer-by.
+
+        first_px (n, 2), distance (n,): points of a fit and how far each lies from it, in standard deviations.  A cell
+        is astray if its median distance is ASTRAY times the typical cell's; none if most points would be.
+        """
+        cell = self.cells(first_px)
+        counts = np.bincount(cell, minlength=CELLS**2)
+        medians = np.zeros(CELLS**2)
+        full = np.flatnonzero(counts >= LEAST_IN_CELL)
+        for number in full:
+            medians[number] = np.median(distance[cell == number])
+        astray = medians > ASTRAY * (np.median(medians[full]) if len(full) else np.inf)
+        return astray & (counts[astray].sum() <= MOST_ASTRAY * counts.sum())
+
+    def without_cells(self, cells: NDArray[np.bool_]) -> ObservedTracks:
+        """Leave out the points that begin in some cells (CELLS²,) of the picture, and pairs that are then too few."""
+        kept = [_selected(pair, ~cells[self.cells(pair.points_first_px)]) for pair in self.pairs]
+        use = np.array([len(pair) >= MIN_TRACKS for pair in kept])
+        return replace(self, pairs=tuple(kept)).chosen(use)
+
+    def cells(self, points_px: Array) -> NDArray[np.intp]:
+        """Number of the cell that each point lies in."""
+        part = points_px * (CELLS / np.array([self.lens.width, self.lens.height]))
+        x, y = np.clip(part.astype(np.intp), 0, CELLS - 1).T
+        return np.asarray(y * CELLS + x)
+
+    def table(self, max_points: int) -> TrackTable:
+        """All points in one table, evenly thinned to about max_points."""
+        stride = max(-(-self.tracks // max_points), 1)
+        pairs = [_thinned(pair, k % stride, stride) for k, pair in enumerate(self.pairs)]
+        return track_table(pairs, self.stamp_s, self.exposure_s, self.noise_px, self._windows())
+
+    def _windows(self) -> list[list[int]]:
+        """Equal stretches of at most WINDOW_S; a pause of one also ends a window."""
+        middle = np.array([self.stamp_s[pair.second] for pair in self.pairs])
+        parts: list[list[int]] = []
+        for run in np.split(np.arange(len(middle)), np.flatnonzero(np.diff(middle) > 0.5 * WINDOW_S) + 1):
+            count = max(int(np.ceil((middle[run[-1]] - middle[run[0]]) / WINDOW_S)), 1)
+            edges = np.linspace(middle[run[0]], middle[run[-1]], count + 1)[1:-1]
+            parts += [list(part) for part in np.split(run, np.searchsorted(middle[run], edges)) if len(part)]
+        return parts
+
+
+def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> ObservedTracks:
+    """Keep the pairs with enough points and known stamps; the exposure of frames without one is the typical one."""
+    stamp_s, exposure_s, known = frame_times(capture)
+    kept = tuple(
+        pair for pair in pairs if len(pair) >= MIN_TRACKS and np.isfinite(stamp_s[[pair.first, pair.second]]).all()
+    )
+    lens = profile.intrinsics or guessed_lens(profile)
+    return ObservedTracks(kept, stamp_s, exposure_s, known, step_noise_px(kept), lens)
+
+
+def frame_times(capture: Capture) -> tuple[Array, Array, bool]:
+    """Stamps and logged exposures (frames,) by movie index, and whether exposures are known: else they are 0."""
+    stamp_s = np.array([frame.time_s for frame in capture.frames], float)
+    exposure_s = np.array([np.nan if f.exposure_s is None else f.exposure_s for f in capture.frames], float)
+    known = bool(np.isfinite(exposure_s).mean() > 0.5)
+    exposure_s = np.where(np.isfinite(exposure_s), exposure_s, np.nanmedian(exposure_s) if known else 0.0)
+    return stamp_s, exposure_s, known
+
+
+def guessed_lens(profile: CameraProfile) -> Intrinsics:
+    """A phone's main camera, where nothing is known."""
+    return profile.lens_of(GUESSED_FOCAL * max(profile.width, profile.height))
+
+
+def _selected(pair: TrackPair, use: NDArray[np.bool_]) -> TrackPair:
+    return replace(
+        pair,
+        points_first_px=pair.points_first_px[use],
+        points_second_px=pair.points_second_px[use],
+        forward_backward_px=None,
+    )
+
+
+def _thinned(pair: TrackPair, start: int, stride: int) -> TrackPair:
+    return replace(
+        pair,
+        points_first_px=pair.points_first_px[start::stride],
+        points_second_px=pair.points_second_px[start::stride],
+        forward_backward_px=None,
+    )
+
+
+def track_table(
+    pairs: Sequence[TrackPair],
+    stamp_s: Array,
+    exposure_s: Array,
+    noise_px: Array,
+    windows: Sequence[Sequence[int]] | None = None,
+) -> TrackTable:
+    """Lay out pairs; stamp_s, exposure_s (frames,) by movie index, exposure 0 where unknown.
+
+    windows: numbers of the pairs in each window; None: one window.
+    """
+    windows = windows or [range(len(pairs))]
+    sizes = [len(pair) for pair in pairs]
+    first = np.repeat([pair.first for pair in pairs], sizes)
+    second = np.repeat([pair.second for pair in pairs], sizes)
+    number = np.zeros(len(pairs), np.intp)
+    for k, members in enumerate(windows):
+        number[list(members)] = k
+    middles = np.array([0.5 * (stamp_s[pair.first] + stamp_s[pair.second]) for pair in pairs])
+    origin = np.array([middles[number == k].mean() if (number == k).any() else 0.0 for k in range(len(windows))])
+    return TrackTable(
+        np.repeat(np.arange(len(pairs)), sizes),
+        np.repeat(number, sizes),
+        first,
+        second,
+        np.concatenate([pair.points_first_px for pair in pairs]),
+        np.concatenate([pair.points_second_px for pair in pairs]),
+        stamp_s[first],
+        stamp_s[second],
+        exposure_s[first],
+        exposure_s[second],
+        origin,
+        noise_px,
+    )

@@ -1,0 +1,77 @@
+"""The recorder's start-up: pictures later than their stamps, and how exact repeats use the lag up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.join import median_period_s
+from virest.capture.records import Capture
+from virest.inference.coarse_alignment import align_coarsely
+from virest.inference.observed_tracks import ObservedTracks
+
+Array = NDArray[np.float64]
+EXTRA_PERIODS = (0.0, 0.5, 1.0, 1.5, 2.0)
+"""A lag may be longer than the repeats seen use up, if the recording ends before it is over."""
+LAGGING = 0.7
+"""The lag is believed if turns then disagree at most this part of how much they disagree without."""
+
+Schedule = tuple[float, int, tuple[float, ...]]
+"""(lag_s at slot 0, last lagging slot, seconds by which each slot shows a later capture)."""
+
+
+def lag_schedules(capture: Capture, repeats: Sequence[int]) -> list[Schedule]:
+    """Schedules that the repeats seen allow; none without a repeat."""
+    if not repeats:
+        return []
+    period_s = median_period_s(np.array([frame.time_s for frame in capture.frames]))
+    slots = np.arange(len(capture.frames))
+    so_far = np.searchsorted(np.sort(np.array(repeats)), slots, side="right")
+    last, total = max(repeats), len(repeats)
+    whole_movie = last >= 0.8 * len(slots)
+    found = []
+    for extra in EXTRA_PERIODS if whole_movie else (0.0,):
+        shift = np.where(slots <= last, total + extra - so_far, extra) * period_s
+        found.append(((total + extra) * period_s, int(last), tuple(shift.tolist())))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class StartUpLag:
+    """What the pictures' turns say of the recorder's start-up."""
+
+    lag_s: float
+    """Of slot 0; 0 where none is believed."""
+    frames: int
+    """The last lagging slot."""
+    by_frame_s: tuple[float, ...]
+    determined: bool
+    note: str
+
+
+def fit_start_up_lag(capture: Capture, observed: ObservedTracks, profile: CameraProfile) -> StartUpLag:
+    """Find the schedule at which the turns of pictures and gyroscope agree best; observed: with the first frames."""
+    none = StartUpLag(0.0, 0, (), False, "no frame repeats another: a lag cannot be determined")
+    schedules = lag_schedules(capture, capture.repeats)
+    if not schedules:
+        return none
+    left = [_disagreement(capture, observed, profile, by_frame) for _, _, by_frame in schedules]
+    without = _disagreement(capture, observed, profile, (0.0,) * len(capture.frames))
+    best = int(np.argmin(left))
+    if not left[best] < LAGGING * without:
+        return replace(none, note="the turns agree no better with a lag than without")
+    lag_s, last, by_frame = schedules[best]
+    return StartUpLag(lag_s, last, by_frame, True, f"used up by frame {last}")
+
+
+def _disagreement(
+    capture: Capture, observed: ObservedTracks, profile: CameraProfile, by_frame_s: Sequence[float]
+) -> float:
+    """Part of the pictures' changing turns that the gyroscope leaves unexplained at the best offset."""
+    late = replace(observed, stamp_s=observed.stamp_s + np.array(by_frame_s))
+    coarse = align_coarsely(late.turns(profile), capture.imu, profile)
+    return 1.0 if coarse is None else 1.0 - coarse.explained

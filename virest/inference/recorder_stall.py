@@ -1,0 +1,171 @@
+"""An encoder that stalls in mid-movie: which capture each slot shows, told by tracked points against the gyroscope.
+
+An encoder that pauses draws, when it goes on, what is current: from some slot on pictures are m captures later than
+their stamps, and m repeats use that up, one each.  So slot k of a stall shows capture k + m − (repeats up to k), or its
+own before the jump.  The repeats are seen; where the jump lies is not, and each place says other turns between
+successive pictures.  The place is taken whose turns are the pictures', beyond doubt; otherwise none is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.records import STALL, Capture
+from virest.image_formation.row_clock import RowClock
+from virest.inference.frame_rotations import gyro_turns, picture_rotation
+from virest.inference.observed_tracks import MIN_TRACKS
+from virest.inference.tracking import TrackPair, track_pairs
+from virest.motion.integration import integrate_gyro
+from virest.motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+CONTEXT = 8
+"""Frames on both sides of a stall, whose stamps are right: they say how well turns agree."""
+MIN_CONTEXT = 6
+REPEAT_PX, MOVED_PX = 0.1, 0.5
+"""A picture that moves less than the first where the gyroscope says more than the second repeats its predecessor."""
+LEAST_NOISE_PX = 0.1
+TOLD_CHI2 = 37.0
+"""In units of the turns' own scatter, the best place must be better than any other by this: exp(−37 / 2) is
+1e-8, and 1e-6 where turns scatter 15 % more than their neighbours say."""
+OTHER_SIGMA, MOST_REST = 3.0, 0.2
+"""A lateness that is no whole number of captures, by these deviations and this part of a period, is something else."""
+FITS = 1.5
+"""Rms inside the stall over that about it, up to which turns are explained."""
+
+
+@dataclass(frozen=True, slots=True)
+class Retimed:
+    """A stall whose pictures were told."""
+
+    first: int
+    """Slot from which pictures are late."""
+    last: int
+    shows: tuple[int, ...]
+    """The capture that each slot from ``first`` to ``last`` shows."""
+    rest_s: tuple[float, float]
+    """What is left of their lateness, in the mean, and its standard deviation."""
+
+
+def stall_window(capture: Capture, stall: tuple[int, int]) -> range:
+    """The frames that are looked at."""
+    return range(max(stall[0] - CONTEXT, 0), min(stall[1] + CONTEXT + 1, len(capture.frames)))
+
+
+def fit_stall(
+    capture: Capture, profile: CameraProfile, stall: tuple[int, int], pictures: Mapping[int, NDArray[np.uint8]]
+) -> Retimed | None:
+    """What the slots of a stall show; None where points do not tell.
+
+    profile: with focal length and time offset; pictures: luma by movie index, those of :func:`stall_window`.
+    """
+    lens = profile.intrinsics
+    if lens is None or profile.time_offset_s is None:
+        return None
+    window = stall_window(capture, stall)
+    slots = [k for k in window[1:] if k in pictures and k - 1 in pictures]
+    pairs = {k: pair for k in slots if (pair := _pair(pictures, k)) is not None}
+    time_s, trajectory = _middle_s(capture, profile), integrate_gyro(capture.imu, profile)
+    if time_s[window[0]] < trajectory.span_s[0] or time_s[window[-1]] > trajectory.span_s[1]:
+        return None
+
+    def predicted_px(first: Sequence[int], second: Sequence[int]) -> Array:
+        return gyro_turns(trajectory, time_s[list(first)], time_s[list(second)]) * lens.fx_px
+
+    expected = dict(zip(slots, predicted_px([k - 1 for k in slots], slots), strict=True))
+    repeats = [
+        k
+        for k in slots
+        if stall[0] < k <= stall[1] and np.linalg.norm(expected[k]) > MOVED_PX and _stands(pairs.get(k))
+    ]
+    seen = [k for k in slots if pairs.get(k) is not None and k not in repeats]
+    turned = np.array([picture_rotation(lens, pairs[k]) for k in seen]).reshape(-1, 3) * lens.fx_px
+    inside = np.array([stall[0] <= k <= stall[1] + 1 for k in seen], bool)
+    if not repeats or (~inside).sum() < MIN_CONTEXT or not inside.any():
+        return None
+    if stall[1] + len(repeats) >= len(capture.frames):
+        return None
+    trials = [_shows(window, start, repeats) for start in range(stall[0], repeats[0])]
+    stamped = dict(zip(window, window, strict=True))
+    left = np.array(
+        [turned - predicted_px([shows[k - 1] for k in seen], [shows[k] for k in seen]) for shows in (stamped, *trials)]
+    )
+    noise_px = max(float(np.sqrt(np.mean(left[0][~inside] ** 2))), LEAST_NOISE_PX)
+    chi2 = (left[:, inside] ** 2).sum(axis=(1, 2)) / noise_px**2
+    best = int(np.argmin(chi2))
+    if best == 0 or chi2[best] > FITS**2 * 3 * inside.sum() or np.partition(chi2, 1)[1] - chi2[best] < TOLD_CHI2:
+        return None
+    start, shows = stall[0] + best - 1, trials[best - 1]
+    within = [k for k, i in zip(seen, inside, strict=True) if i]
+    rest_s = _rest_s(
+        trajectory, time_s[[shows[k - 1] for k in within]], time_s[[shows[k] for k in within]],
+        left[best][inside], lens.fx_px, noise_px,
+    )  # fmt: skip
+    if abs(rest_s[0]) > max(OTHER_SIGMA * rest_s[1], MOST_REST * float(np.median(np.diff(time_s)))):
+        return None
+    return Retimed(start, stall[1], tuple(shows[k] for k in range(start, stall[1] + 1)), rest_s)
+
+
+def _rest_s(
+    trajectory: Trajectory, first_s: Array, second_s: Array, left_px: Array, focal_px: float, noise_px: float
+) -> tuple[float, float]:
+    """By how much all of the pictures would be later still, and its standard deviation, by least squares."""
+    step_s = 1e-3
+    moved = gyro_turns(trajectory, first_s + step_s, second_s + step_s) - gyro_turns(trajectory, first_s, second_s)
+    slope = focal_px * moved / step_s
+    power = max(float((slope**2).sum()), 1e-12)
+    return float((slope * left_px).sum()) / power, noise_px / float(np.sqrt(power))
+
+
+def at_shown_times(capture: Capture, found: Sequence[Retimed]) -> Capture:
+    """The capture with the slots of stalls at the times and exposures of what they show; what else bars them stays."""
+    frames = list(capture.frames)
+    for one in found:
+        shows = dict(zip(range(one.first, one.last + 1), one.shows, strict=True))
+        for slot in _stalled(capture, one):
+            source, frame = capture.frames[shows.get(slot, slot)], frames[slot]
+            only = frame.skip_codes == (STALL,)
+            frames[slot] = replace(
+                frame,
+                time_s=source.time_s,
+                exposure_s=source.exposure_s,
+                skip_reason=None if only else frame.skip_reason,
+                skip_codes=() if only else frame.skip_codes,
+            )
+    return replace(capture, frames=tuple(frames))
+
+
+def _stalled(capture: Capture, one: Retimed) -> range:
+    """All slots of the stall that holds a retimed part, those before its jump too: they are as stamped."""
+    first = next(first for first, last in capture.stalls if first <= one.first <= last)
+    return range(first, one.last + 1)
+
+
+def _pair(pictures: Mapping[int, NDArray[np.uint8]], k: int) -> TrackPair | None:
+    found = track_pairs([(k - 1, pictures[k - 1]), (k, pictures[k])])
+    return found[0] if found and len(found[0]) >= MIN_TRACKS else None
+
+
+def _stands(pair: TrackPair | None) -> bool:
+    """Whether a picture is its predecessor's; pictures that are the same throughout give no pair."""
+    if pair is None:
+        return True
+    return float(np.median(np.linalg.norm(pair.points_second_px - pair.points_first_px, axis=-1))) < REPEAT_PX
+
+
+def _middle_s(capture: Capture, profile: CameraProfile) -> Array:
+    """When the middle of each capture's picture was seen, IMU clock."""
+    stamp_s = np.array([frame.time_s for frame in capture.frames])
+    exposure_s = np.array([frame.exposure_s or 0.0 for frame in capture.frames])
+    return np.asarray(RowClock(profile).middle_s(stamp_s, exposure_s))
+
+
+def _shows(window: range, start: int, repeats: Sequence[int]) -> dict[int, int]:
+    """The capture that each slot shows where pictures are late from ``start`` on."""
+    late = {k: len(repeats) - sum(repeat <= k for repeat in repeats) for k in window}
+    return {k: k + (late[k] if k >= start else 0) for k in window}

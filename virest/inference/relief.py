@@ -1,0 +1,408 @@
+"""What stands out of the plane: a surface of inverse depth over one frame's picture, from points of many frames.
+
+Depths before a camera are patches with edges between them, so points a distance h apart differ by ½ E(Δ²) =
+nugget² + sill² (1 − exp(−h / length)) in inverse depth: the variogram of a random mosaic (Matheron 1963; Lee, Mumford
+& Huang 2001).  It is measured among the points of each window.  A frame's surface is bilinear between the nodes of a
+coarse grid, tied to their neighbours as loosely as that and drawn back to the plane over its length where no points
+are: a Gaussian Markov field (Rue & Held 2005), so the information matrix is a band.  A window takes surfaces only if
+they tell held-out points better than its planes do.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from virest.image_formation.point_model import SMALLEST_DEPTH
+from virest.inference.depth import Sightings
+from virest.motion.optics import MovingLens
+from virest.motion.relief_surface import Relief, angles
+
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+LONG_CELLS, SHORT_CELLS = 24, 18
+"""Cells along the picture's longer and shorter side."""
+OUTSIDE = 0.05
+"""The grid reaches this part of the picture beyond its edge."""
+NEAR_S = 1.0
+"""Points seen within this time of a frame speak for it."""
+ENOUGH, MOST, NEARBY = 500, 1500, 1 / 32
+"""A frame takes the points of the nearest pairs: this many, or up to MOST while parallax stays below this part of the
+picture's longer side."""
+MIN_POINTS = 60
+"""A frame with fewer keeps its plane."""
+COMPARED_PAIRS, CLEAR = 8, 2.0
+"""Pairs of frames whose points are compared with each other, those left out that are known CLEAR times worse than the
+typical one."""
+LAGS, FINEST_LAG, WIDEST_LAG, MIN_DIFFERENCES = 9, 0.02, 0.6, 200
+"""Edges of the classes of distance, from and to these parts of the picture's longer side, and what fills a class."""
+LENGTHS, SHORTEST, LONGEST = 8, 0.04, 0.6
+"""Lengths that are tried, parts of the picture's longer side."""
+FAR_QUANTILE, FAR_REACH = 0.02, 1.5
+"""Inverse depths are held within the outermost quantiles, widened by this factor, before they are compared."""
+WITHIN_CELL = 0.38
+"""Mean distance of a square's points from its middle, in sides."""
+MATCHED_CELLS, MATCHED_GROWTH = 2.0, 0.18
+"""Nodes this far apart differ as the variogram says: on a wide membrane by 0.73 times the variance of a free edge
+(Spitzer 1976), taken four times looser, since depths step rather than bend."""
+STIFFNESSES = (0.25, 1.0, 4.0)
+"""Times stiffer than that: what tells held-out points best is taken."""
+CAUCHY, REWEIGHTINGS = 2.4, 1
+STD_STEP = 6
+"""Standard deviations are worked out at every such node."""
+JUDGED_INSTANTS, MIN_JUDGED_CELLS = 4, 12
+SURE, LEAST_GAIN = 3.0, 0.1
+"""A surface must beat the plane on held-out points by this many standard errors and by this part of their distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Roughness:
+    """Variogram of inverse depths about the plane."""
+
+    sill_per_m: float
+    """Standard deviation of what neighbours share."""
+    length_rad: float
+    """Angle over which they share it."""
+    nugget_per_m: float
+    """Standard deviation of what they do not, beyond the tracking noise."""
+
+    def lost(self, distance_rad: Array | float) -> Array:
+        """Variance of the difference between places that far apart, the nugget's left out."""
+        return np.asarray(2 * self.sill_per_m**2 * -np.expm1(-np.asarray(distance_rad) / self.length_rad))
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Nodes over the picture."""
+
+    low: Array
+    """(2,)."""
+    cell: Array
+    """(2,)."""
+    columns: int
+    rows: int
+
+    @property
+    def extent(self) -> float:
+        """Angle along the longer side."""
+        return float(max(self.cell[0] * (self.columns - 1), self.cell[1] * (self.rows - 1)))
+
+
+def picture_grid(lens: MovingLens, time_s: float) -> Grid:
+    """Lay a grid over what the lens sees at a time."""
+    size = np.array([lens.lens.width, lens.lens.height], float)
+    part = np.linspace(0.0, 1.0, 5)
+    points_px = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * (size - 1)
+    seen = angles(lens.rays(points_px, np.full(len(points_px), time_s)))
+    beyond = OUTSIDE * np.ptp(seen, axis=0)
+    low, high = seen.min(axis=0) - beyond, seen.max(axis=0) + beyond
+    cells = np.array([LONG_CELLS, SHORT_CELLS] if size[0] >= size[1] else [SHORT_CELLS, LONG_CELLS])
+    return Grid(low, (high - low) / cells, int(cells[0]) + 1, int(cells[1]) + 1)
+
+
+# ── how rough ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
+    """Fit the variogram of a window's points to differences between points of the same frame; None: too few.
+
+    ½ Δ² less the two points' own variances, averaged over classes of distance; sill and nugget by least squares for
+    each of some lengths.
+    """
+    values, variance, place = _held(sights.above_per_m), sights.points.std_per_m**2, angles(sights.rays)
+    clear = variance < CLEAR**2 * np.median(variance)
+    edges = grid.extent * np.geomspace(FINEST_LAG, WIDEST_LAG, LAGS)
+    total, count = np.zeros((2, LAGS - 1)), np.zeros(LAGS - 1)
+    for pair in _spread(np.unique(sights.pair), COMPARED_PAIRS):
+        mine = np.flatnonzero(clear & (sights.pair == pair))
+        first, second = (mine[k] for k in np.triu_indices(len(mine), 1))
+        lag = np.searchsorted(edges, np.linalg.norm(place[first] - place[second], axis=-1)) - 1
+        inside = (lag >= 0) & (lag < LAGS - 1)
+        first, second, lag = first[inside], second[inside], lag[inside]
+        half = 0.5 * ((values[first] - values[second]) ** 2 - variance[first] - variance[second])
+        total[0] += np.bincount(lag, half, LAGS - 1)
+        count += np.bincount(lag, minlength=LAGS - 1)
+    used = count > MIN_DIFFERENCES
+    if used.sum() < 3:
+        return None
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    return _fitted(middle[used], total[0][used] / count[used], grid.extent)
+
+
+def _held(values: Array) -> Array:
+    """Values drawn in to their outermost quantiles: a mismatch must not stand for a depth."""
+    low, middle, high = np.quantile(values, [FAR_QUANTILE, 0.5, 1 - FAR_QUANTILE])
+    return np.clip(values, middle + FAR_REACH * (low - middle), middle + FAR_REACH * (high - middle))
+
+
+def _fitted(lag: Array, half: Array, extent: float) -> Roughness:
+    """Least squares on relative differences: a variogram's error grows with its value."""
+    level = max(float(half.max()), 1e-18)
+    weight = 1 / np.maximum(half, 0.1 * level)
+    best, least = Roughness(0.0, extent, float(np.sqrt(max(half.mean(), 0.0)))), np.inf
+    for length in extent * np.geomspace(SHORTEST, LONGEST, LENGTHS):
+        rise = -np.expm1(-lag / length)
+        sill, nugget = _both_positive(rise, half, weight)
+        left = float(((half - sill * rise - nugget) ** 2 * weight**2).sum())
+        if left < least:
+            best, least = Roughness(float(np.sqrt(sill)), float(length), float(np.sqrt(nugget))), left
+    return best
+
+
+def _both_positive(rise: Array, half: Array, weight: Array) -> tuple[float, float]:
+    """Sill and nugget (squared), neither below 0, of half ≈ sill · rise + nugget."""
+    design = np.stack([rise, np.ones_like(rise)], axis=-1) * weight[:, None]
+    sill, nugget = np.linalg.lstsq(design, half * weight, rcond=None)[0]
+    if nugget < 0:
+        sill, nugget = (design[:, 0] @ (half * weight)) / (design[:, 0] @ design[:, 0]), 0.0
+    if sill < 0:
+        sill, nugget = 0.0, max(float((half * weight**2).sum() / (weight**2).sum()), 0.0)
+    return max(float(sill), 0.0), float(nugget)
+
+
+# ── one frame's surface ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A camera before its plane."""
+
+    time_s: float
+    """IMU clock."""
+    rotation_world_cam: Array
+    """(3, 3)."""
+    centre_m: Array
+    """(3,) world axes, from its place at the window's middle."""
+    plane_per_m: Array
+    """(3,) camera axes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """Points as one frame sees them."""
+
+    place: Array
+    """(n, 2) angles."""
+    above_per_m: Array
+    """(n,) inverse depth above the frame's plane."""
+    variance: Array
+    """(n,) of the tracking noise and of what may hide a point that was seen from elsewhere."""
+
+    def chosen(self, use: NDArray[np.bool_]) -> Before:
+        """Some of the points."""
+        return Before(self.place[use], self.above_per_m[use], self.variance[use])
+
+
+def points_before(sights: Sightings, view: View, prior: ReliefPrior) -> Before:
+    """Move the window's points into a frame's camera axes.
+
+    A point seen from elsewhere may be hidden by now: the surface that is seen in its place has been displaced against
+    it by up to the parallax of the sill, and differs from it by the variogram at that distance.
+    """
+    points, grid, rough = sights.points, prior.grid, prior.rough
+    near = _seen_nearby(sights, view, prior)
+    local = (points.place_m[near] - view.centre_m) @ view.rotation_world_cam
+    ahead = local[:, 2] > SMALLEST_DEPTH / max(float(np.linalg.norm(view.plane_per_m)), 1e-6)
+    local, near = local[ahead], near[ahead]
+    inverse = 1.0 / local[:, 2]
+    rays = local * inverse[:, None]
+    place = angles(rays)
+    inside = ((place >= grid.low) & (place <= grid.low + grid.cell * [grid.columns - 1, grid.rows - 1])).all(axis=-1)
+    rays, inverse, near, place = rays[inside], inverse[inside], near[inside], place[inside]
+    apart = (sights.from_m[near] - view.centre_m) @ view.rotation_world_cam
+    parallax = np.linalg.norm(apart[:, :2] - rays[:, :2] * apart[:, 2:], axis=-1) * rough.sill_per_m
+    std = points.std_per_m[near] * (inverse / points.inverse_depth_per_m[near]) ** 2
+    return Before(place, inverse - rays @ view.plane_per_m, std**2 + rough.lost(parallax))
+
+
+def _seen_nearby(sights: Sightings, view: View, prior: ReliefPrior) -> Index:
+    """Numbers of the points seen from about here: by pairs, the nearest first.
+
+    All pairs between which the sill's parallax is below NEARBY of a cell, or as many as give ENOUGH points.
+    """
+    pairs, start, count = np.unique(sights.pair, return_index=True, return_counts=True)
+    parallax = np.linalg.norm(sights.from_m[start] - view.centre_m, axis=-1) * prior.rough.sill_per_m
+    late = np.abs(sights.points.time_s[start] - view.time_s) > NEAR_S
+    order = np.lexsort((start, np.abs(sights.points.time_s[start] - view.time_s), parallax, late))
+    before = np.cumsum(count[order]) - count[order]
+    taken = (before < ENOUGH) | ((before < MOST) & (parallax[order] < NEARBY * prior.grid.extent))
+    taken &= ~late[order]
+    chosen = np.zeros(len(pairs), bool)
+    chosen[order[taken]] = True
+    return np.flatnonzero(np.repeat(chosen, count))
+
+
+@dataclass(frozen=True, slots=True)
+class ReliefPrior:
+    """How much neighbouring nodes may differ: a membrane on the grid, drawn to the plane."""
+
+    rough: Roughness
+    grid: Grid
+    edge_variance: float
+    """Of the difference between neighbouring nodes, were they tied by nothing else."""
+    within_variance: float
+    """Of a sight about its cell's bilinear surface."""
+
+    def information(self) -> Array:
+        """Band (rows + 2, nodes) of the nodes' information matrix: band[k, j] = Q[j + k, j]."""
+        columns, rows = self.grid.columns, self.grid.rows
+        band = np.zeros((rows + 2, columns * rows))
+        down = np.ones((columns, rows))
+        down[:, -1] = 0.0
+        right = np.ones((columns, rows))
+        right[-1] = 0.0
+        degree = down + right
+        degree[:, 1:] += down[:, :-1]
+        degree[1:] += right[:-1]
+        cell = float(self.grid.cell.mean()) / self.rough.length_rad
+        band[0] = degree.ravel() + cell**2
+        band[1], band[rows] = -down.ravel(), -right.ravel()
+        return np.asarray(band / self.edge_variance)
+
+
+def relief_prior(rough: Roughness, grid: Grid, stiffness: float = 1.0) -> ReliefPrior:
+    """Tie neighbours so that nodes MATCHED_CELLS apart differ as the variogram says."""
+    cell = float(grid.cell.mean())
+    within = float(rough.lost(WITHIN_CELL * cell))
+    edge = float(rough.lost(MATCHED_CELLS * cell)) / MATCHED_GROWTH / stiffness
+    return ReliefPrior(rough, grid, edge, within + rough.nugget_per_m**2)
+
+
+def fit_surface(before: Before, prior: ReliefPrior, *, deviations: bool = True) -> Relief:
+    """Posterior mean and standard deviation of the nodes, with Cauchy weights about the surface."""
+    grid, information = prior.grid, prior.information()
+    node, part = _corners(before.place, grid)
+    variance = before.variance + prior.within_variance
+    weight = 1 / variance
+    for passing in range(REWEIGHTINGS + 1):
+        factor, values = _posterior(before.above_per_m, weight, node, part, information, grid.rows)
+        if passing < REWEIGHTINGS:
+            left = before.above_per_m - (values[node] * part).sum(axis=-1)
+            weight = 1 / (variance + (left / CAUCHY) ** 2)
+    std = _deviations(factor, grid) if deviations else np.zeros((2, 2))
+    above = values.reshape(grid.columns, grid.rows).T
+    return Relief(
+        grid.low, grid.cell * [grid.columns - 1, grid.rows - 1], above.astype(np.float32), std.astype(np.float32)
+    )
+
+
+def _corners(place: Array, grid: Grid) -> tuple[Index, Array]:
+    """The four nodes about each place (n, 4), numbered down the columns, and their bilinear weights (n, 4)."""
+    position = np.clip((place - grid.low) / grid.cell, 0.0, np.array([grid.columns, grid.rows]) - 1.000001)
+    first = position.astype(np.intp)
+    x, y = (position - first).T
+    start = first[:, 0] * grid.rows + first[:, 1]
+    node = start[:, None] + np.array([0, 1, grid.rows, grid.rows + 1])
+    return node, np.stack([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y], axis=-1)
+
+
+def _posterior(
+    above: Array, weight: Array, node: Index, part: Array, information: Array, rows: int
+) -> tuple[Array, Array]:
+    """Banded Cholesky factor and mean (nodes,): each point ties the four nodes about it."""
+    count = information.shape[1]
+    weighted = part * weight[:, None]
+    band = information.copy()
+    band[0] += np.bincount(node.ravel(), (weighted * part).ravel(), count)
+    for apart, pairs in ((1, ((0, 1), (2, 3))), (rows - 1, ((1, 2),)), (rows, ((0, 2), (1, 3))), (rows + 1, ((0, 3),))):
+        for one, other in pairs:
+            band[apart] += np.bincount(node[:, one], weighted[:, one] * part[:, other], count)
+    right = np.bincount(node.ravel(), (weighted * above[:, None]).ravel(), count)
+    factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
+    return factor, np.asarray(cho_solve_banded((factor, True), right, check_finite=False))
+
+
+def _deviations(factor: Array, grid: Grid) -> Array:
+    """Standard deviations of every STD_STEP-th node, (rows, columns)."""
+    column, row = np.arange(0, grid.columns, STD_STEP), np.arange(0, grid.rows, STD_STEP)
+    number = (column[:, None] * grid.rows + row).ravel()
+    unit = np.zeros((factor.shape[1], len(number)))
+    unit[number, np.arange(len(number))] = 1.0
+    solved = cho_solve_banded((factor, True), unit, check_finite=False)
+    return np.asarray(np.sqrt(solved[number, np.arange(len(number))]).reshape(len(column), len(row)).T)
+
+
+# ── surface or plane ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def surface_gain(frames: list[Before], prior: ReliefPrior) -> tuple[float, float]:
+    """By how much surfaces come nearer to held-out points than planes: relative gain, and that over its error.
+
+    Points in every other cell are held out, then the others: a surface must tell what lies a cell away.
+    """
+    grid = prior.grid
+    gain, before = np.zeros((2, (grid.rows - 1) * (grid.columns - 1)))
+    seen = np.zeros_like(gain)
+    for points in frames:
+        cell, colour = _cells(points.place, grid)
+        for odd in (False, True):
+            held = colour == odd
+            if held.sum() < MIN_POINTS or (~held).sum() < MIN_POINTS:
+                continue
+            surface = fit_surface(points.chosen(~held), prior, deviations=False)
+            node, part = _corners(points.place[held], grid)
+            told = (surface.above_per_m.T.ravel()[node] * part).sum(axis=-1)
+            above = points.above_per_m[held]
+            near = 1 / (points.variance[held] + prior.within_variance)
+            plane, left = np.abs(above), np.abs(above - told)
+            gain += np.bincount(cell[held], near * (plane - left), len(gain))
+            before += np.bincount(cell[held], near * plane, len(gain))
+            seen += np.bincount(cell[held], minlength=len(gain))
+    used = seen > 0
+    if used.sum() < MIN_JUDGED_CELLS:
+        return 0.0, 0.0
+    error = float(gain[used].std()) * np.sqrt(used.sum())
+    return float(gain.sum() / max(before.sum(), 1e-30)), float(gain.sum()) / max(error, 1e-30)
+
+
+def _cells(place: Array, grid: Grid) -> tuple[Index, NDArray[np.bool_]]:
+    """Number of each place's cell, and its colour on a chessboard."""
+    position = np.clip((place - grid.low) / grid.cell, 0.0, np.array([grid.columns, grid.rows]) - 1.000001)
+    x, y = position.astype(np.intp).T
+    return y * (grid.columns - 1) + x, (x + y) % 2 == 1
+
+
+@dataclass(frozen=True, slots=True)
+class WindowRelief:
+    """What stands out of the planes of a window."""
+
+    sights: Sightings
+    """All tracked points of the window."""
+    prior: ReliefPrior
+
+    def surface(self, view: View) -> Relief | None:
+        """The surface that a camera sees; None where it has too few points before it."""
+        before = points_before(self.sights, view, self.prior)
+        return fit_surface(before, self.prior) if len(before.place) >= MIN_POINTS else None
+
+
+def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) -> WindowRelief | None:
+    """Measure how rough a window's scene is, and keep the surfaces if they tell held-out points better.
+
+    view: the camera at a time, before its frame's plane.
+    """
+    if len(sights) < 2 * MIN_POINTS:
+        return None
+    rough = measure_roughness(sights, grid)
+    if rough is None or not rough.sill_per_m > 0:
+        return None
+    priors = [relief_prior(rough, grid, stiffness) for stiffness in STIFFNESSES]
+    chosen = _spread(np.unique(sights.pair), JUDGED_INSTANTS)
+    instants = [float(np.median(sights.points.time_s[sights.pair == pair])) for pair in chosen]
+    frames = [points_before(sights, view(instant), priors[0]) for instant in instants]
+    gains = [surface_gain(frames, prior) for prior in priors]
+    best = int(np.argmax([gain for gain, _ in gains]))
+    gain, sure = gains[best]
+    log.debug("relief %s: %s, held-out points %.0f %% nearer, %.1f errors", rough, STIFFNESSES[best], 100 * gain, sure)
+    return WindowRelief(sights, priors[best]) if gain > LEAST_GAIN and sure > SURE else None
+
+
+def _spread(values: Index, count: int) -> Index:
+    """At most ``count`` of the values, spread evenly."""
+    return values[np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).astype(int))]

@@ -1,0 +1,65 @@
+"""How well points are tracked, measured without any camera model: what a free smooth flow of each pair leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.inference.tracking import TrackPair
+
+Array = NDArray[np.float64]
+REWEIGHTINGS = 6
+CAUCHY = 2.4
+RAYLEIGH_MEDIAN = 1.1774
+POINTS_PER_TERM = 4
+"""A cubic flow has 10 terms an axis; with fewer points than this many times the terms a lower order is taken."""
+ENOUGH_POINTS = 36
+"""With fewer points the flow that can be fitted does not follow a turning picture; other pairs speak for them."""
+ORDERS = (3, 2, 1)
+SMALLEST_NOISE_PX = 0.01
+
+
+def step_noise_px(pairs: Sequence[TrackPair]) -> Array:
+    """Standard deviation (pairs,) of a tracked step per coordinate, from a cubic flow over each picture.
+
+    Turns, a readout and a plane's parallax are smooth over a picture; tracking errors are not.  Depth steps and moving
+    objects raise it a little: the scale is a median.
+    """
+    noise = np.array([_pair_noise(pair) for pair in pairs])
+    enough = np.array([len(pair) >= ENOUGH_POINTS for pair in pairs], bool)
+    return np.where(enough, noise, np.median(noise[enough])) if enough.any() else noise
+
+
+def smooth_flow_residual(pair: TrackPair) -> Array:
+    """Tracked steps (n, 2) less their pair's smooth flow."""
+    return _residual(pair)[0]
+
+
+def _pair_noise(pair: TrackPair) -> float:
+    residual, terms = _residual(pair)
+    freedom = max(1 - terms / max(len(pair), 1), 0.25)
+    return max(float(np.median(np.linalg.norm(residual, axis=-1))) / RAYLEIGH_MEDIAN / freedom**0.5, SMALLEST_NOISE_PX)
+
+
+def _residual(pair: TrackPair) -> tuple[Array, int]:
+    order = next((o for o in ORDERS if len(pair) >= POINTS_PER_TERM * (o + 1) * (o + 2) // 2), 0)
+    basis = flow_basis(pair.points_first_px, order)
+    step = pair.points_second_px - pair.points_first_px
+    weight = np.ones(len(pair))
+    residual = step
+    for _ in range(REWEIGHTINGS):
+        root = np.sqrt(weight)[:, None]
+        residual = step - basis @ np.linalg.lstsq(basis * root, step * root, rcond=None)[0]
+        squared = (residual**2).sum(axis=-1)
+        scale = max(float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN, 1e-3)
+        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+    return residual, basis.shape[1]
+
+
+def flow_basis(points_px: Array, order: int) -> Array:
+    """Monomials (n, k) of places up to an order, about their middle."""
+    centred = points_px - points_px.mean(axis=0)
+    x, y = (centred / max(float(np.abs(centred).max()), 1.0)).T
+    return np.stack([x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)], axis=-1)

@@ -1,0 +1,312 @@
+"""Points followed from one frame to the next (pyramidal Lucas-Kanade, Bouguet 2001), checked forwards and back.
+
+A guide (motion.guidance) may say where to look for them: pictures are then compared through the map that it predicts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.inference.parallel import ParallelMap, one_by_one
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Points = NDArray[np.float32]
+Stream = Iterable[tuple[int, Picture | None]]
+PART_FRAMES = 60
+"""Frames that are followed in one go: a part begins a few frames early, and before it lies what must be decoded."""
+LEAD_FRAMES = 2
+"""The frame before a part's first, for the pair of the two, and one more, which that frame may repeat."""
+CORNER_BLOCK_PX = 5
+CORNER_SPACING_PX = 7
+"""A corner is the strongest of a square of this side."""
+REPEATS = 1.9
+"""Two patches that differ by noise alone, of some 100 independent pixels, differ by up to this ratio of their squared
+differences but for one in 1000 (F distribution)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingSettings:
+    """How points are picked and followed. Lengths are pixels of the picture after halving."""
+
+    halve_above_px: int = 800
+    """Pictures with a longer side are halved first, again and again."""
+    grid: tuple[int, int] = (8, 8)
+    """(columns, rows) of cells over the picture; each gives its best corners."""
+    points_per_cell: int = 4
+    window_px: int = 21
+    pyramid_levels: int = 4
+    """Levels above the picture itself: 4 with this window follow some 70 px."""
+    guided_levels: int = 2
+    """The same where a guide says where the points are: errors of some 20 px."""
+    repeats_from_px: float = 4.0
+    """Found further than this from where the guide puts it, a point may have been taken for its like."""
+    max_forward_backward_px: float = 0.3
+    """A point that does not come back to within this is dropped."""
+    min_corner_levels: float = 1.5
+    """Least gradient of a corner, grey levels a pixel along the weaker axis; noise of 2 levels makes about 1."""
+    border_px: int = 6
+    """Points nearer to the picture's edge than this are dropped."""
+
+
+class Between(Protocol):
+    """Where what two pictures show lies, as a guide predicts it."""
+
+    def second_of(self, points_px: Array) -> Array:
+        """Where points (n, 2) of the first picture are in the second."""
+
+    def carried(self, first: Picture) -> Picture:
+        """The first picture as the second one should show it, as blurred as the second where that is more."""
+
+    def evened(self, second: Picture) -> Picture:
+        """The second picture, as blurred as the first where that is more."""
+
+
+class Guide(Protocol):
+    """Says where points are to be looked for; picklable where parts are handed to processes."""
+
+    def seen_before(self, first: int, second: int, shape: tuple[int, int], factor: int) -> Between | None:
+        """The map between two frames' pictures, (height, width), shrunk ``factor`` times; None: not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackPair:
+    """Points seen in two consecutive frames; (0, 0) is the centre of the top-left pixel of the stored picture."""
+
+    first: int
+    """Movie index of the first frame."""
+    second: int
+    points_first_px: Array
+    """(n, 2)."""
+    points_second_px: Array
+    """(n, 2), the same points."""
+    forward_backward_px: Array | None = None
+    """(n,) distance between a point and where tracking back puts it."""
+
+    def __len__(self) -> int:
+        return len(self.points_first_px)
+
+
+def track_pairs(
+    pictures: Iterable[tuple[int, NDArray[np.uint8] | None]],
+    settings: TrackingSettings | None = None,
+    progress: Callable[[int], None] | None = None,
+    guide: Guide | None = None,
+) -> list[TrackPair]:
+    """Follow points between each two consecutive frames of a stream of (movie index, grey (h, w) or None).
+
+    guide: says where the points of one frame are to be looked for in the next; see :mod:`virest.inference.guidance`.
+
+    Fresh corners are picked in every first frame, so pairs are independent of each other.  None and jumps in the index
+    begin anew.  A picture identical to the one before it shows another time than its stamp: it gives no pair, neither
+    backwards nor forwards.  Two pictures are in memory at a time.  progress is called with each index.
+    """
+    settings = settings or TrackingSettings()
+    pairs: list[TrackPair] = []
+    before: tuple[int, NDArray[np.uint8]] | None = None
+    newest: NDArray[np.uint8] | None = None
+    for index, picture in pictures:
+        repeated = picture is not None and newest is not None and np.array_equal(picture, newest)
+        newest = picture
+        if progress is not None:
+            progress(index)
+        if picture is None or repeated:
+            before = None
+            continue
+        small, factor = _halved(picture, settings.halve_above_px)
+        if before is not None and before[0] == index - 1 and before[1].shape == small.shape:
+            pair = _track(before[1], small, factor, before[0], settings, guide)
+            if len(pair):
+                pairs.append(pair)
+        before = (index, small)
+    return pairs
+
+
+def track_frames(
+    gray: Callable[[Sequence[int]], Stream],
+    frames: Sequence[int],
+    each: ParallelMap = one_by_one,
+    progress: Callable[[int], None] | None = None,
+    guide: Guide | None = None,
+) -> list[TrackPair]:
+    """Follow points through frames (movie indices, rising), part by part; the same as in one stream of them.
+
+    gray: gives (index, picture) of the frames asked for; picklable where ``each`` hands parts to processes.  progress
+    is called with the number of frames that a finished part had.
+    """
+    parts = _parts(frames)
+    sizes = [sum(index >= first for index in part) for part, first in parts]
+    found = each(
+        _track_part,
+        [(gray, part, first, guide) for part, first in parts],
+        None if progress is None else lambda place: progress(sizes[place]),
+    )
+    return [pair for pairs in found for pair in pairs]
+
+
+def _parts(frames: Sequence[int]) -> list[tuple[list[int], int]]:
+    """Parts of the runs of neighbours, each with its lead, and the index of the first frame that is a part's own."""
+    rising = np.array(sorted(set(frames)), np.intp)
+    parts: list[tuple[list[int], int]] = []
+    for run in np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1):
+        cuts = np.linspace(0, len(run), -(-len(run) // PART_FRAMES) + 1).round().astype(int)
+        for start, end in pairwise(cuts):
+            parts.append((run[max(start - LEAD_FRAMES, 0) : end].tolist(), int(run[start])))
+    return parts
+
+
+def _track_part(
+    gray: Callable[[Sequence[int]], Stream], frames: list[int], own_from: int, guide: Guide | None
+) -> list[TrackPair]:
+    """Pairs whose second frame is the part's own."""
+    return [pair for pair in track_pairs(gray(frames), guide=guide) if pair.second >= own_from]
+
+
+def find_corners(picture: NDArray[np.uint8], settings: TrackingSettings) -> NDArray[np.float32]:
+    """Corners (n, 2) of a grey picture, strongest first, at most ``points_per_cell`` from each cell of the grid.
+
+    Strength is the smaller eigenvalue of the structure tensor (Shi & Tomasi 1994).
+    """
+    strength = cv2.cornerMinEigenVal(picture, CORNER_BLOCK_PX, ksize=3)
+    # OpenCV's scaling of 8-bit pictures makes this 4 x (mean squared gradient) / 255².
+    least = 4 * (settings.min_corner_levels / 255.0) ** 2
+    peak = cv2.dilate(strength, np.ones((CORNER_SPACING_PX, CORNER_SPACING_PX), np.uint8))
+    candidate = (strength >= peak) & (strength > least)
+    edge = settings.border_px
+    candidate[:edge], candidate[-edge:], candidate[:, :edge], candidate[:, -edge:] = False, False, False, False
+    y, x = np.nonzero(candidate)
+    order = np.argsort(-strength[y, x], kind="stable")
+    y, x = y[order], x[order]
+    height, width = picture.shape
+    columns, rows = settings.grid
+    cell = (y * rows // height) * columns + x * columns // width
+    kept = _rank_within(cell) < settings.points_per_cell
+    return np.stack([x[kept], y[kept]], axis=-1).astype(np.float32)
+
+
+def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
+    """How many earlier entries have the same group."""
+    order = np.argsort(group, kind="stable")
+    ordered = group[order]
+    start = np.searchsorted(ordered, ordered, side="left")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(group)) - start
+    return rank
+
+
+def _halved(picture: NDArray[np.uint8], limit_px: int) -> tuple[NDArray[np.uint8], int]:
+    """Return the picture halved until it fits, by means of 2 x 2 pixels, and the factor."""
+    factor = 1
+    while max(picture.shape) > limit_px and min(picture.shape) >= 64:
+        even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+        picture = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        factor *= 2
+    return picture, factor
+
+
+def _track(
+    first: Picture, second: Picture, factor: int, index: int, settings: TrackingSettings, guide: Guide | None
+) -> TrackPair:
+    start = find_corners(first, settings)
+    if len(start) == 0:
+        return TrackPair(index, index + 1, np.zeros((0, 2)), np.zeros((0, 2)))
+    between = None if guide is None else guide.seen_before(index, index + 1, first.shape, factor)
+    if between is None:
+        ahead, good, distance = _there_and_back(first, second, start, settings, settings.pyramid_levels)
+    else:
+        ahead, good, distance = _guided(first, second, start, settings, between)
+    returned_px = distance[good].astype(float) * factor
+    return TrackPair(index, index + 1, _stored(start[good], factor), _stored(ahead[good], factor), returned_px)
+
+
+def _guided(
+    first: Picture, second: Picture, start: Points, settings: TrackingSettings, between: Between
+) -> tuple[Points, NDArray[np.bool_], NDArray[np.float32]]:
+    """Follow points from where the guide puts them; those that are not found there, as without a guide.
+
+    The first picture is compared as the guide carries it into the second, turned and sheared.  A point found far from
+    where it was put does not count where the carried picture shows the same there: texture that repeats.
+    """
+    put = between.second_of(start.astype(float)).astype(np.float32)
+    carried, evened = between.carried(first), between.evened(second)
+    ahead, good, distance = put.copy(), np.zeros(len(put), bool), np.zeros(len(put), np.float32)
+    guided, plain = (carried, evened, put, settings.guided_levels), (first, second, start, settings.pyramid_levels)
+    for before, after, begun, levels in (guided, plain):
+        missing = np.flatnonzero(_inside(put, second, settings) & ~good)
+        if len(missing):
+            ahead[missing], good[missing], distance[missing] = _there_and_back(
+                before, after, begun[missing], settings, levels
+            )
+    far = np.flatnonzero(good & (np.linalg.norm(ahead - put, axis=-1) > settings.repeats_from_px))
+    good[far[_repeats(carried, evened, put[far], ahead[far], settings)]] = False
+    return ahead, good, distance
+
+
+def _repeats(
+    carried: Picture, second: Picture, put: Points, ahead: Points, settings: TrackingSettings
+) -> NDArray[np.bool_]:
+    """Whether (n,) what the guide puts at the places found looks as much like what is there as the point itself does.
+
+    Squared differences of patches, mean and contrast left out, of which both are noise where texture repeats.
+    """
+    if not len(put):
+        return np.zeros(0, bool)
+    there = _patches(second, ahead, settings.window_px)
+    own, others = (_patches(carried, at, settings.window_px) for at in (put, ahead))
+    unlike_own, unlike_others = (1 - (there * patches).sum(axis=1) for patches in (own, others))
+    return np.asarray(unlike_others < REPEATS * unlike_own)
+
+
+def _patches(picture: Picture, points: Points, side: int) -> NDArray[np.float32]:
+    """Patches (n, side²) about points (n, 2), of mean 0 and norm 1."""
+    offset = np.arange(side, dtype=np.float32) - (side - 1) / 2
+    x = np.broadcast_to(points[:, :1, None] + offset[None, None, :], (len(points), side, side))
+    y = np.broadcast_to(points[:, 1:, None] + offset[None, :, None], (len(points), side, side))
+    rows = (len(points), side * side)
+    shown = cv2.remap(picture, x.reshape(rows), y.reshape(rows), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    centred = shown.astype(np.float32) - shown.mean(axis=1, keepdims=True, dtype=np.float32)
+    return np.asarray(centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-3), np.float32)
+
+
+def _there_and_back(
+    first: Picture, second: Picture, start: Points, settings: TrackingSettings, levels: int
+) -> tuple[Points, NDArray[np.bool_], NDArray[np.float32]]:
+    """Where points (n, 2) are found, whether they count (n,), and how far from their start tracking back puts them."""
+    ahead, found = _follow(first, second, start, settings, levels)
+    back, returned = _follow(second, first, ahead, settings, levels)
+    distance = np.linalg.norm(back - start, axis=-1)
+    good = found & returned & _inside(ahead, second, settings) & (distance < settings.max_forward_backward_px)
+    return ahead, good, distance
+
+
+def _inside(points: Points, picture: Picture, settings: TrackingSettings) -> NDArray[np.bool_]:
+    height, width = picture.shape
+    edge = settings.border_px
+    return (points >= edge).all(axis=-1) & (points[:, 0] < width - edge) & (points[:, 1] < height - edge)
+
+
+def _follow(
+    first: Picture, second: Picture, points: Points, settings: TrackingSettings, levels: int
+) -> tuple[Points, NDArray[np.bool_]]:
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        points[:, None],
+        None,
+        winSize=(settings.window_px, settings.window_px),
+        maxLevel=levels,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005),
+    )
+    return moved[:, 0], status.ravel() == 1
+
+
+def _stored(points: Points, factor: int) -> Array:
+    """Pixels of the stored picture: the mean of factor x factor pixels lies at their common centre."""
+    return points.astype(float) * factor + (factor - 1) / 2

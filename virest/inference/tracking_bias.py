@@ -1,0 +1,68 @@
+"""What tracking gets wrong in the same way all over a capture, so that no statistics of the capture show it.
+
+Followed points lag and shrink a little where blur changes from frame to frame, and more where the codec's predicted
+blocks replace what was seen.  Measured on simulated captures with H.264 at 0.12 to 2 bits a pixel; it grows with the
+noise of a tracked step, of which 0.15 px is typical.
+
+Whatever its pattern is, a part of it is correlated with what a value itself does to the points.  Where a value moves
+many
+points far, that is little; where it moves them by hundredths of a pixel (a lens seen while walking straight on, a skew
+within three seconds), it is most of what is not known.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.inference.track_fit import TrackFit
+
+Array = NDArray[np.float64]
+TYPICAL_NOISE_PX, LEAST_NOISE_PX = 0.15, 0.05
+SHARED = 0.025
+"""Part of each point's error that is correlated with a value's own pattern.  Ten kinds of values in forty captures
+whose
+truth was known came out wrong by 0.018 to 0.027 of it (rms), hand-held or walking, before far things, walls and rooms,
+at 0.04 to 0.19 px of noise; statistics alone had put one in five of them more than two deviations off."""
+SHARED_READOUT = 0.03
+"""The same for a readout: predicted blocks shear less than rows do.  With it median |error| / deviation is 0.71 of
+readouts and 0.68 of the offsets of their first rows in seven hand-held
+captures drawn as `bench --only calibration` draws them; 0.67 is right, and twice the part gave 0.40 and 0.39."""
+SHARED_RELIEF = 0.6
+"""Part of the spread of depths about the plane that parts of the picture share in a constant rate's own sense: travel
+of which the depths are wrong looks like one.  In rooms that were walked through biases were off by 0.5 to 2 of it."""
+BIAS_STD: dict[str, tuple[float, ...]] = {
+    "time_offset": (2e-5,),
+    "imu_rotation": (2.5e-4,) * 3,
+    "gyro_bias": (1.5e-4,) * 3,
+    "gyro_scale": (6e-4,),
+    "focal_length": (6e-4,),
+    "focal_drift": (3e-4,),
+    "radial_distortion": (7e-4,),
+    "principal_point": (0.2, 0.2),
+    "stabilisation": (0.002, 0.02, 0.0, 0.0),
+    "clock_skew": (1e-5,),
+    "exposure_time": (0.015,),
+    "scene_depth": (0.004,),
+}
+"""At the typical noise, in the units of the terms of profile_terms; a depth's relative."""
+WANDER_STD = {"gyro_bias": 1.5e-4}
+"""What a value does of its own accord however well points are tracked: a phone's gyroscope drifts by this much within
+seconds, and its noise of 3e-4 rad/s/√Hz has that mean over two of them."""
+
+
+def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
+    """Standard deviation (k,) of the bias of a term's values; noise_px: of a tracked step, per coordinate.
+
+    At least what errors common to many points make of them: Σw points told a value to the curvature, and no number of
+    points tells it better than 1 / SHARED² would.
+    """
+    own = fit.slices.get(name)
+    told = np.zeros(1) if own is None else np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[own])
+    if name == "readout_time":
+        return np.asarray(SHARED_READOUT * told)
+    scaled = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX * np.array(BIAS_STD[name])
+    floor = np.maximum(np.maximum(scaled, SHARED * told), WANDER_STD.get(name, 0.0))
+    if name == "gyro_bias" and own is not None:
+        floor = np.hypot(floor, SHARED_RELIEF * fit.by_relief[own])
+    return np.asarray(floor)
