@@ -1,4 +1,4 @@
-"""The row clock is written once: nobody above image_formation/row_clock.py adds readout and exposure to a start by hand."""
+"""The row clock is written once: nobody outside its file adds readout and exposure to a start by hand."""
 
 import ast
 from collections.abc import Iterator

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from motion.synthetic_motion import R_CAM_IMU, hand_motion
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
-from synthetic_motion import R_CAM_IMU, hand_motion
 
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motion.synthetic_tracks import GRAVITY_M_S2, Recording, Setup, recorded
 from scipy.spatial.transform import Rotation
-from synthetic_tracks import GRAVITY_M_S2, Recording, Setup, recorded
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples

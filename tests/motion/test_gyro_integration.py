@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from motion.synthetic_motion import R_CAM_IMU, Motion
 from scipy.spatial.transform import Rotation
-from synthetic_motion import R_CAM_IMU, Motion
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from swaying_camera import CENTRE_PX, Sway, SwayingCamera
+from motion.swaying_camera import CENTRE_PX, Sway, SwayingCamera
 
 from virest.camera.intrinsics import Intrinsics
 from virest.inference.depth import Sightings, TriangulatedPoints

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from motion.synthetic_motion import R_CAM_IMU, Motion, hand_motion
 from numpy.typing import NDArray
 from scipy.spatial.transform import Slerp
-from synthetic_motion import R_CAM_IMU, Motion, hand_motion
 
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile

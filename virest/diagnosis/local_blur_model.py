@@ -1,7 +1,7 @@
 """What the profile predicts for the local blur: the one forward model's paths, across edges and in spectra.
 
 A fit asks for the paths of some hundred frames again and again, so they are worked out for all frames together, from
-the trajectory and the moving lens that `image_formation.kernel_field` goes by as well; a test holds the two to each other.
+the trajectory and the moving lens that `image_formation.kernels` uses as well; a test holds the two to each other.
 """
 
 from __future__ import annotations

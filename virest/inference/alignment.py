@@ -1,7 +1,7 @@
 """Pictures and gyroscope on one clock: the time offset, the gyroscope's bias, and whether the two agree at all.
 
 Coarse: each pair's rotation against the gyroscope's at every offset within the search.  Fine: every tracked point at
-its own row's mid-exposure (motion.point_fit).  What the chosen model leaves open (parallax, a readout, an axis map or a
+its own row's mid-exposure (point_fit).  What the chosen model leaves open (parallax, a readout, an axis map or a
 clock rate that is a little off) enters the standard deviation by how far it would move the offset.
 """
 

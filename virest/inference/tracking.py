@@ -1,6 +1,6 @@
 """Points followed from one frame to the next (pyramidal Lucas-Kanade, Bouguet 2001), checked forwards and back.
 
-A guide (motion.guidance) may say where to look for them: pictures are then compared through the map that it predicts.
+A guide (`guidance`) may say where to look for them: pictures are then compared through the map that it predicts.
 """
 
 from __future__ import annotations
