@@ -35,7 +35,9 @@ from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, Indices, Mask
 from virest.diagnosis.photometry_fit import HeldOut
 from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
-from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock
+from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
+from virest.image_formation.turning_camera import TurningCamera, turning_camera
+from virest.image_formation.warp import moved_between
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
@@ -156,16 +158,15 @@ def observe_mixing(
 ) -> MixingEvidence:
     """Compare blurred frames with sharp ones near them. Empty where the hand gives no such pairs."""
     settings = settings or MixingSettings()
-    pairs = _choose_pairs(frames, trajectory, profile, settings)
+    camera = turning_camera(trajectory, profile) if profile.intrinsics is not None else None
+    pairs = _choose_pairs(frames, camera, settings) if camera is not None else []
     wanted = sorted({k for pair in pairs for k in pair})
     pictures = {index: rgb for index, rgb in read_rgb(wanted) if rgb is not None}
     by_index = {frame.index: frame for frame in frames}
     darkest = _darkest(list(pictures.values()))
     steps = _steps(darkest)
     known = [number for number, pair in enumerate(pairs) if pair[0] in pictures and pair[1] in pictures]
-    calls = [
-        (*((by_index[k], pictures[k]) for k in pairs[number]), trajectory, profile, settings, steps) for number in known
-    ]
+    calls = [(*((by_index[k], pictures[k]) for k in pairs[number]), camera, settings, steps) for number in known]
     compared = each(_compare, calls)
     rows = [(number, row) for number, found in zip(known, compared, strict=True) for row in found]
     table = np.array([row for _, row in rows]).reshape(-1, 12)
@@ -244,14 +245,11 @@ def _root(evidence: MixingEvidence, effect_name: str) -> float:
 # ── pairs of frames ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _choose_pairs(
-    frames: Sequence[Frame], trajectory: Trajectory, profile: CameraProfile, settings: MixingSettings
-) -> list[tuple[int, int]]:
+def _choose_pairs(frames: Sequence[Frame], camera: TurningCamera, settings: MixingSettings) -> list[tuple[int, int]]:
     """(sharp, blurred) movie indices with the most blur between them."""
-    lens = profile.intrinsics
-    if lens is None or any(frame.exposure_s is None for frame in frames) or len(frames) < 2:
+    if any(frame.exposure_s is None for frame in frames) or len(frames) < 2:
         return []
-    length = _central_blur_px(frames, trajectory, profile)
+    length = _central_blur_px(frames, camera)
     index = np.array([frame.index for frame in frames])
     found = []
     for i in np.flatnonzero((length > settings.blurred_px[0]) & (length < settings.blurred_px[1])):
@@ -262,21 +260,13 @@ def _choose_pairs(
     return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[: settings.pairs]]
 
 
-def _central_blur_px(frames: Sequence[Frame], trajectory: Trajectory, profile: CameraProfile) -> Array:
+def _central_blur_px(frames: Sequence[Frame], camera: TurningCamera) -> Array:
     """How far apart the ends of the exposure see the point that its middle has at the picture's centre, (n,)."""
-    lens = profile.intrinsics
-    assert lens is not None, "paths need a focal length"
-    centre = np.tile([(profile.width - 1) / 2, (profile.height - 1) / 2], (len(frames), 1))
+    centre = np.array([(camera.profile.width - 1) / 2, (camera.profile.height - 1) / 2])
     logged_s = np.array([frame.exposure_s or 0.0 for frame in frames])
-    stamp_s = np.array([frame.time_s for frame in frames])
-    start_s, middle_s, end_s = (
-        RowClock(profile).seen_s(centre, stamp_s, logged_s, share) for share in (ROW_START, ROW_MIDDLE, ROW_END)
-    )
-    world = trajectory.orientation(middle_s) @ lens.rays(centre)[..., None]
-    first, last = (
-        lens.project(np.squeeze(np.swapaxes(trajectory.orientation(time_s), -1, -2) @ world, -1))
-        for time_s in (start_s, end_s)
-    )
+    at = camera.frames(np.array([frame.time_s for frame in frames]), logged_s)
+    middle_s = at.row_time_s(centre, ROW_MIDDLE)
+    first, last = (moved_between(at, centre, middle_s, at.row_time_s(centre, share)) for share in (ROW_START, ROW_END))
     return np.asarray(np.linalg.norm(last - first, axis=-1))
 
 
@@ -288,15 +278,14 @@ def _darkest(pictures: Sequence[Rgb]) -> float:
 def _compare(
     sharp: tuple[Frame, Rgb],
     blurred: tuple[Frame, Rgb],
-    trajectory: Trajectory,
-    profile: CameraProfile,
+    camera: TurningCamera,
     settings: MixingSettings,
     steps: dict[str, Array],
 ) -> list[Array]:
     """Pixels, noise, and for each effect stiffness, scores and rest, (12,) in all, of each usable tile of one pair."""
     height, width = blurred[1].shape[:2]
     here, there = (Follower(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
-    where = seen_elsewhere(here, there, trajectory, profile, _nodes(width, height))
+    where = seen_elsewhere(here, there, camera, _nodes(width, height))
     if where is None:
         return []
     x, y = ((np.arange(n) / _NODE_PX).astype(np.float32) for n in (width, height))
@@ -305,14 +294,13 @@ def _compare(
     tiles = _tiles(width, height, settings.tile_px)
     middles = np.array([((t[1].start + t[1].stop) / 2, (t[0].start + t[0].stop) / 2) for t in tiles])
     kernels = [
-        [_kernel(path) for path in path_over_exposure(middles, frame, trajectory, profile)]
-        for frame in (sharp[0], blurred[0])
+        [_kernel(path) for path in path_over_exposure(middles, frame, camera)] for frame in (sharp[0], blurred[0])
     ]
     told = _spread([k for k, tile in enumerate(tiles) if _tells(usable[tile])], settings.tiles)
     pixels = [_compared(usable, tiles[k]) for k in told]
     if not told:
         return []
-    curve = profile.response or ResponseCurve("srgb")
+    curve = camera.profile.response or ResponseCurve("srgb")
 
     def light(seen: ResponseCurve) -> list[tuple[Plane, list[Plane]]]:
         """Either picture's light where the blurred one has it, with the other's kernels."""

@@ -18,15 +18,14 @@ from virest.diagnosis.local_blur_spectra import MEMORY, SpectrumRatios, spectral
 from virest.image_formation.kernels import angle_and_length, blur_chords
 from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
 from virest.image_formation.row_motion import row_motion
-from virest.motion.optics import MovingLens, moving_lens
+from virest.image_formation.turning_camera import turning_camera
+from virest.image_formation.warp import seen_by_rows
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 _NODES = 4
 _INSTANTS = 5
 """Of an exposure (Gauss-Legendre): exact for paths that bend like a fourth-order polynomial."""
-_ROW_STEPS = 3
-"""The row that sees a point depends on where it sees it; each step shrinks the error about thirtyfold."""
 _RATIOS = np.linspace(0.0, 6.0, 25)
 
 
@@ -70,32 +69,15 @@ def node_tensors(
     nodes_px: Array, stamp_s: Array, exposure_s: Array, profile: CameraProfile, trajectory: Trajectory
 ) -> Array:
     """Covariance xx, xy, yy (f, n, 3) of the paths at pixels (n, 2) of frames (f,) over their rows' exposures."""
-    clock, lens = RowClock(profile), moving_lens(trajectory, profile)
-    frames = stamp_s[:, None, None], exposure_s[:, None, None]
+    frames = turning_camera(trajectory, profile).frames(stamp_s[:, None, None], exposure_s[:, None, None])
     instant, share = np.polynomial.legendre.leggauss(_INSTANTS)
-    time_s = clock.seen_s(nodes_px[:, None], *frames, 0.5 * (1 + instant))
-    points = np.broadcast_to(nodes_px[:, None], (*time_s.shape, 2))
-    world = _turned(trajectory.orientation(time_s), _rays(lens, points, time_s))
-    seen = points
-    for _ in range(_ROW_STEPS):
-        row_s = clock.seen_s(seen, *frames)
-        back = np.swapaxes(trajectory.orientation(row_s), -1, -2)
-        seen = lens.project(_turned(back, world), row_s)
+    nodes_px = nodes_px[:, None]
+    time_s = frames.row_time_s(nodes_px, 0.5 * (1 + instant))
+    seen = seen_by_rows(frames, nodes_px, time_s, ROW_MIDDLE)
     weight = 0.5 * share[:, None]
     centred = seen - (weight * seen).sum(axis=-2, keepdims=True)
     x, y = centred[..., 0], centred[..., 1]
     return np.stack([x * x, x * y, y * y], axis=-1).swapaxes(-1, -2) @ weight[:, 0]
-
-
-def _rays(lens: MovingLens, points_px: Array, time_s: Array) -> Array:
-    """Rays (f, n, k, 3) through points of frames; where the lens stands still, undistorted only once."""
-    if lens.focal_drift_per_s or lens.zoom or lens.shift is not None:
-        return lens.rays(points_px, time_s)
-    return np.broadcast_to(lens.rays(points_px[:1, :, :1], time_s[:1, :, :1]), (*time_s.shape, 3))
-
-
-def _turned(rotation: Array, rays: Array) -> Array:
-    return np.squeeze(rotation @ rays[..., None], -1)
 
 
 def across(tensors: Array, direction: Array) -> Array:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,12 +22,13 @@ from virest.capture.records import Frame
 from virest.diagnosis.photometry import Array, PhotometricObservations
 from virest.diagnosis.photometry_noise import measured_noise
 from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
+from virest.image_formation.turning_camera import TurningCamera, turning_camera
+from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
 from virest.inference.tracking import TrackingSettings, find_corners
 from virest.motion.trajectory import Trajectory
 
 Picture = NDArray[np.uint8]
 
-_FIXED_POINT_STEPS = 4
 _LK_WINDOW = (21, 21)
 _LK_LEVELS = 3
 
@@ -86,6 +86,9 @@ def observe_photometry(
     settings = settings or PatchSettings()
     if max(profile.width, profile.height) > settings.halve_above_px:
         pictures, profile = ((frame, _halved(picture)) for frame, picture in pictures), halved_profile(profile)
+    camera = None
+    if trajectory is not None and profile.intrinsics is not None:
+        camera = turning_camera(trajectory, profile)
     keys: list[_Key] = []
     places = since = 0
     rows: list[Array] = []
@@ -97,7 +100,7 @@ def observe_photometry(
         before = picture
         seen.append(frame)
         look = _look(picture, settings)
-        found = [_seen_patches(key, frame, look, trajectory, profile, settings) for key in keys]
+        found = [_seen_patches(key, frame, look, camera, settings) for key in keys]
         rows += found
         fresh = since >= settings.key_every and (frame.index in intra_frames or since >= 2 * settings.key_every)
         lost = bool(keys) and since >= settings.least_seen and len(found[-1]) < 0.5 * len(keys[-1].patches_px)
@@ -213,34 +216,29 @@ def _seen_patches(
     key: _Key,
     frame: Frame,
     look: _Look,
-    trajectory: Trajectory | None,
-    profile: CameraProfile,
+    camera: TurningCamera | None,
     settings: PatchSettings,
 ) -> Array:
     """Read the key's patches in another frame; empty where the frames cannot be registered."""
     corners = key.corners_px.astype(float)
-    guess = predicted_points(corners, key.frame, frame, trajectory, profile)
+    guess = predicted_points(corners, key.frame, frame, camera)
     field = _deviation(key, guess, look, settings)
     if field is None:
         return np.zeros((0, 8))
-    patches = predicted_points(key.patches_px, key.frame, frame, trajectory, profile)
+    patches = predicted_points(key.patches_px, key.frame, frame, camera)
     height, width = look.normal.shape
     return _read(key, patches + _smooth_basis(patches, width, height) @ field, frame, look, settings)
 
 
-def predicted_points(
-    points_px: Array, key: Frame, frame: Frame, trajectory: Trajectory | None, profile: CameraProfile
-) -> Array:
-    """Where points (n, 2) of one frame are seen in another by rotation alone, each at its own row's mid-exposure."""
-    lens = profile.intrinsics
-    if trajectory is None or lens is None:
+def predicted_points(points_px: Array, key: Frame, frame: Frame, camera: TurningCamera | None) -> Array:
+    """Where points (n, 2) of one frame are seen in another by rotation alone, each at its own row's mid-exposure.
+
+    camera: None: where they were.
+    """
+    if camera is None:
         return points_px
-    world = trajectory.orientation(_seen_s(points_px, key, profile)) @ lens.rays(points_px)[..., None]
-    seen = points_px
-    for _ in range(_FIXED_POINT_STEPS):
-        turned = np.swapaxes(trajectory.orientation(_seen_s(seen, frame, profile)), -1, -2) @ world
-        seen = lens.project(np.squeeze(turned, -1))
-    return seen
+    seen_s = camera.frame(key).row_time_s(points_px, ROW_MIDDLE)
+    return seen_by_rows(camera.frame(frame), points_px, seen_s, ROW_MIDDLE, within_px=PIXELS_WITHIN_PX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,37 +250,28 @@ class Follower:
 
 
 def seen_elsewhere(
-    at: Follower, other: Follower, trajectory: Trajectory, profile: CameraProfile, points_px: Array
+    at: Follower, other: Follower, camera: TurningCamera, points_px: Array
 ) -> NDArray[np.float32] | None:
     """Where points (..., 2) of one frame are seen in another, (..., 2), corrected by corners; None: not registered."""
     settings = PatchSettings()
     looks = [_look(cv2.cvtColor(one.gray, cv2.COLOR_GRAY2RGB), settings) for one in (at, other)]
     key = _make_key(at.frame, looks[0], 0, settings)
-    guess = predicted_points(key.corners_px.astype(float), at.frame, other.frame, trajectory, profile)
+    guess = predicted_points(key.corners_px.astype(float), at.frame, other.frame, camera)
     field = _deviation(key, guess, looks[1], settings)
     if field is None:
         return None
     height, width = at.gray.shape
-    seen = predicted_points(points_px.reshape(-1, 2), at.frame, other.frame, trajectory, profile)
+    seen = predicted_points(points_px.reshape(-1, 2), at.frame, other.frame, camera)
     seen = seen + _smooth_basis(seen, width, height) @ field
     return seen.reshape(points_px.shape).astype(np.float32)
 
 
-def path_over_exposure(
-    points_px: Array, frame: Frame, trajectory: Trajectory, profile: CameraProfile, instants: int = 13
-) -> Array:
+def path_over_exposure(points_px: Array, frame: Frame, camera: TurningCamera, instants: int = 13) -> Array:
     """Displacements (n, instants, 2) of points seen at mid-exposure, over the exposure of their own rows."""
-    lens = profile.intrinsics
-    assert lens is not None, "paths need a focal length"
-    middle = _seen_s(points_px, frame, profile)
-    world = trajectory.orientation(middle) @ lens.rays(points_px)[..., None]
-    time_s = _seen_s(points_px[:, None], frame, profile, np.linspace(0.0, 1.0, instants))
-    turned = np.swapaxes(trajectory.orientation(time_s), -1, -2) @ world[:, None]
-    return lens.project(np.squeeze(turned, -1)) - points_px[:, None]
-
-
-def _seen_s(points_px: Array, frame: Frame, profile: CameraProfile, exposure_share: Any = ROW_MIDDLE) -> Array:
-    return RowClock(profile).seen_s(points_px, frame.time_s, frame.exposure_s or 0.0, exposure_share)
+    at = camera.frame(frame)
+    points_px = points_px[:, None]
+    time_s = at.row_time_s(points_px, np.linspace(0.0, 1.0, instants))
+    return moved_between(at, points_px, at.row_time_s(points_px, ROW_MIDDLE), time_s) - points_px
 
 
 def _deviation(key: _Key, guess: Array, look: _Look, settings: PatchSettings) -> Array | None:

@@ -29,7 +29,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
-from virest.image_formation.row_motion import frame_times_s
+from virest.image_formation.row_motion import RowMotion, covering_both, row_motion
+from virest.image_formation.warp import moved_between
 from virest.inference.alignment import choose_pairs
 from virest.inference.guidance import GyroGuide, MapBetween, map_between
 from virest.inference.guide_choice import find_guide
@@ -118,21 +119,16 @@ class _Restoration:
         """Where points (n, 2) of one restored frame lie in another one, by the model."""
         assert self.trajectory is not None
         assert self.lens is not None
-        from_s, to_s = self._reference_s(frame), self._reference_s(other)
-        rays = self.lens.rays(points_px, from_s)
-        turn = self.trajectory.orientation(to_s).T @ self.trajectory.orientation(from_s)
-        moved = rays @ turn.T
-        translation = (self.plan.translations or {}).get(frame)
-        if translation is not None:
-            nearness = translation.inverse_depth(rays)
-            shift = turn @ translation.position_m(np.array(to_s - from_s))
-            moved = moved - np.outer(nearness, shift)
-        return self.lens.project(moved, to_s)
+        here, there = (self._motion(number) for number in (frame, other))
+        both = covering_both(here, there, self.trajectory, self.lens)
+        return moved_between(both, points_px, here.reference_s, there.reference_s)
 
-    def _reference_s(self, number: int) -> float:
-        frame = self.frames[number]
-        reference = self.plan.settings.reference
-        return frame_times_s(self.plan.profile, frame.time_s, frame.exposure_s, reference)[1]
+    def _motion(self, number: int) -> RowMotion:
+        assert self.trajectory is not None
+        frame, plan = self.frames[number], self.plan
+        times = frame.time_s, frame.exposure_s, plan.settings.reference
+        translation = (plan.translations or {}).get(number)
+        return row_motion(self.trajectory, plan.profile, *times, translation, self.lens)
 
 
 def measure_restoration_gain(

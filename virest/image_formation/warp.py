@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from virest.image_formation.row_motion import RowMotion
+from virest.motion.optics import MovingLens
 
 Array = NDArray[np.float64]
 FIXED_POINT_PX = 1e-5
@@ -29,7 +30,28 @@ CELLS_PER_KNOT, MIN_KNOTS = 3, 12
 """Cells of a map's grid for each knot of its splines, and least number of knots: one in about 2 ms of a readout."""
 
 
-def moved_between(motion: RowMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = None) -> Array:
+class CameraMotion(Protocol):
+    """What the map asks of a motion: of one frame (`RowMotion`), or of many at once (`TurningFrames`)."""
+
+    @property
+    def optics(self) -> MovingLens:
+        """The lens at every instant."""
+
+    @property
+    def readout_time_s(self) -> float:
+        """From the first row to the last."""
+
+    def pose(self, time_s: Any) -> tuple[Array, Array | None]:
+        """(R (..., 3, 3), t (..., 3) or None) from fixed axes to the camera's at times (...)."""
+
+    def row_time_s(self, points_px: Array, exposure_share: Any) -> Array:
+        """When the rows through pixels (..., 2) are exposed to a share of their exposure."""
+
+    def inverse_depth(self, rays: Array, time_s: Any) -> Array:
+        """1 / depth (...) of what rays (..., 3), z = 1, meet at times (...)."""
+
+
+def moved_between(motion: CameraMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = None) -> Array:
     """Where points seen at pixels (..., 2) at one time are seen at another."""
     return _shown(motion, *_fixed_points(motion, points_px, from_s, inverse_depth), to_s)
 
@@ -49,7 +71,7 @@ def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, in
 
 
 def seen_by_rows(
-    motion: RowMotion,
+    motion: CameraMotion,
     points_px: Array,
     at_s: Any,
     anchor: float,
@@ -59,6 +81,7 @@ def seen_by_rows(
     """Where points seen at pixels (..., 2) at time ``at_s`` lie in the picture whose rows are seen at their anchors.
 
     A fixed point, since the row that sees a point depends on where it sees it; found once steps are below within_px.
+    Where many frames are seen at once, the motion is that of the frames that see; its poses hold at ``at_s`` too.
     """
     seen = points_px
     fixed = _fixed_points(motion, points_px, at_s, inverse_depth)
@@ -125,8 +148,8 @@ def _knots(length: int, spacing: int) -> tuple[Array, Array]:
     return knots, np.asarray(CubicSpline(knots, np.eye(count))(nodes))
 
 
-def _fixed_points(motion: RowMotion, points_px: Array, at_s: Any, inverse_depth: Any) -> tuple[Array, Array | None]:
-    """Points (..., 3), camera axes at the reference time, in units of their depths at ``at_s``; 1 / those, (...)."""
+def _fixed_points(motion: CameraMotion, points_px: Array, at_s: Any, inverse_depth: Any) -> tuple[Array, Array | None]:
+    """Points (..., 3), fixed axes, in units of their depths at ``at_s``; 1 / those, (...)."""
     rays = motion.optics.rays(points_px, at_s)
     rotation, translation = motion.pose(at_s)
     back = np.swapaxes(rotation, -1, -2)
@@ -136,7 +159,7 @@ def _fixed_points(motion: RowMotion, points_px: Array, at_s: Any, inverse_depth:
     return np.squeeze(back @ (rays - translation * nearness[..., None])[..., None], -1), nearness
 
 
-def _shown(motion: RowMotion, points: Array, nearness: Array | None, at_s: Any) -> Array:
+def _shown(motion: CameraMotion, points: Array, nearness: Array | None, at_s: Any) -> Array:
     """Pixels (..., 2) at which the points of :func:`_fixed_points` are seen at times (...)."""
     rotation, translation = motion.pose(at_s)
     moved = np.squeeze(rotation @ points[..., None], -1)

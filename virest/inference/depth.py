@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, TrackTable, centre, seen_s, turned
+from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, TrackTable, predict, turned
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
@@ -149,25 +149,17 @@ def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, p
 
     The standard deviation is the pair's tracking noise over the parallax.
     """
-    assert known.displacement is not None
-    profile = known.profile
-    first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
-    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
-    origin_s = np.asarray(profile.imu_time_s(table.origin_s))[table.window]
-    velocity, plane = scene.velocity_m_s[table.window], scene.plane_per_m[table.window]
-    centre_1 = centre(known.displacement, scene, velocity, first_s, origin_s)[0]
-    centre_2 = centre(known.displacement, scene, velocity, second_s, origin_s)[0]
-    scale = profile.shutter.exposure_scale
-    before = known.trajectory.mean_orientation(first_s, scale * table.first_exposure_s)
-    back = np.swapaxes(known.trajectory.mean_orientation(second_s, scale * table.second_exposure_s), -1, -2)
-    rays = known.lens.rays(table.first_px, first_s)
-    way = turned(before, rays)
-    clearance = np.maximum(1 - (plane * centre_1).sum(axis=-1), SMALLEST_DEPTH)
-    expected = np.maximum((plane * way).sum(axis=-1) / clearance, 0.0)
-    view = _Parallax(known.lens, turned(back, way), turned(back, centre_1 - centre_2), table, second_s)
+    prediction = predict(known, table, scene)
+    poses, moved = prediction.poses, prediction.moved
+    assert moved is not None
+    assert moved.paths is not None
+    centre_1 = moved.paths[0].centre(scene, scene.velocity_m_s[table.window])
+    rays, expected = known.lens.rays(table.first_px, poses.first_s), moved.inverse_depth
+    way = turned(poses.before, rays)
+    view = _Parallax(known.lens, turned(poses.back, way), turned(poses.back, moved.step), table, poses.second_s)
     depth, std, across = view.inverse_depths(expected, passes, reach)
     safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-    points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], first_s, depth, std)
+    points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], poses.first_s, depth, std)
     return Sightings(points, table.pair, centre_1, rays, depth - expected, across)
 
 
