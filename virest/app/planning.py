@@ -31,6 +31,7 @@ from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_win
 from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.capture_estimation import plan_restoration
+from virest.restoration.plan_notes import NoteCode
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.undistortion import require_undistortable
 
@@ -268,7 +269,7 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
 
     plan = plan_restoration(job.capture, job.profile, settings, read_decodable)
     for name, estimate in plan.profile.estimates.items():
-        told = name == "time_offset_s" and any(warning.startswith("time offset") for warning in plan.warnings)
+        told = name == "time_offset_s" and any(note.code is NoteCode.TIME_OFFSET for note in plan.said)
         if name not in job.profile.estimates and not told:
             said = with_deviation(name, estimate.value, estimate.std)
             log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
@@ -305,7 +306,7 @@ def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) ->
             f"± {1e3 * told.rest_s[1]:.1f} ms)"
         )
         log.warning("%s: %s", job.name, text)
-        plan = dataclasses.replace(plan, warnings=(*plan.warnings, text))
+        plan = plan.noted(NoteCode.TRUE_TIMES, text)
     if not found:
         return job, plan
     moved = {slot for one in found for slot in range(one.first, one.last + 1)}

@@ -26,6 +26,7 @@ from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.refinement import MissingTurn
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight, with_neighbours
 from virest.restoration.parameters import degradation_parameters, unknown_parameters
+from virest.restoration.plan_notes import NoteCode, PlanNote
 from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 
 UNTRUSTED = "the inertial log does not follow the camera"
@@ -42,9 +43,9 @@ class RestorationPlan:
     profile: CameraProfile
     """Unknown values filled in, as far as they could be."""
     settings: RestorationSettings
-    warnings: tuple[str, ...] = ()
-    """What holds for the whole capture."""
-    copy_reason: str | None = None
+    said: tuple[PlanNote, ...] = ()
+    """What holds for the whole capture, for its user to know."""
+    refusal: PlanNote | None = None
     """Why no frame may be restored; None: they may."""
     imu_gaps_s: tuple[tuple[float, float], ...] = ()
     """Holes in the inertial data: frames that reach into one are left out."""
@@ -61,6 +62,33 @@ class RestorationPlan:
 
     confirmed: ConfirmedGain | None = None
     """How much of a promised gain neighbouring frames confirm; None: they could not tell."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The sentences of ``said``."""
+        return tuple(note.text for note in self.said)
+
+    @property
+    def copy_reason(self) -> str | None:
+        """The sentence of ``refusal``."""
+        return None if self.refusal is None else self.refusal.text
+
+    def noted(self, code: NoteCode, *texts: str) -> RestorationPlan:
+        """The plan with further notes."""
+        return replace(self, said=(*self.said, *(PlanNote(code, text) for text in texts)))
+
+    def without(self, code: NoteCode) -> RestorationPlan:
+        """The plan without notes about something, a refusal included."""
+        kept = tuple(note for note in self.said if note.code is not code)
+        return replace(self, said=kept, refusal=None if self.refuses(code) else self.refusal)
+
+    def refused(self, code: NoteCode, text: str) -> RestorationPlan:
+        """The plan that copies all frames, for this reason."""
+        return replace(self, refusal=PlanNote(code, text))
+
+    def refuses(self, *codes: NoteCode) -> bool:
+        """Whether all frames are copied for one of these reasons."""
+        return self.refusal is not None and self.refusal.code in codes
 
     @property
     def reach(self) -> int:

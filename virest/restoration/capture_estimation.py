@@ -35,10 +35,17 @@ from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.restoration.blur_length_check import TilePowers, kept_powers, path_scale, telling
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
-from virest.restoration.conflict_plan import MAX_FOCAL_SPREAD, MAX_OFFSET_STD_S, explains_points, settle
+from virest.restoration.conflict_plan import (
+    MAX_FOCAL_SPREAD,
+    MAX_OFFSET_STD_S,
+    estimated_offset,
+    explains_points,
+    settle,
+)
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbour_plan import with_neighbours_asked
 from virest.restoration.neighbours.survey import kept_lumas, survey_runs
+from virest.restoration.plan_notes import NoteCode, PlanNote
 from virest.restoration.settings import RestorationSettings
 
 MIN_COARSE_EXPLAINED = 0.5
@@ -105,20 +112,20 @@ def _planned(
             alignment = _aligned(settled.profile, profile, capture, all_pairs)
             settled = _with_clock(settled, profile, alignment)
         plan = settled
-    if plan.copy_reason is None and not _clock_agrees(alignment, plan.profile):
+    if plan.refusal is None and not _clock_agrees(alignment, plan.profile):
         pairs = _through_resting_lens(tracked, capture, plan.profile)
         agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
         if np.isnan(agreement.motion_px) and not followed:
-            plan = replace(plan, warnings=(*plan.warnings, f"{UNCHECKED} ({agreement.reason})"))
+            plan = plan.noted(NoteCode.UNCHECKED, f"{UNCHECKED} ({agreement.reason})")
         if not agreement.agrees and not followed:
-            plan = replace(plan, copy_reason=f"pictures and gyroscope disagree: {agreement.reason}")
+            plan = plan.refused(NoteCode.DISAGREEMENT, f"pictures and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
             estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
             offset_s, std_s = agreement.best_offset_s, COARSE_STEP_S
             if estimate.determined:
                 offset_s, std_s = estimate.at_readout(plan.profile.shutter.readout_time_s), estimate.std_s
             plan = _with_doubt(plan, profile.time_offset_s, offset_s, std_s)
-    if plan.copy_reason is not None:
+    if plan.refusal is not None:
         return plan
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
@@ -169,10 +176,8 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     if np.any(np.abs(values) > 3 * spread):
         held = tuple(float(value) for value in values)
         profile = profile.with_estimate("gyro_bias_rad_s", list(held), spread.tolist(), source, gyro_bias_rad_s=held)
-    warnings = tuple(text for text in plan.warnings if not text.startswith("time offset"))
-    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
-    copy = None if plan.copy_reason and plan.copy_reason.startswith("time offset") else plan.copy_reason
-    return replace(plan, profile=profile, warnings=(*warnings, said), copy_reason=copy)
+    plan = replace(plan.without(NoteCode.TIME_OFFSET), profile=profile)
+    return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
 
 
 def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
@@ -181,7 +186,7 @@ def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: f
         return plan
     said = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
     contradicted = replace(plan.profile, time_offset_s=offset_s)
-    return replace(plan, warnings=(*plan.warnings, said), contradicted=contradicted)
+    return replace(plan, contradicted=contradicted).noted(NoteCode.OTHER_OFFSET, said)
 
 
 def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> dict[int, float]:
@@ -224,7 +229,7 @@ def _with_seen_paths(
         return plan
     said = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
     shutter = profile.shutter
-    offset_s, warnings = profile.time_offset_s or 0.0, plan.warnings
+    offset_s = profile.time_offset_s or 0.0
     if found_by_points:
         logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
         to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
@@ -232,10 +237,10 @@ def _with_seen_paths(
         doubt_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
         if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < doubt_s:
             offset_s = given.time_offset_s
-            warnings = tuple(text for text in warnings if not text.startswith(OTHER_OFFSET))
+            plan = plan.without(NoteCode.OTHER_OFFSET)
     shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
     contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
-    return replace(plan, warnings=(*warnings, said), contradicted=contradicted)
+    return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, said)
 
 
 def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:
@@ -252,25 +257,25 @@ def _with_translations(plan: RestorationPlan, capture: Capture, alignment: Visua
     known = {index: motion for index, motion in motions.items() if isinstance(motion, FrameMotion)}
     if not known:
         return _without_translation(plan, alignment.refused or "no frames")
-    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
+    plan = plan.without(NoteCode.TRANSLATION)
     open_frames = [motion for index, motion in motions.items() if index not in known]
     if open_frames:
         reason = max(map(str, open_frames), key=[str(motion) for motion in open_frames].count)
-        warnings = (*warnings, f"{NOT_ESTIMATED} in {len(open_frames)} of {len(motions)} frames ({reason})")
+        text = f"{NOT_ESTIMATED} in {len(open_frames)} of {len(motions)} frames ({reason})"
+        plan = plan.noted(NoteCode.TRANSLATION, text)
     unscaled = [motion.unscaled for motion in known.values() if motion.unscaled]
     if unscaled:
         reason = max(unscaled, key=unscaled.count)
-        said = f"travel known over depth, not in metres, in {len(unscaled)} of {len(motions)} frames ({reason})"
-        warnings = (*warnings, said)
+        text = f"travel known over depth, not in metres, in {len(unscaled)} of {len(motions)} frames ({reason})"
+        plan = plan.noted(NoteCode.TRANSLATION, text)
     translations = {index: _translation(motion, profile.depth_m) for index, motion in known.items()}
     scaled = [motion for motion in known.values() if not motion.unscaled]
     notes = (*plan.notes, _account(scaled, alignment)) if scaled else plan.notes
-    return replace(plan, warnings=warnings, notes=notes, translations=translations)
+    return replace(plan, notes=notes, translations=translations)
 
 
 def _without_translation(plan: RestorationPlan, reason: str) -> RestorationPlan:
-    warnings = tuple(text for text in plan.warnings if text != NOT_ESTIMATED)
-    return replace(plan, warnings=(*warnings, f"{NOT_ESTIMATED} ({reason})"))
+    return plan.without(NoteCode.TRANSLATION).noted(NoteCode.TRANSLATION, f"{NOT_ESTIMATED} ({reason})")
 
 
 def _motion(
@@ -368,18 +373,18 @@ def _times(capture: Capture) -> tuple[list[float], list[float | None]]:
     return [f.time_s for f in capture.frames], [f.exposure_s for f in capture.frames]
 
 
-def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[str, ...]:
-    """A warning for each value that is a documented default."""
-    warnings = []
+def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
+    """A note for each value that is a documented default."""
+    notes = []
     if profile.response is None:
-        warnings.append("response curve unknown: srgb taken")
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "response curve unknown: srgb taken"))
     if not profile.readout_known:
-        warnings.append("readout time unknown: 0 taken, rows are not straightened")
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "readout time unknown: 0 taken, rows are not straightened"))
     if all(frame.exposure_s is None for frame in capture.frames):
-        warnings.append("exposure times unknown: frames are not deblurred")
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "exposure times unknown: frames are not deblurred"))
     if profile.depth_m is None:
-        warnings.append(NOT_ESTIMATED)
-    return tuple(warnings)
+        notes.append(PlanNote(NoteCode.TRANSLATION, NOT_ESTIMATED))
+    return tuple(notes)
 
 
 def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> RestorationPlan:
@@ -389,18 +394,17 @@ def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> 
     if plan.profile.time_offset_s is not None:
         return plan
     if not estimate.determined:
-        warning = f"time offset not determined ({estimate.reason})"
-        plan = replace(plan, warnings=(*plan.warnings, warning))
-        return plan if plan.copy_reason else replace(plan, copy_reason="time offset not determined: virest calibrate")
+        plan = plan.noted(NoteCode.TIME_OFFSET, f"time offset not determined ({estimate.reason})")
+        refused = plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")
+        return plan if plan.refusal else refused
     offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
     profile = plan.profile.with_estimate(
         "time_offset_s", offset_s, estimate.std_s, "tracked points against the gyroscope", time_offset_s=offset_s
     )
     profile = _with_bias(profile, estimate)
-    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {estimate.std_s * 1e3:.2f} ms"
-    plan = replace(plan, profile=profile, warnings=(*plan.warnings, said))
-    if estimate.std_s > MAX_OFFSET_STD_S and plan.copy_reason is None:
-        return replace(plan, copy_reason=f"time offset only known to ± {estimate.std_s * 1e3:.1f} ms")
+    plan = replace(plan, profile=profile).noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, estimate.std_s))
+    if estimate.std_s > MAX_OFFSET_STD_S and plan.refusal is None:
+        return plan.refused(NoteCode.TIME_OFFSET, f"time offset only known to ± {estimate.std_s * 1e3:.1f} ms")
     return plan
 
 
@@ -422,5 +426,5 @@ def _with_focal(plan: RestorationPlan, estimate: OffsetEstimate) -> RestorationP
     focal, std = estimate.focal_px, estimate.focal_std_px
     if focal is None or std is None or std > MAX_FOCAL_SPREAD * focal:
         known = "" if focal is None or std is None else f" (about {focal:.0f} ± {std:.0f} px)"
-        return replace(plan, copy_reason=FOCAL_UNKNOWN + known)
+        return plan.refused(NoteCode.FOCAL_LENGTH, FOCAL_UNKNOWN + known)
     return replace(plan, profile=profile.with_focal(focal, std, "tracked points against the gyroscope"))

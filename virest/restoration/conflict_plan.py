@@ -15,7 +15,8 @@ from virest.inference.observed_tracks import ObservedTracks, guessed_lens, obser
 from virest.inference.tracking import TrackPair
 from virest.inference.visual_inertial import VisualInertialAlignment
 from virest.motion.integration import integrate_gyro
-from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.plan_notes import NoteCode
 from virest.restoration.profile_conflict import CONTRADICTED, MIN_PAIRS, Settled, settle_conflict
 
 OFFSET_SOURCE = "tracked points against the gyroscope"
@@ -55,18 +56,14 @@ def settle(
             found = again if again.after_px < found.after_px else found
     followed = found.explained > FOLLOWED
     if offset_known and not found.taken:
-        return (_said(plan, _unexplained(found)) if found.contradicted else plan), followed
+        return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     if offset_known:
-        plan = replace(plan, profile=found.profile, copy_reason=None)
-        return _said(plan, *found.taken, *_rest(found)), followed
-    open_yet = plan.copy_reason is not None and plan.copy_reason.startswith(("time offset", FOCAL_UNKNOWN))
+        plan = replace(plan, profile=found.profile, refusal=None)
+        return plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_rest(found)), followed
+    open_yet = plan.refuses(NoteCode.TIME_OFFSET, NoteCode.FOCAL_LENGTH)
     if not found.taken and not (followed and (open_yet or found.contradicted)):
-        return (_said(plan, _unexplained(found)) if found.contradicted else plan), followed
+        return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     return _with_open_values(plan, found), followed
-
-
-def _said(plan: RestorationPlan, *texts: str) -> RestorationPlan:
-    return replace(plan, warnings=(*plan.warnings, *texts))
 
 
 def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
@@ -79,11 +76,16 @@ def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
             return plan
         profile = replace(profile, intrinsics=None).with_focal(*found.focal, OFFSET_SOURCE)
     profile = profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
-    kept = tuple(text for text in plan.warnings if not text.startswith("time offset"))
-    said = f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
-    copy = f"time offset only known to ± {std_s * 1e3:.1f} ms" if std_s > MAX_OFFSET_STD_S else None
-    plan = replace(plan, profile=profile, warnings=kept, copy_reason=copy)
-    return _said(plan, *found.taken, *_rest(found), said)
+    plan = replace(plan.without(NoteCode.TIME_OFFSET), profile=profile, refusal=None)
+    if std_s > MAX_OFFSET_STD_S:
+        plan = plan.refused(NoteCode.TIME_OFFSET, f"time offset only known to ± {std_s * 1e3:.1f} ms")
+    plan = plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_rest(found))
+    return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
+
+
+def estimated_offset(offset_s: float, std_s: float) -> str:
+    """What is said of an offset that the profile leaves open."""
+    return f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
 
 
 def _unexplained(found: Settled) -> str:

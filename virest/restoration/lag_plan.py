@@ -14,6 +14,7 @@ from virest.inference.observed_tracks import observe_tracks
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.tracking import track_pairs
 from virest.restoration.capture import RestorationPlan, at_true_times
+from virest.restoration.plan_notes import NoteCode
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
 MIN_PAIRS = 8
@@ -43,7 +44,7 @@ def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
     contradicted = None if plan.contradicted is None else _followed(plan.contradicted, lag)
     said = f"frame lag of {lag.lag_s:.2f} s at the start: the first {lag.frames} frames are taken at their true times"
     profile = _followed(plan.profile, lag)
-    return replace(plan, profile=profile, contradicted=contradicted, warnings=(*plan.warnings, said))
+    return replace(plan, profile=profile, contradicted=contradicted).noted(NoteCode.TRUE_TIMES, said)
 
 
 def _followed(profile: CameraProfile, lag: StartUpLag) -> CameraProfile:

@@ -200,7 +200,7 @@ def test_a_blur_longer_than_a_measured_tile_is_undone(simulated):
     """Paths of 100 px and more in a large picture are measured at a smaller size, and restored (once: given up)."""
     capture = simulated(width=480, height=400, focal_px=700.0, rate_rad_s=6.0, exposure_ms=30.0, frames=3)
     settings = replace(PRESETS["fast"], min_blur_px=1.0)
-    plan = replace(capture.plan(settings), confirmed=None, copy_reason=None)
+    plan = replace(capture.plan(settings), confirmed=None, refusal=None)
     lengths = [r.parameters["blur"]["length_px"] for r in capture.restored(plan)]
     gains = _gains(capture, plan)
     assert max(lengths) > 100
