@@ -46,6 +46,7 @@ from virest.diagnosis.geometric_evidence import (
     capped_rms,
     depth_of,
 )
+from virest.diagnosis.left_open import variance_left_open
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
 from virest.inference.parallel import ParallelMap, one_by_one
@@ -136,6 +137,8 @@ class GeometricVerdict:
     """Unknown effects that were found beyond the causes: :class:`virest.diagnosis.field.records.FittedField`."""
     evidence: Evidence | None = None
     """The pairs that the model was fitted to."""
+    left_open: dict[str, Array] = field(default_factory=dict)
+    """Variance (k,) of causes' values, by name, from further causes that points which stay astray leave open."""
 
 
 def climb(
@@ -170,8 +173,21 @@ def climb(
         say(0.9)
         rival = _conclude(evidence, nominal_model, other.model, list(other.accepted), list(other.rungs), nominal)
         verdict = _either(evidence, verdict, rival)
+    verdict.left_open = _left_open(course, verdict)
     verdict.notes += notes
     return verdict
+
+
+def _left_open(course: SearchContext, verdict: GeometricVerdict) -> dict[str, Array]:
+    """What further causes leave open in the values of those that entered, where points stay astray."""
+    effects = [entry.effect for entry in verdict.accepted if entry.effect is not None and entry.effect.term is not None]
+    if not effects or verdict.fit.scale < ASTRAY_SCALE:
+        return {}
+    tried = {entry.name for entry in verdict.accepted}
+    further = [candidate for candidate in course.candidates(verdict.model, tried) if candidate.added]
+    return variance_left_open(
+        course.evidence, verdict.model, effects, further, total_change, is_plausible, course.each
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -731,7 +747,8 @@ def _changes_at(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramet
         return effect.changes(nominal, found, None)
     part = verdict.fit.slices[effect.term.name]
     floor = bias_std(verdict.fit, effect.name, verdict.step_noise_px)
-    stds = np.sqrt(np.diag(verdict.fit.covariance)[part] + floor**2)
+    left_open = verdict.left_open.get(effect.name, np.zeros(1))
+    stds = np.sqrt(np.diag(verdict.fit.covariance)[part] + floor**2 + left_open)
     changes = effect.changes(nominal, found, stds)
     match effect.name:
         case "imu_rotation":

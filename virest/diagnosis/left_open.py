@@ -1,0 +1,97 @@
+"""What the deviations of causes leave out while points stay astray: causes that did not enter.
+
+A fit's covariance holds if the model is right.  Where tracked points remain far from where the model puts them, it is
+not.  Each value then depends on which further cause one would believe in, and on where the descent began: robust losses
+of points that follow no model have many lows.  Each cause that a phone can have is therefore fitted beside those in the
+model, and the model is fitted again from either side; by how much that moves the values, beyond what the cause's own
+freedom explains, enters their variance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
+from virest.diagnosis.geometric_effects import GeometricEffect
+from virest.diagnosis.geometric_evidence import Evidence, Model, fit_model
+from virest.inference.parallel import ParallelMap
+from virest.inference.track_fit import TrackFit
+
+Array = NDArray[np.float64]
+ASIDE = 3.0
+"""Standard deviations on either side at which the model's own fit begins again."""
+Change = Callable[[GeometricEffect, CameraProfile, CameraProfile], Array]
+Plausible = Callable[[Evidence, GeometricEffect, CameraProfile, Array], bool]
+
+
+def variance_left_open(
+    evidence: Evidence,
+    model: Model,
+    effects: Sequence[GeometricEffect],
+    further: Sequence[Candidate],
+    change: Change,
+    plausible: Plausible,
+    each: ParallelMap,
+) -> dict[str, Array]:
+    """Variance (k,) by which the values of effects in a model depend on causes that are not, by the effects' names.
+
+    further: causes that may be added, at all places where their fits may begin.  change: values of an effect between
+    two profiles.  plausible: whether a phone can be so.
+    """
+    table = evidence.table(model, SCREEN_POINTS)
+    base = fit_model(evidence.imu, model, model.terms, table)
+    aside = _aside(model, effects, base)
+    calls = [(evidence.imu, start, model.terms, table) for start in aside]
+    calls += [(evidence.imu, c.model, (*c.model.terms, *c.added), table) for c in further]
+    fits = each(fit_model, calls)
+    others = [fitted for fitted in fits[: len(aside)] if fitted.cost <= base.cost]
+    best: dict[str, TrackFit] = {}
+    for candidate, fitted in zip(further, fits[len(aside) :], strict=True):
+        effect, name = candidate.effect, candidate.name
+        if effect is None or fitted.cost >= best.get(name, base).cost:
+            continue
+        if plausible(evidence, effect, fitted.profile, change(effect, model.profile, fitted.profile)):
+            best[name] = fitted
+    return {effect.name: _spread(base, others, list(best.values()), effect, change) for effect in effects}
+
+
+def _aside(model: Model, effects: Sequence[GeometricEffect], fitted: TrackFit) -> list[Model]:
+    """The model with each value of its causes moved to either side, and all other values as those go with it."""
+    starts = []
+    for effect in effects:
+        assert effect.term is not None
+        part = fitted.slices[effect.term.name]
+        for k in range(part.start, part.stop):
+            step = fitted.covariance[k] / np.sqrt(max(fitted.covariance[k, k], np.finfo(float).tiny))
+            starts += [_moved(model, fitted, side * ASIDE * step) for side in (1.0, -1.0)]
+    return starts
+
+
+def _moved(model: Model, fitted: TrackFit, step: Array) -> Model:
+    profile = model.profile
+    for term in model.terms:
+        profile = term.change(profile, step[fitted.slices[term.name]])
+    return replace(model, profile=profile)
+
+
+def _spread(
+    base: TrackFit, others: Sequence[TrackFit], wider: Sequence[TrackFit], effect: GeometricEffect, change: Change
+) -> Array:
+    """Variance (k,): the widest of the model's own ends, and what each further cause adds to it."""
+    own = [change(effect, base.profile, other.profile) ** 2 for other in others]
+    freedom = [np.maximum(_variance(other, effect) - _variance(base, effect), 0.0) for other in wider]
+    moved = [change(effect, base.profile, other.profile) ** 2 for other in wider]
+    excess = [np.maximum(shift - free, 0.0) for shift, free in zip(moved, freedom, strict=True)]
+    nothing = np.zeros(len(_variance(base, effect)))
+    return np.asarray(np.max([nothing, *own], axis=0) + np.sum([nothing, *excess], axis=0))
+
+
+def _variance(fitted: TrackFit, effect: GeometricEffect) -> Array:
+    assert effect.term is not None
+    part = fitted.slices[effect.term.name]
+    return np.asarray(np.diag(fitted.covariance)[part])
