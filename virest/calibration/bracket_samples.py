@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -56,7 +57,7 @@ class BracketPicture:
     """Listed light, in any unit that the bracket shares."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class BracketSamples:
     """Greys of the same places in every picture."""
 
@@ -93,19 +94,19 @@ class BracketSamples:
         """The brightest grey that is measured in any channel."""
         return float(self.highs.max())
 
-    @property
+    @cached_property
     def limits(self) -> tuple[Array, Array]:
         """Censoring limits of each sample, (samples, 1) both."""
         return self.lows[self.channel][:, None], self.highs[self.channel][:, None]
 
-    @property
+    @cached_property
     def measured(self) -> NDArray[np.bool_]:
         """(samples, pictures): not censored."""
         low, high = self.limits
         inside = (self.grey > low) & (self.grey < high)
         return inside if self.fair is None else inside & self.fair
 
-    @property
+    @cached_property
     def sigma(self) -> Array:
         """(samples, pictures) standard deviation of each grey."""
         return np.sqrt(self.noise.at(self.grey, self.channel))

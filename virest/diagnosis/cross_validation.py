@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
@@ -22,6 +21,7 @@ from virest.diagnosis.geometric_evidence import (
     relief_loss,
 )
 from virest.image_formation.point_model import TrackTable
+from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap
 from virest.inference.track_fit import Term
 
@@ -229,7 +229,7 @@ def lagging_gain(evidence: Evidence, before: Judged, after: Judged) -> Array:
 
 def chance_of(gain: Array) -> float:
     """Probability (one-sided t test) of so even a gain (blocks,) where there is none."""
-    return float(stats.t.sf(t_ratio(gain), max(len(gain) - 1, 1)))
+    return student_tail(t_ratio(gain), max(len(gain) - 1, 1))
 
 
 def t_ratio(values: Array) -> float:

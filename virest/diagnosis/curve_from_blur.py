@@ -27,7 +27,6 @@ from itertools import pairwise
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
@@ -38,6 +37,7 @@ from virest.diagnosis.photometry_patches import Follower, path_over_exposure, se
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
 from virest.image_formation.warp import moved_between
+from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
@@ -204,7 +204,7 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
     strength = float(np.sqrt(evidence.stiffness[effect_name].sum() / evidence.pixels.sum()))
     absolute, relative = DOUBT[effect_name]
     std = float(np.sqrt(jackknife + absolute**2 + (AGREEMENT / max(strength, 1e-6)) ** 2))
-    p_value = float(2 * stats.t.sf(abs(change) / std, len(pairs) - 1))
+    p_value = 2 * student_tail(abs(change) / std, len(pairs) - 1)
     std = float(np.hypot(std, relative * change))
     curve = profile.response or ResponseCurve("srgb")
     if effect_name == "response_curve":

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
@@ -31,6 +30,7 @@ from virest.diagnosis.local_blur import STILL_PX, frames_to_read, time_blocks
 from virest.diagnosis.local_blur_edges import TANGENT_PX, EdgeSettings, find_edges
 from virest.diagnosis.local_blur_model import across, path_tensors
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader
+from virest.inference.chance import normal_tail
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ class Sharpening:
     @property
     def p_value(self) -> float:
         """Probability of such an overshoot on both sides where nobody sharpened."""
-        return float(stats.norm.sf(self.z))
+        return normal_tail(self.z)
 
 
 def judge_sharpening(capture: Capture, profile: CameraProfile, trajectory: Trajectory, gray: Reader) -> PictureVerdict:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from virest.calibration.geometry import right_way_round
 from virest.calibration.physical_limits import is_depth
@@ -49,6 +48,7 @@ from virest.diagnosis.geometric_evidence import (
 from virest.diagnosis.left_open import variance_left_open
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
+from virest.inference.chance import chi2_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.recorder_lag import Schedule
 from virest.inference.track_fit import Term, TrackFit
@@ -524,7 +524,7 @@ def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float
     given_m = given_m or np.inf
     nearer = 1 / depth_m - 1 / given_m
     certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
-    return float(stats.chi2.sf((nearer / max(certain, 1e-9)) ** 2, 1))
+    return chi2_tail((nearer / max(certain, 1e-9)) ** 2, 1)
 
 
 def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
@@ -547,8 +547,8 @@ def p_of(
     part = fitted.slices[effect.name]
     covariance = fitted.covariance[part, part] + np.diag(floor**2)
     if effect.name == "stabilisation":
-        return float(stats.chi2.sf(change[0] ** 2 / covariance[0, 0], 1))
-    return float(stats.chi2.sf(change @ np.linalg.solve(covariance, change), len(change)))
+        return chi2_tail(change[0] ** 2 / covariance[0, 0], 1)
+    return chi2_tail(change @ np.linalg.solve(covariance, change), len(change))
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────

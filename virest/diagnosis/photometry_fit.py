@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from itertools import islice, product
 
 import numpy as np
-from scipy import stats
 
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
+from virest.inference.chance import chi2_tail, normal_deviate
 from virest.inference.parallel import ParallelMap, one_by_one
 
 _CAUCHY = 2.5
@@ -220,8 +220,8 @@ def significance(fit: PhotometricFit, effect_name: str, observations: Photometri
     else:
         off = values[0] - (1.0 if effect_name == "response_curve" else 0.0)
         z2 = off**2 / covariance[0, 0]
-        p = float(stats.chi2.sf(z2, 1))
-    return float(stats.norm.isf(max(p, 1e-300) / 2)), p
+        p = chi2_tail(z2, 1)
+    return normal_deviate(max(p, 1e-300) / 2), p
 
 
 def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covariance: Array) -> float:
@@ -242,7 +242,7 @@ def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covarian
     slow = float(off @ np.linalg.solve(spread, off)) / freedom
     quick = _quick_changes(log_gain, spread - _lag_of_gains(log_gain, np.abs(late)))
     tests = ((slow, stretches), (quick, max(freedom / NEIGHBOURS, 1.0)))
-    return float(min(1.0, 2 * min(stats.chi2.sf(ratio * count, count) for ratio, count in tests)))
+    return float(min(1.0, 2 * min(chi2_tail(ratio * count, count) for ratio, count in tests)))
 
 
 def _quick_changes(log_gain: Array, spread: Array) -> float:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
@@ -32,6 +31,7 @@ from virest.diagnosis.photometry import PhotometricObservations, normalised_rms,
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
 from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
+from virest.inference.chance import normal_deviate, student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
@@ -63,7 +63,7 @@ MIXING_P = 1.5e-3
 MIXING_LEAST = {"response_curve": 0.05, "black_level": 0.02}
 """Smallest change of the curve that is named from mixing: of the logarithm of gamma, of black level."""
 MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
-BLUR_Z = float(stats.norm.isf(MAX_P / 2))
+BLUR_Z = normal_deviate(MAX_P / 2)
 """Deviations from no change of exposure or defocus at which the two-sided probability is MAX_P."""
 MIN_DEFOCUS_PX = 0.5
 SOFT_Z = 5.0
@@ -420,7 +420,7 @@ def climb_blur(
         before, after = local_blur_fit.held_out(observations, profile, trajectory, alone)
         changes = _blur_change(k, profile, scale, sigma, std)
         z = abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / (2 * std[1])
-        p_value = float((2 if k == 0 else 1) * stats.t.sf(z, local_blur.BLOCKS - 1))
+        p_value = (2 if k == 0 else 1) * student_tail(z, local_blur.BLOCKS - 1)
         name = effects[k].name
         verdict.findings.append(
             Finding(name, changes, HeldOutGain(BLUR, before, after, None), (), p_value, sentence_of(name, changes))

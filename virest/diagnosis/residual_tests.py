@@ -6,7 +6,6 @@ import logging
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from virest.diagnosis import picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
@@ -14,6 +13,7 @@ from virest.diagnosis.geometric_ladder import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
 from virest.image_formation.point_model import seen_s
+from virest.inference.chance import chi2_tail, mean_tail
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> t
     square = np.bincount(pair, np.minimum(distance, STRAY_DISTANCE) ** 2) / count
     stray = np.bincount(pair, distance > STRAY_DISTANCE) / count
     tests = ((square, 2 * (SCALE_EXCESS * noise) ** 2), (stray, STRAY_PART))
-    first, second = (float(stats.ttest_1samp(v[used], mean, alternative="greater").pvalue) for v, mean in tests)
+    first, second = (mean_tail(v[used] - mean) for v, mean in tests)
     return first, second
 
 
@@ -115,7 +115,7 @@ def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Str
         excess += float(np.mean(np.maximum(mean[used] ** 2 - spread, 0.0)))
         chi2 += float(np.sum(mean[used] ** 2 / spread))
         freedom += int(used.sum())
-    return Structure("time", float(np.sqrt(excess / 2)), float(stats.chi2.sf(chi2, max(freedom, 1))))
+    return Structure("time", float(np.sqrt(excess / 2)), chi2_tail(chi2, max(freedom, 1)))
 
 
 def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+
+from virest.inference.chance import chi2_tail, normal_deviate, student_tail
 
 Array = NDArray[np.float64]
 BINS = 10
@@ -55,12 +56,12 @@ def _along(
                 continue
             spread = error**2 + floor**2
             excess += max(mean**2 - spread, 0.0)
-            tail = stats.t.sf(abs(mean) / np.sqrt(spread), count - 1)
-            chi2 += float(stats.norm.isf(max(float(tail), 1e-300))) ** 2
+            tail = student_tail(abs(mean) / np.sqrt(spread), count - 1)
+            chi2 += normal_deviate(max(tail, 1e-300)) ** 2
             freedom, bins = freedom + 1, bins + 1
     if not freedom:
         return Structure(name, 0.0, 1.0)
-    return Structure(name, float(np.sqrt(excess / bins)), float(stats.chi2.sf(chi2, freedom)))
+    return Structure(name, float(np.sqrt(excess / bins)), chi2_tail(chi2, freedom))
 
 
 def _mean_of_stretches(

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, ground
 from virest.inference import profile_terms as terms_of
+from virest.inference.chance import chi2_tail, student_tail
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.profile_terms import CLOCK_SKEW, shift_offset
 from virest.inference.track_fit import RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
@@ -262,7 +262,7 @@ class _Search:
         """Whether the cause that entered last has a value that a phone can have, and not by chance."""
         cause, found = start.causes[-1], fit.profile
         ratio = cause.change(self.given, found) / _std(fit, cause, float(np.median(self.table.noise_px)))[0]
-        return cause.plausible(self.given, found) and float(stats.chi2.sf(ratio**2, 1)) < VALUE_P
+        return cause.plausible(self.given, found) and chi2_tail(ratio**2, 1) < VALUE_P
 
     def _held_out(self, start: _Start, fit: TrackFit) -> Array:
         """Whitened distances (n,) of all points from fits that did not see their block."""
@@ -292,4 +292,4 @@ def _p_of_mean(gain: Array) -> float:
     """One-sided probability of so large a mean gain by chance."""
     if len(gain) < 3 or gain.mean() <= 0:
         return 1.0
-    return float(stats.t.sf(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-12), len(gain) - 1))
+    return student_tail(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-12), len(gain) - 1)

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from virest.image_formation.neighbour import turn_jacobian_px
 from virest.image_formation.row_motion import RowMotion
+from virest.inference.chance import chi2_median, chi2_tail
 from virest.restoration.neighbours.registration import PairTurn
 
 Array = NDArray[np.float64]
@@ -99,10 +99,10 @@ def missing_turn(runs: Sequence[Sequence[PairTurn | None]], motions: Sequence[Ro
     if len(turns) < 2 or not motions:
         return None
     squares = [t.rate_rad_s @ np.linalg.solve(t.covariance, t.rate_rad_s) for t in turns]
-    if stats.chi2.sf(np.sum(squares), 3 * len(turns)) > FALSE_ALARM:
+    if chi2_tail(np.sum(squares), 3 * len(turns)) > FALSE_ALARM:
         return None
     noise = np.mean([np.trace(t.covariance) / 3 for t in turns])
-    variance = np.median([t.rate_rad_s @ t.rate_rad_s for t in turns]) / stats.chi2.median(3) - noise
+    variance = np.median([t.rate_rad_s @ t.rate_rad_s for t in turns]) / chi2_median(3) - noise
     if variance <= 0:
         return None
     bends = [

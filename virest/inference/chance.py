@@ -1,0 +1,46 @@
+"""Tails of the distributions that tests of significance use, from `scipy.special` (`scipy.stats` loads too slowly)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+
+def chi2_tail(value: Any, freedom: Any) -> float:
+    """Probability of a larger chi-square."""
+    return float(special.chdtrc(freedom, value))
+
+
+def chi2_median(freedom: int) -> float:
+    """Median of a chi-square."""
+    return float(special.chdtri(freedom, 0.5))
+
+
+def student_tail(value: Any, freedom: Any) -> float:
+    """Probability of a larger Student's t."""
+    return float(special.stdtr(freedom, -np.asarray(value, float)))
+
+
+def normal_tail(value: Any) -> float:
+    """Probability of a larger normal deviate."""
+    return float(special.ndtr(-np.asarray(value, float)))
+
+
+def normal_deviate(tail: Any) -> float:
+    """Normal deviate that this probability exceeds: the inverse of :func:`normal_tail`."""
+    return float(-special.ndtri(tail))
+
+
+def gamma_tail(value: Any, shape: Any, scale: Any) -> float:
+    """Probability of a larger gamma deviate."""
+    return float(special.gammaincc(shape, np.asarray(value, float) / scale))
+
+
+def mean_tail(values: NDArray[np.float64]) -> float:
+    """Probability of so large a mean of values (n,) by chance: a one-sided t test against 0; NaN for fewer than two."""
+    if len(values) < 2:
+        return float("nan")
+    return student_tail(values.mean() * np.sqrt(len(values)) / values.std(ddof=1), len(values) - 1)
