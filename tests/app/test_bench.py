@@ -30,7 +30,7 @@ STAGE_S = {"decode": 0.01, "estimate": 0.002, "deblur": 0.05, "shutter": 0.02, "
 def line(deblur: str = "hyper-laplacian", shutter: str = "rowwise", **stages: float) -> Facts:
     """One frame's line of a log."""
     return {"status": "restored", "seconds": {**STAGE_S, **stages}, "deblur": {"method": deblur},
-            "shutter": {"method": shutter}}  # fmt: skip
+            "shutter": {"method": shutter}, "blur": {"length_px": 9.0}}  # fmt: skip
 
 
 def run(frames: int, wall_s: float, cpu_s: float, others_cores: float = 0.125, **of_line: Any) -> Run:
@@ -52,7 +52,8 @@ def speed_facts(**of_floor: Any) -> Facts:
     """Everything the section ``speed`` gives, at known figures: floor 25, fast 10, balanced 8 and best 0.2 frames/s."""
     floor = entry("floor", 0.04, 0.076, **{"deblur": "none", **of_floor})
     measured = [floor, entry("fast", 0.1, 0.19), entry("balanced", 0.125, 0.2), entry("best", 5.0, 9.5)]
-    return {"jobs": 2, "size": "720x1280", "planning_cpu_s": 3.0, **speed.judged(measured, 3.0),
+    return {"jobs": 2, "size": "720x1280", "content": "dead leaves", "blur_px": 9.0, "processor": "Z80",
+            "transforms": "OpenCV", "planning_cpu_s": 3.0, **speed.judged(measured, 3.0),
             "peers_s_per_frame": {"wiener": 0.5}, "peers_missing": {"deepinv wiener": peers.GET_DEEPINV}}  # fmt: skip
 
 
@@ -331,13 +332,12 @@ def test_a_busy_machine_is_judged_only_where_it_can_be(
     assert summary.judge(by_wall, by_cpu, others_cores, ratio=ratio) == said
 
 
-def test_the_summary_says_what_was_not_run() -> None:
-    """A section that is missing is named with the option that runs it; one that ran is not."""
+def test_the_summary_has_only_what_was_run() -> None:
+    """A section that did not run has no row; where nothing asked for anything ran, there is no summary."""
     text = summary.summary_text(report(memory=memory_facts()))
-    for section in ("speed", "growth", "commands"):
-        assert f"not run: --only {section}" in text
-    assert "not run: --only memory" not in text
     assert "260 MB" in text
+    assert "frames/s" not in text
+    assert summary.summary_text(report(shutter={"captures": []})) == ""
 
 
 def test_the_summary_names_peers_that_are_not_there() -> None:
@@ -462,7 +462,6 @@ def test_a_section_is_printed_kept_and_summed_up(
     bench.main(["--only", "commands", "--quick", "--out", str(tmp_path)])
     printed = capsys.readouterr().out
     assert printed.index("TOLD quick") < printed.index("SUMMARY") < printed.index("virest --help")
-    assert "not run: --only speed" in printed
     kept = json.loads((tmp_path / "bench.json").read_text())
     assert kept["commands"] == command_facts(0.2)
     assert {"virest", "commit", "python", "numpy", "deepinv", "processor", "load"} <= kept["versions"].keys()

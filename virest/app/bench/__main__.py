@@ -76,11 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
     work = options.keep or Path(tempfile.mkdtemp(prefix="work-", dir=options.out))
     try:
-        for name in options.only or SECTIONS:
+        for number, name in enumerate(options.only or SECTIONS):
             report[name], text = SECTIONS[name](work, scale)
-            emit(text + "\n")
+            emit("\n" * bool(number) + text)
             _write(options.out / "bench.json", report)
-        emit(summary_text(report))
+        if closing := summary_text(report):
+            emit("\n" + closing)
     finally:
         if work != options.keep:
             shutil.rmtree(work, ignore_errors=True)

@@ -19,7 +19,7 @@ from virest.app.bench.workload import (
     simulated,
     truth_frame,
 )
-from virest.app.console import emit
+from virest.app.console import CONSOLE
 from virest.evaluation.fidelity import psnr_db
 
 METHODS = (*PRESETS, *PEERS)
@@ -40,7 +40,7 @@ def quality_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         found = measure_workload(work, workload)
         rows += found
         means = {m: np.mean([row["gain_db"][m] for row in found]) for m in METHODS}
-        emit(f"{workload.name}: " + ", ".join(f"{method} {mean:+.2f}" for method, mean in means.items()))
+        CONSOLE.line(f"{workload.name}: " + ", ".join(f"{method} {mean:+.2f}" for method, mean in means.items()))
     summary = summarise(rows)
     return {"frames": rows, "summary": summary}, _text(summary)
 
