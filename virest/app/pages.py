@@ -6,8 +6,8 @@ $ python -m virest.app.pages --only "evaluate shutter" docs/results.md
 $ python -m virest.app.pages --quiet-machine       # those with speeds too
 $ python -m virest.app.pages --check --at-most 1   # compare, write nothing; exit 1 where a page is out of date
 
-A block of a page is a session between two comments, run from an empty folder that holds ``sample_data`` and ``examples``.  What
-goes to standard error is not shown:
+A block of a page is a session between two comments, run from an empty folder that holds ``sample_data`` and
+``examples``.  What goes to standard error is not shown:
 
     <!-- figures: 12 s, quiet machine -->
     ```console
@@ -54,7 +54,7 @@ CLOCK = re.compile(r"\s*(?:s|ms|µs|frames/s)\b")
 CLOCK_HEADS = ("frames/s", "time s")
 """Units and columns of what a clock says: no run repeats it."""
 ROUNDING, RELATIVE = 1.5, 0.02
-"""How far a repeated figure may lie off, in units of its last digit or of itself: other processors round differently."""
+"""How far a repeated figure may lie off, in units of its last digit or of itself: processors round differently."""
 
 
 @dataclass(frozen=True, slots=True)
