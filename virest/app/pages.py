@@ -148,8 +148,12 @@ def _run(command: str, folder: Path) -> str:
 def block_text(block: Block, session: str, took_s: float) -> str:
     """A block as it stands in the page; where speeds are in it, the machine below."""
     head = ", ".join([_duration(took_s), *block.needs])
-    machine = f"*{processor() or 'unknown processor'}, {cores()} cores*\n" if has_speeds(session) else ""
+    machine = f"*{processor() or 'unknown processor'}, {_count(cores(), 'core')}*\n" if has_speeds(session) else ""
     return f"<!-- figures: {head} -->\n```console\n{session}```\n{machine}<!-- end: virest {__version__} -->"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number != 1 else ''}"
 
 
 def has_speeds(session: str) -> bool:
@@ -216,7 +220,8 @@ def last_digit(number: str) -> float:
 
 
 def _close(shown: str, now: str) -> bool:
-    return abs(value(shown) - value(now)) <= max(ROUNDING * last_digit(shown), RELATIVE * abs(value(shown)))
+    rounding = ROUNDING * last_digit(shown) if re.search("[.e]", shown) else 0.0  # counts are exact
+    return abs(value(shown) - value(now)) <= max(rounding, RELATIVE * abs(value(shown)))
 
 
 # ── the command ──────────────────────────────────────────────────────────────────────────────────────────────────
