@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from documentation import DOCS, PAGES, ROOT, name_of, read
 
 from virest import __version__
 from virest.app import pages
+from virest.app.cli import program
 
 BLOCKS = [block for page in PAGES for block in pages.blocks(page)]
 CHEAP_S = 6.0
+WITHOUT_INPUT = ("import",)
+"""Commands whose input the repository does not hold (a bag)."""
 GALLERY = DOCS / "gallery.md"
 """Written as a whole by `make figures`."""
 FIGURE = re.compile(
@@ -67,6 +72,32 @@ def test_a_block_was_printed_by_this_version(block: pages.Block) -> None:
 def test_a_cheap_block_prints_what_the_page_says(block: pages.Block) -> None:
     """The commands of a block are run from an empty folder; clocks and last digits may differ."""
     assert not pages.differences(block.session, pages.rerun(block)[0])
+
+
+def helps(command: Any) -> Iterator[str]:
+    """Help texts of all commands, with those of commands inside commands."""
+    for name, inner in getattr(command, "commands", {}).items():
+        if name not in WITHOUT_INPUT:
+            yield inner.help or ""
+            yield from helps(inner)
+
+
+def quotes(session: str) -> list[str]:
+    """What a session of a help text shows as printed: one line each, up to what is left out (...)."""
+    outputs = "".join(output for _, output in pages.steps(inspect.cleandoc(session)))
+    lines = [line.partition("...")[0] for line in outputs.splitlines()]
+    return [" ".join(line.split()) for line in lines if line.strip()]
+
+
+QUOTED = [(part.split("\n")[0], quotes(part)) for text in helps(program())
+          for part in text.split("\b\n")[1:] if quotes(part)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("first", "lines"), QUOTED, ids=[first.strip() for first, _ in QUOTED])
+def test_help_shows_what_the_pages_show(first: str, lines: list[str]) -> None:
+    """A session of `--help` is an excerpt of a block: whatever it prints, some page prints."""
+    shown = "\n".join(" ".join(line.split()) for block in BLOCKS for line in block.session.splitlines())
+    assert not [line for line in lines if f"\n{line}" not in shown]
 
 
 # ── figures in prose ─────────────────────────────────────────────────────────────────────────────────────────────

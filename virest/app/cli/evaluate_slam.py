@@ -15,9 +15,7 @@ from virest.restoration.settings import PRESETS
 def slam(
     captures: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[CAPTURE]...", help="Capture folders with truth/; - reads names from stdin. [simulated]"
-        ),
+        typer.Argument(metavar="CAPTURE", help="Capture folders with truth/; - reads names from stdin. [simulated]"),
     ] = None,
     command: Annotated[
         str | None,
