@@ -18,8 +18,8 @@ from virest.app.cli import program
 
 BLOCKS = [block for page in PAGES for block in pages.blocks(page)]
 CHEAP_S = 6.0
-WITHOUT_INPUT = ("import",)
-"""Commands whose input the repository does not hold (a bag)."""
+WITHOUT_INPUT = ("import", "doctor")
+"""Commands whose input the repository does not hold: a bag, the machine."""
 GALLERY = DOCS / "gallery.md"
 """Written as a whole by `make figures`."""
 FIGURE = re.compile(
