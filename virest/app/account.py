@@ -16,8 +16,8 @@ from virest.app.outputs import file_facts, parse_lines, resolved
 from virest.app.planning import Job, ProcessOptions
 from virest.camera.profile import profile_mapping
 from virest.capture.location import is_remote, locate, read_each
-from virest.image_formation import transforms
 from virest.errors import VirestError
+from virest.image_formation import transforms
 from virest.restoration.capture import RestorationPlan
 
 PARTLY_FAILED = 9

@@ -19,8 +19,8 @@ from typing import Any
 
 from virest import __version__
 from virest.capture.location import is_remote
-from virest.image_formation import transforms
 from virest.errors import RestorationError, SettingsError
+from virest.image_formation import transforms
 
 log = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ from virest.app.doctor import processor
 from virest.app.jobs import prepare_worker
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_gray
-from virest.degradation import transforms
+from virest.image_formation import transforms
 from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.settings import PRESETS as SETTINGS
 
