@@ -416,9 +416,9 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
         f"{residual_words(nominal.geometry_rms_px, nominal.geometry_noise_px)}"
     ]
     if found.causes:
-        header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
-        lines.append(table(header, [row for cause in found.causes for row in _rows(cause)]))
-        lines += [f"{cause.name}: {_one_line(cause.sentence)}" for cause in found.causes]
+        header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain"]
+        lines.append(table(header, [row for cause in found.causes for row in _rows(cause)], words=0))
+        lines += [line for cause in found.causes for line in _sentences(cause)]
     for field in found.fields:
         lines.append(f"field: {_one_line(field.sentence)}")
         lines.append(f"  likely: {field.reasons}; to tell: {field.next}")
@@ -428,16 +428,21 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
     return "\n".join([*lines, f"verdict: {found.verdict}"])
 
 
+def _sentences(cause: Finding) -> list[str]:
+    """The cause in words with the error that it was judged by, and what would explain as much."""
+    rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals)
+    told = f"{cause.name}: {_one_line(cause.sentence)} (held-out {cause.held_out.quantity})"
+    return [told, f"  as good an explanation: {rivals}"] if rivals else [told]
+
+
 def _rows(cause: Finding) -> list[list[str]]:
     """A row for each number or word that changed; what the cause gains stands on its first."""
     held_out = cause.held_out
     gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
-    judged = [_number(held_out.before), _number(held_out.after), gain, held_out.quantity]
-    rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals) or "-"
-    first = [cause.name, [*judged, rivals]]
+    judged = [_number(held_out.before), _number(held_out.after), gain]
     values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
     return [
-        [str(first[0]) if k == 0 else "", *value, *(first[1] if k == 0 else [""] * 5)]
+        [cause.name if k == 0 else "", *value, *(judged if k == 0 else [""] * len(judged))]
         for k, value in enumerate(values or [["-"] * 4])
     ]
 
