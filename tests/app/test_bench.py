@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from virest.app.bench import __main__ as bench
-from virest.app.bench import commands, compare, growth, memory, peers, speed, summary
+from virest.app.bench import commands, compare, growth, memory, peers, quality, speed, summary
 from virest.app.bench.workload import (
     Run,
     Scale,
@@ -466,3 +466,15 @@ def test_a_section_is_printed_kept_and_summed_up(
     assert kept["commands"] == command_facts(0.2)
     assert {"virest", "commit", "python", "numpy", "deepinv", "processor", "load"} <= kept["versions"].keys()
     assert [path.name for path in tmp_path.iterdir()] == ["bench.json"]
+
+
+def test_the_quality_table_sums_up_only_kinds_of_several_captures() -> None:
+    """A kind with one capture has one row; the worst frames stand in a table of their own."""
+    gains = {method: 1.0 if method in quality.PRESETS else -1.0 for method in quality.METHODS}
+    frames = [("leaves", "ordinary"), ("phone-calm", "phone"), ("phone-fast", "phone")]
+    rows = [{"capture": name, "kind": kind, "frame": 0, "in_range": True, "straightened_db": 20.0,
+             "gain_db": {**gains, "fast": 0.25 + number}} for number, (name, kind) in enumerate(frames)]  # fmt: skip
+    means, worst = quality._text(quality.summarise(rows)).split("the same of the worst frame")
+    assert "ALL ordinary" not in means
+    assert means.splitlines()[-2].split()[-7:-5] == ["20.00", "+1.75"]
+    assert worst.splitlines()[-1].split()[-3:] == ["+1.25", "+1.00", "+1.00"]
