@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import shutil
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from documentation import DOCS, PAGES, ROOT, name_of, read
 from virest import __version__
 from virest.app import pages
 from virest.app.cli import program
+from virest.app.gallery import gallery_page
 
 BLOCKS = [block for page in PAGES for block in pages.blocks(page)]
 CHEAP_S = 6.0
@@ -142,6 +144,12 @@ def test_a_figure_in_prose_is_printed_by_the_command_it_names(page: Path) -> Non
                     continue
                 unknown = [number for number in figure.groups() if number and not printed(number.rstrip(".,"), output)]
                 assert not unknown, f"{name_of(page)}: {figure[0]!r} in {' '.join(piece.split())[:160]!r}"
+
+
+def test_the_gallery_says_what_diagnose_found() -> None:
+    """Its page is the one that `make figures` makes of the results kept beside its pictures: no figure was typed."""
+    results = json.loads((DOCS / "images" / "gallery" / "results.json").read_text("utf-8"))
+    assert read(GALLERY) == gallery_page(results)
 
 
 @pytest.mark.parametrize(
