@@ -19,7 +19,7 @@ from virest.app.cli import program
 from virest.app.gallery import gallery_page
 
 BLOCKS = [block for page in PAGES for block in pages.blocks(page)]
-CHEAP_S = 6.0
+CHEAP_S = 4.5
 WITHOUT_INPUT = ("import", "doctor")
 """Commands whose input the repository does not hold: a bag, the machine."""
 GALLERY = DOCS / "gallery.md"
