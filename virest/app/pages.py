@@ -33,12 +33,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from virest import __version__
+from virest.app import console
 from virest.app.bench.tables import table
 from virest.app.cli.options import cores
-from virest.app.console import emit
 from virest.app.doctor import processor
 from virest.app.outputs import write_whole
-from virest.errors import SettingsError
+from virest.errors import SettingsError, VirestError
 
 ROOT = Path(__file__).resolve().parents[2]
 OFFERED = ("sample_data", "examples")
@@ -265,17 +265,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="list the blocks and run nothing")
     options = parser.parse_args(arguments)
     if options.list:
-        emit(_listing([block for page in options.pages or pages() for block in blocks(page.resolve())]))
+        console.emit(_listing([block for page in options.pages or pages() for block in blocks(page.resolve())]))
         return 0
-    stale = 0
-    for block in _chosen(options):
+    kept = [_brought_up_to_date(block, options.check) for block in _chosen(options)]
+    return int(not all(kept))
+
+
+def _brought_up_to_date(block: Block, only_check: bool) -> bool:
+    """Run one block and write it; with ``only_check`` say whether it is as it was. False too where a command fails."""
+    about = f"{block.page.name}: {block.commands[-1]}"
+    try:
         session, took_s = rerun(block)
-        other = differences(block.session, session)
-        stale += bool(other)
-        emit(f"{block.page.name}: {block.commands[-1]}: {_duration(took_s)}, " + ("; ".join(other) or "the same"))
-        if not options.check:
-            rewrite(block, session, took_s)
-    return int(bool(options.check and stale))
+    except VirestError as error:
+        console.report_error(error, about)
+        return False
+    other = differences(block.session, session)
+    console.emit(f"{about}: {_duration(took_s)}, " + ("; ".join(other) or "the same"))
+    if not only_check:
+        rewrite(block, session, took_s)
+    return not (only_check and other)
 
 
 if __name__ == "__main__":
