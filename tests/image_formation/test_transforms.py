@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from virest.image_formation import transforms
-from virest.image_formation.blur import FAST_SIZES
+from virest.image_formation.blur import FAST_SIZES, SpaceVariantBlur, tile_grid
 
 SIZES = [(4, 4), (8, 6), (64, 80), (128, 128), (192, 160)]
 
@@ -49,3 +49,16 @@ def test_a_round_trip_returns_the_picture_without_ipp(rng: np.random.Generator, 
     monkeypatch.setattr(cv2.ipp, "useIPP", lambda: False)
     picture = rng.normal(size=(192, 192)).astype(np.float32)
     np.testing.assert_allclose(transforms.inverse(transforms.forward(picture)), picture, atol=1e-5)
+
+
+def test_a_picture_is_blurred_alike_by_either_library(rng: np.random.Generator, monkeypatch) -> None:
+    """Spectra of kernels and tiles, products and the way back: rounding is all that differs."""
+    grid = tile_grid(210, 260, 128, 32)
+    kernels = rng.random((len(grid.centres_px), 11, 11)).astype(np.float32)
+    light = rng.random((220, 270)).astype(np.float32)
+    blurred = []
+    for ipp in (True, False):
+        monkeypatch.setattr(cv2.ipp, "useIPP", lambda ipp=ipp: ipp)
+        blurred.append(SpaceVariantBlur(grid, kernels).apply(light))
+    assert not np.array_equal(*blurred), "the same library ran twice"
+    np.testing.assert_allclose(*blurred, rtol=1e-5)
