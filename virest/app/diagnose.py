@@ -127,12 +127,22 @@ def find_diagnosis(path: Path, config: Path | None = None) -> Json:
 def _found_and_judged(source: Source, say: Progress, each: ParallelMap) -> tuple[Diagnosis, RestorationGain]:
     """What is wrong, and what mending it does to pictures that no fit has seen."""
     firsts = pairs_to_keep_back(source.capture, source.profile)
-    kept_back = [first + step for first in firsts for step in (0, 1)]
-    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, kept_back)
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, _of_pairs(firsts))
     say("restoring", LADDER_PART)
     profiles = found.nominal_profile, found.extended_profile
     gain = measure_restoration_gain(source.capture, *profiles, source.pictures, source.gray, each=each, firsts=firsts)
     return found, gain
+
+
+def _of_pairs(firsts: Collection[int]) -> list[int]:
+    """Both frames of each pair."""
+    return [first + step for first in firsts for step in (0, 1)]
+
+
+def climb_as_command(source: Source) -> Diagnosis:
+    """What `virest diagnose` finds: the frames that its restoration gain is measured on are kept back."""
+    kept_back = _of_pairs(pairs_to_keep_back(source.capture, source.profile))
+    return climb(source, lambda _stage, _part: None, kept_back=kept_back)
 
 
 def climb(

@@ -12,12 +12,11 @@ from typing import Any
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, run_process
 from virest.app.calibrate import plan_calibration
-from virest.app.diagnose import open_source
+from virest.app.diagnose import climb_as_command, open_source
 from virest.calibration.geometry import calibrate_geometry
 from virest.capture.video import GrayReader, probe_movie
 from virest.diagnosis.findings import Diagnosis
 from virest.diagnosis.geometric_ladder import shown
-from virest.diagnosis.ladder import diagnose_capture
 from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided
 
@@ -53,7 +52,8 @@ def _processed(folder: Path, work: Path) -> Row:
     """What became of the frames, by run.json."""
     run = run_process(folder, work / "real", "--preset", PRESET)
     account = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))
-    return [folder.name, str(len(run.lines)), *(str(account["counts"][name]) for name in COUNTED), account["verdict"]]
+    verdict = account["verdict"].partition(":")[0]
+    return [folder.name, str(len(run.lines)), *(str(account["counts"][name]) for name in COUNTED), verdict]
 
 
 def _calibrated(folder: Path, extra: tuple[str, ...]) -> list[Row]:
@@ -77,7 +77,7 @@ def _diagnosed(folder: Path, offset_s: float | None = None) -> list[Row]:
     profile, name = source.profile, folder.name
     if offset_s is not None:
         profile, name = replace(profile, time_offset_s=offset_s), f"{name}, offset given as {offset_s:g}"
-    return _rows(name, diagnose_capture(source.capture, profile, source.pictures, source.gray))
+    return _rows(name, climb_as_command(replace(source, profile=profile)))
 
 
 def _rows(name: str, found: Diagnosis) -> list[Row]:
