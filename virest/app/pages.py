@@ -34,7 +34,6 @@ from pathlib import Path
 
 from virest import __version__
 from virest.app import console
-from virest.app.bench.tables import table
 from virest.app.cli.options import cores
 from virest.app.doctor import processor
 from virest.app.outputs import write_whole
@@ -251,7 +250,7 @@ def _listing(found: list[Block]) -> str:
     rows = [[block.page.relative_to(ROOT).as_posix(), "-" if block.took_s is None else _duration(block.took_s),
              ", ".join(block.needs) or "-", block.version, block.commands[-1].splitlines()[0][:80]]
             for block in found]  # fmt: skip
-    return table(["page", "took", "needs", "virest", "command"], rows)
+    return console.table(["page", "took", "needs", "virest", "command"], rows, words=3)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
