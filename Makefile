@@ -3,13 +3,14 @@
 #   make test     all tests: the fast ones first, then the scenarios
 #   make bench    quality and speed tables; ARGS="--only speed --quick" for a part of them
 #   make lint     ruff and mypy
+#   make readme   run what README and docs show and write its output into them; ARGS="--list" lists the blocks
 #   make docs     the documentation as a site in site/, with the manual page virest.1; make figures draws its pictures anew
 #   make sample   write sample_data/ anew
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: demo test bench lint docs figures sample clean
+.PHONY: demo test bench lint readme docs figures sample clean
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   := .venv
@@ -36,6 +37,9 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy virest
+
+readme: $(READY)
+	$(BIN)/python -m virest.app.pages $(ARGS)
 
 docs: $(READY)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'

@@ -11,6 +11,7 @@ import yaml
 from documentation import DOCS, PAGES, README, ROOT, anchors, fences, links, name_of, prose, read, typed_lines
 from pydantic import BaseModel
 
+from virest.app import pages
 from virest.app.bench import __main__ as bench
 from virest.app.cli import app
 from virest.app.gallery import CASES
@@ -87,9 +88,12 @@ def test_every_command_named_in_the_text_exists(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_option_named_in_the_text_exists(page: Path) -> None:
-    """An option that a page names belongs to some command, to the program, or to the bench."""
+    """An option that a page names belongs to some command, to the program, to the bench, or to `make readme`."""
     known = options_of(PROGRAM) | OTHER_TOOLS | {"--help", "--version", "--install-completion", "--show-completion"}
-    known |= set(re.findall(r'add_argument\(\s*"(--[a-z-]+)"', Path(bench.__file__).read_text(encoding="utf-8")))
+    for tool in (bench, pages):
+        known |= set(
+            re.findall(r'add_argument\(\s*"(--[a-z-]+)"', Path(str(tool.__file__)).read_text(encoding="utf-8"))
+        )
     assert not set(re.findall(r"`(--[a-z][a-z-]*)", prose(page))) - known
 
 

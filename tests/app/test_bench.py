@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from virest.app.bench import __main__ as bench
-from virest.app.bench import commands, compare, growth, memory, peers, speed, summary
+from virest.app.bench import commands, compare, growth, memory, peers, quality, speed, summary
 from virest.app.bench.workload import (
     Run,
     Scale,
@@ -30,7 +30,7 @@ STAGE_S = {"decode": 0.01, "estimate": 0.002, "deblur": 0.05, "shutter": 0.02, "
 def line(deblur: str = "hyper-laplacian", shutter: str = "rowwise", **stages: float) -> Facts:
     """One frame's line of a log."""
     return {"status": "restored", "seconds": {**STAGE_S, **stages}, "deblur": {"method": deblur},
-            "shutter": {"method": shutter}}  # fmt: skip
+            "shutter": {"method": shutter}, "blur": {"length_px": 9.0}}  # fmt: skip
 
 
 def run(frames: int, wall_s: float, cpu_s: float, others_cores: float = 0.125, **of_line: Any) -> Run:
@@ -52,7 +52,8 @@ def speed_facts(**of_floor: Any) -> Facts:
     """Everything the section ``speed`` gives, at known figures: floor 25, fast 10, balanced 8 and best 0.2 frames/s."""
     floor = entry("floor", 0.04, 0.076, **{"deblur": "none", **of_floor})
     measured = [floor, entry("fast", 0.1, 0.19), entry("balanced", 0.125, 0.2), entry("best", 5.0, 9.5)]
-    return {"jobs": 2, "size": "720x1280", "planning_cpu_s": 3.0, **speed.judged(measured, 3.0),
+    return {"jobs": 2, "size": "720x1280", "content": "dead leaves", "blur_px": 9.0, "processor": "Z80",
+            "transforms": "OpenCV", "planning_cpu_s": 3.0, **speed.judged(measured, 3.0),
             "peers_s_per_frame": {"wiener": 0.5}, "peers_missing": {"deepinv wiener": peers.GET_DEEPINV}}  # fmt: skip
 
 
@@ -331,13 +332,12 @@ def test_a_busy_machine_is_judged_only_where_it_can_be(
     assert summary.judge(by_wall, by_cpu, others_cores, ratio=ratio) == said
 
 
-def test_the_summary_says_what_was_not_run() -> None:
-    """A section that is missing is named with the option that runs it; one that ran is not."""
+def test_the_summary_has_only_what_was_run() -> None:
+    """A section that did not run has no row; where nothing asked for anything ran, there is no summary."""
     text = summary.summary_text(report(memory=memory_facts()))
-    for section in ("speed", "growth", "commands"):
-        assert f"not run: --only {section}" in text
-    assert "not run: --only memory" not in text
     assert "260 MB" in text
+    assert "frames/s" not in text
+    assert summary.summary_text(report(shutter={"captures": []})) == ""
 
 
 def test_the_summary_names_peers_that_are_not_there() -> None:
@@ -462,8 +462,19 @@ def test_a_section_is_printed_kept_and_summed_up(
     bench.main(["--only", "commands", "--quick", "--out", str(tmp_path)])
     printed = capsys.readouterr().out
     assert printed.index("TOLD quick") < printed.index("SUMMARY") < printed.index("virest --help")
-    assert "not run: --only speed" in printed
     kept = json.loads((tmp_path / "bench.json").read_text())
     assert kept["commands"] == command_facts(0.2)
     assert {"virest", "commit", "python", "numpy", "deepinv", "processor", "load"} <= kept["versions"].keys()
     assert [path.name for path in tmp_path.iterdir()] == ["bench.json"]
+
+
+def test_the_quality_table_sums_up_only_kinds_of_several_captures() -> None:
+    """A kind with one capture has one row; the worst frames stand in a table of their own."""
+    gains = {method: 1.0 if method in quality.PRESETS else -1.0 for method in quality.METHODS}
+    frames = [("leaves", "ordinary"), ("phone-calm", "phone"), ("phone-fast", "phone")]
+    rows = [{"capture": name, "kind": kind, "frame": 0, "in_range": True, "straightened_db": 20.0,
+             "gain_db": {**gains, "fast": 0.25 + number}} for number, (name, kind) in enumerate(frames)]  # fmt: skip
+    means, worst = quality._text(quality.summarise(rows)).split("the same of the worst frame")
+    assert "ALL ordinary" not in means
+    assert means.splitlines()[-2].split()[-7:-5] == ["20.00", "+1.75"]
+    assert worst.splitlines()[-1].split()[-3:] == ["+1.25", "+1.00", "+1.00"]

@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from virest.app.cli import run
+
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 Edit = Callable[[Callable[[list[str]], list[str]]], None]
 FAST = ("--preset", "fast", "--jobs", "1")
@@ -80,6 +82,30 @@ def test_help_imports_nothing_heavy() -> None:
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] == "0 []"
     assert "process" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "usage"),
+    [
+        ("process", "[OPTIONS] CAPTURE..."),
+        ("evaluate shutter", "[OPTIONS] [CAPTURE]..."),
+        ("profile new", "[OPTIONS] [CAPTURE]"),
+        ("import", "[OPTIONS] BAG OUT"),
+    ],
+)
+def test_help_names_arguments_as_manual_pages_do(words: str, usage: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """NAME, [NAME] where it may be left out, NAME... where there may be several, and no Python types."""
+    assert run([*words.split(), "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert f"Usage: virest {words} {usage}\n" in shown
+    assert "<" not in shown.split("Arguments:")[1].split("Options:")[0]
+
+
+def test_help_of_a_group_cuts_no_description(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each command's line is whole on a terminal of 80 columns."""
+    for group in ([], ["evaluate"], ["profile"]):
+        run([*group, "--help"])
+        assert "..." not in capsys.readouterr().out.split("Commands:")[1]
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,15 @@ from motion.synthetic_tracks import Setup, recorded
 
 from virest.app.calibrate import _require_offset
 from virest.app.calibrate_curve import calibrate_curve
+from virest.app.process import _advice
 from virest.calibration.geometry import ROUGH_OFFSET_S, CalibratedValue, GeometryCalibration, _rough
-from virest.errors import CalibrationError, OutputError
+from virest.capture.detect import choose_reader
+from virest.errors import CalibrationError, CaptureError, OutputError
 from virest.inference.profile_terms import TIME_OFFSET
 from virest.inference.track_fit import TrackFit, fit_tracks
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.plan_notes import NoteCode
+from virest.restoration.settings import RestorationSettings
 
 
 def fit_of(recording) -> TrackFit:
@@ -57,3 +62,22 @@ def test_a_curve_that_exists_is_replaced_only_where_that_is_asked_for(tmp_path: 
         calibrate_curve(tmp_path / "nothing", out=out)
     assert "--overwrite" in (refused.value.hint or "")
     assert out.read_text() == "mine"
+
+
+def test_a_movie_that_follows_no_gyroscope_has_to_be_recorded_again() -> None:
+    """Of a stabilised movie no calibration makes more: the advice does not lead to a command that refuses it."""
+    unknown = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None)
+    plan = RestorationPlan(unknown, RestorationSettings())
+    assert "virest calibrate" in _advice(plan)
+    advice = _advice(plan.refused(NoteCode.NOT_FOLLOWING, "the pictures do not follow the gyroscope"))
+    assert "stabilisation off" in advice
+    assert "calibrate" not in advice
+
+
+def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
+    """And of another one the error says what it holds instead."""
+    with pytest.raises(CaptureError, match="; it is empty"):
+        choose_reader(tmp_path)
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(CaptureError, match=r"\(but notes.txt\)"):
+        choose_reader(tmp_path)

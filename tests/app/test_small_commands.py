@@ -41,17 +41,26 @@ def test_the_doctor_says_what_is_here(virest_here, monkeypatch: pytest.MonkeyPat
     facts = json.loads(done.stdout)
     assert facts["missing"] == []
     assert "h264" in facts["decoders"]
-    assert facts["transforms"].startswith("OpenCV")
+    assert facts["transforms"] in facts["tile_fft_s"]
+    assert min(facts["tile_fft_s"].values()) > 0
     monkeypatch.setattr(doctor, "NEEDED", (*doctor.NEEDED, "no-such-package"))
     _, text, code = doctor.examine()
     assert code == 1
     assert text.endswith("missing: no-such-package")
 
 
+def test_the_doctor_says_who_transforms_without_ipp(virest) -> None:
+    """Where OpenCV is told to do without IPP, the other library transforms, and a note says what that costs."""
+    facts = json.loads(virest("doctor", "--json", OPENCV_IPP="disabled").stdout)
+    assert facts["ipp"] is None
+    assert facts["transforms"] == "scipy's pocketfft"
+    assert any("IPP" in note for note in facts["notes"])
+
+
 def test_the_doctor_names_what_is_slow() -> None:
     """Few cores, little memory, a slow core: each with its reason."""
     facts = {"cores": 8, "memory_bytes": 1.5e9, "free_bytes_here": 1e9, "fft_s": 0.05, "vector_instructions": False,
-             "decoders": ["h264"], "transforms": doctor.OWN_TRANSFORMS}  # fmt: skip
+             "decoders": ["h264"], "ipp": None}  # fmt: skip
     notes = " ".join(doctor._notes(facts))
     for word in ("--jobs 4", "vector instructions", "5.0 times", "GB free", "HEVC", "IPP"):
         assert word in notes

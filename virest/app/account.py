@@ -17,6 +17,7 @@ from virest.app.planning import Job, ProcessOptions
 from virest.camera.profile import profile_mapping
 from virest.capture.location import is_remote, locate, read_each
 from virest.errors import VirestError
+from virest.image_formation import transforms
 from virest.restoration.capture import RestorationPlan
 
 PARTLY_FAILED = 9
@@ -68,6 +69,7 @@ def run_account(
     return {
         "virest_run": 1,
         "version": __version__,
+        "transforms": transforms.in_use(),
         "capture": job.name,
         "status": "done",
         "exit_code": PARTLY_FAILED if counts["failed"] else 0,
@@ -102,6 +104,7 @@ def failure_account(
     return {
         "virest_run": 1,
         "version": __version__,
+        "transforms": transforms.in_use(),
         "capture": name,
         "status": "failed",
         "exit_code": known.exit_code,

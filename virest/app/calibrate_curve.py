@@ -137,6 +137,11 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
+def _shown(value: float | list[float]) -> str:
+    """A number of a curve, or a point, to four digits; the file has all of them."""
+    return f"({', '.join(map(_shown, value))})" if isinstance(value, list) else f"{value:.4g}"
+
+
 def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
     """The result for people: one line for the curve, a table of the pictures, the notes."""
     rows = []
@@ -148,7 +153,7 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
     low, high = facts["covered_exposure"]
     block = dict(facts["response"])
     name = block.pop("kind")
-    numbers = ", ".join(f"{key} {value}" for key, value in block.items())
+    numbers = ", ".join(f"{key} {_shown(value)}" for key, value in block.items())
     shape = "" if name == "table" else numbers.removeprefix("gamma ")
     lines = [
         f"{name} {shape}".strip(),

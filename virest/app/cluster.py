@@ -20,6 +20,7 @@ from typing import Any
 from virest import __version__
 from virest.capture.location import is_remote
 from virest.errors import RestorationError, SettingsError
+from virest.image_formation import transforms
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +35,8 @@ TALKERS = ("distributed", "tornado", "asyncio")
 """Loggers that tell at length of a connection that was lost."""
 LIBRARIES = ("numpy", "opencv-python-headless", "av", "isal")
 """Those that decide the bytes of a picture."""
+TRANSFORMS = "transforms by"
+"""The library of tiles' Fourier transforms, which follows from OpenCV's build and the environment."""
 
 
 def is_lost(error: BaseException) -> bool:
@@ -43,7 +46,7 @@ def is_lost(error: BaseException) -> bool:
 
 def worker_facts() -> dict[str, str]:
     """What is installed where this is called."""
-    return {"virest": __version__, **{name: version(name) for name in LIBRARIES}}
+    return {"virest": __version__, **{name: version(name) for name in LIBRARIES}, TRANSFORMS: transforms.in_use()}
 
 
 def missing_places(places: list[str]) -> list[str]:
@@ -162,7 +165,11 @@ class ClusterExecutor(Executor):
                     f"{ours['virest']}",
                     hint="install the same version everywhere",
                 )
-            other = [f"{name} {theirs[name]}, here {ours[name]}" for name in LIBRARIES if theirs[name] != ours[name]]
+            other = [
+                f"{name} {theirs[name]}, here {ours[name]}"
+                for name in (*LIBRARIES, TRANSFORMS)
+                if theirs[name] != ours[name]
+            ]
             if other:
                 log.warning("the worker %s has %s: bytes may differ from a local run", worker, "; ".join(other))
 

@@ -127,12 +127,22 @@ def find_diagnosis(path: Path, config: Path | None = None) -> Json:
 def _found_and_judged(source: Source, say: Progress, each: ParallelMap) -> tuple[Diagnosis, RestorationGain]:
     """What is wrong, and what mending it does to pictures that no fit has seen."""
     firsts = pairs_to_keep_back(source.capture, source.profile)
-    kept_back = [first + step for first in firsts for step in (0, 1)]
-    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, kept_back)
+    found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, _of_pairs(firsts))
     say("restoring", LADDER_PART)
     profiles = found.nominal_profile, found.extended_profile
     gain = measure_restoration_gain(source.capture, *profiles, source.pictures, source.gray, each=each, firsts=firsts)
     return found, gain
+
+
+def _of_pairs(firsts: Collection[int]) -> list[int]:
+    """Both frames of each pair."""
+    return [first + step for first in firsts for step in (0, 1)]
+
+
+def climb_as_command(source: Source) -> Diagnosis:
+    """What `virest diagnose` finds: the frames that its restoration gain is measured on are kept back."""
+    kept_back = _of_pairs(pairs_to_keep_back(source.capture, source.profile))
+    return climb(source, lambda _stage, _part: None, kept_back=kept_back)
 
 
 def climb(
@@ -416,9 +426,9 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
         f"{residual_words(nominal.geometry_rms_px, nominal.geometry_noise_px)}"
     ]
     if found.causes:
-        header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain", "held out", "rivals"]
-        lines.append(table(header, [row for cause in found.causes for row in _rows(cause)]))
-        lines += [f"{cause.name}: {_one_line(cause.sentence)}" for cause in found.causes]
+        header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain"]
+        lines.append(table(header, [row for cause in found.causes for row in _rows(cause)], words=0))
+        lines += [line for cause in found.causes for line in _sentences(cause)]
     for field in found.fields:
         lines.append(f"field: {_one_line(field.sentence)}")
         lines.append(f"  likely: {field.reasons}; to tell: {field.next}")
@@ -428,16 +438,21 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -
     return "\n".join([*lines, f"verdict: {found.verdict}"])
 
 
+def _sentences(cause: Finding) -> list[str]:
+    """The cause in words with the error that it was judged by, and what would explain as much."""
+    rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals)
+    told = f"{cause.name}: {_one_line(cause.sentence)} (held-out {cause.held_out.quantity})"
+    return [told, f"  as good an explanation: {rivals}"] if rivals else [told]
+
+
 def _rows(cause: Finding) -> list[list[str]]:
     """A row for each number or word that changed; what the cause gains stands on its first."""
     held_out = cause.held_out
     gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
-    judged = [_number(held_out.before), _number(held_out.after), gain, held_out.quantity]
-    rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals) or "-"
-    first = [cause.name, [*judged, rivals]]
+    judged = [_number(held_out.before), _number(held_out.after), gain]
     values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
     return [
-        [str(first[0]) if k == 0 else "", *value, *(first[1] if k == 0 else [""] * 5)]
+        [cause.name if k == 0 else "", *value, *(judged if k == 0 else [""] * len(judged))]
         for k, value in enumerate(values or [["-"] * 4])
     ]
 

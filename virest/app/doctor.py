@@ -9,10 +9,13 @@ import time
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from virest import __version__
 from virest.app.cli.options import cores
+
+if TYPE_CHECKING:
+    from virest.image_formation.transforms import Transform
 
 Json = dict[str, Any]
 NEEDED = ("numpy", "scipy", "opencv-python-headless", "av", "isal", "pandas", "pydantic", "PyYAML", "typer", "tqdm",
@@ -23,8 +26,8 @@ EXTRAS = {
     "telemetry": ("telemetry-parser",),
     "rosbags": ("rosbags",),
 }
-OWN_TRANSFORMS = "OpenCV's own code"
-"""Four times as long for a tile of 128 to 512 px as with IPP, on one core of a server (x86-64, AVX-512)."""
+TILE_PX, TILE_TRANSFORMS = 192, 40
+"""Side of the tile whose transforms are timed, and how many are timed together."""
 DECODERS, ENCODER = ("h264", "hevc", "vp9", "av1"), "libx264"
 PER_WORKER_BYTES = 300e6
 """Peak of a worker at 720x1280 (`python -m virest.app.bench --only memory`)."""
@@ -40,6 +43,7 @@ def examine() -> tuple[Json, str, int]:
         "system": f"{platform.system()} {platform.machine()}",
         "packages": {name: _version(name) for name in NEEDED},
         "extras": {name: all(_version(package) for package in packages) for name, packages in EXTRAS.items()},
+        "processor": processor(),
         "cores": cores(),
         "memory_bytes": _memory_bytes(),
         "free_bytes_here": shutil.disk_usage(Path.cwd()).free,
@@ -77,6 +81,8 @@ def _abilities() -> Json:
     import cv2
     import numpy as np
 
+    from virest.image_formation import transforms
+
     picture = np.random.default_rng(1).random((1280, 720), dtype=np.float32)
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -90,9 +96,39 @@ def _abilities() -> Json:
         "decoders": [name for name in DECODERS if name in av.codecs_available],
         "encoder": ENCODER if ENCODER in av.codecs_available else None,
         "vector_instructions": bool(cv2.useOptimized()),
-        "transforms": f"OpenCV with {cv2.ipp.getIppVersion()}" if cv2.ipp.useIPP() else OWN_TRANSFORMS,
+        "transforms": transforms.library(TILE_PX, TILE_PX),
+        "ipp": cv2.ipp.getIppVersion() if cv2.ipp.useIPP() else None,
+        "tile_fft_s": {
+            transforms.OPENCV: _tile_s(transforms.opencv_forward, transforms.opencv_inverse),
+            transforms.POCKETFFT: _tile_s(transforms.pocketfft_forward, transforms.pocketfft_inverse),
+        },
         "fft_s": round(min(times), 5),
     }
+
+
+def _tile_s(forward: Transform, inverse: Transform) -> float:
+    """CPU seconds of one tile there and back, with one library: the least of five tries."""
+    import numpy as np
+
+    tile = np.random.default_rng(1).random((TILE_PX, TILE_PX), dtype=np.float32)
+    spectrum, back = np.empty((2, TILE_PX, TILE_PX), np.float32)
+    times = []
+    for _ in range(5):
+        began = time.process_time()
+        for _ in range(TILE_TRANSFORMS):
+            inverse(forward(tile, spectrum), back)
+        times.append(time.process_time() - began)
+    return round(min(times) / TILE_TRANSFORMS, 7)
+
+
+def processor() -> str | None:
+    """The processor's name as Linux, or else Python, tells it; None where neither does."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or None
 
 
 def _notes(facts: Json) -> list[str]:
@@ -108,10 +144,10 @@ def _notes(facts: Json) -> list[str]:
         )
     if not facts.get("vector_instructions", True):
         notes.append("OpenCV runs without vector instructions: deblurring takes several times as long; reinstall it")
-    if facts.get("transforms") == OWN_TRANSFORMS:
+    if "ipp" in facts and facts["ipp"] is None:
         notes.append(
-            "OpenCV transforms without Intel's IPP (not in its build for this processor, or switched off): a tile's "
-            "Fourier transform takes about four times as long, deblurring accordingly"
+            "OpenCV transforms without Intel's IPP (not in its build for this processor, or switched off): deblurring "
+            "takes up to half as long again"
         )
     if facts.get("fft_s", 0.0) > 2 * USUAL_FFT_S:
         times = facts["fft_s"] / USUAL_FFT_S
@@ -133,12 +169,15 @@ def _describe(facts: Json) -> str:
         f"virest {facts['virest']}, Python {facts['python']}, {facts['system']}",
         f"packages  {packages}",
         f"extras    {extras}; pip install 'virest[NAME]' adds one",
-        f"machine   {facts['cores']} cores, {memory} of memory, {facts['free_bytes_here'] / 1e9:.1f} GB free here",
+        f"machine   {facts['processor'] or 'unknown processor'}, {facts['cores']} cores, {memory} of memory, "
+        f"{facts['free_bytes_here'] / 1e9:.1f} GB free here",
     ]
     if "decoders" in facts:
         lines.append(f"codecs    reads {', '.join(facts['decoders'])}; writes {facts['encoder'] or 'no H.264'}")
         lines.append(f"speed     Fourier transform of 720x1280 in {1e3 * facts['fft_s']:.1f} ms on one core")
-        lines.append(f"          transforms by {facts['transforms']}")
+        tiles = ", ".join(f"{1e6 * seconds:.0f} µs by {name}" for name, seconds in facts["tile_fft_s"].items())
+        lines.append(f"          a tile of {TILE_PX} px there and back: {tiles} (CPU time)")
+        lines.append(f"          frames are transformed by {facts['transforms']} ({facts['ipp'] or 'no IPP'})")
     lines += [f"note: {note}" for note in facts["notes"]]
     missing = ", ".join(facts["missing"])
     return "\n".join([*lines, f"missing: {missing}" if missing else "everything that virest needs is here"])

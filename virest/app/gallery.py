@@ -27,7 +27,7 @@ EVIDENCE = {
     GEOMETRY: "tracked points",
     PHOTOMETRY: "brightness along tracks",
     BLUR: "blur of image regions",
-    EDGES: "edges",
+    EDGES: "isolated edges",
 }
 
 
@@ -84,8 +84,12 @@ def write_gallery(docs: Path, names: Sequence[str]) -> None:
             results[name] = _draw_case(name, Path(work) / name, images)
             write_whole(kept, (json.dumps(results, indent=1, sort_keys=True, ensure_ascii=False) + "\n").encode())
             emit(f"gallery: {name}: {results[name]['verdict']}")
-    page = HEAD + "\n".join(_section(name, results[name]) for name in CASES if name in results)
-    write_whole(docs / "gallery.md", page.encode())
+    write_whole(docs / "gallery.md", gallery_page(results).encode())
+
+
+def gallery_page(results: dict[str, Any]) -> str:
+    """The page of the effects that were drawn; results: by name, as images/gallery/results.json keeps them."""
+    return HEAD + "\n".join(_section(name, results[name]) for name in CASES if name in results)
 
 
 HEAD = f"""<!-- Written by `make figures`; edit virest/app/gallery.py instead. -->

@@ -42,6 +42,7 @@ from virest.capture.location import locate
 from virest.capture.video import MovieIndex
 from virest.errors import CaptureError, OutputError, SettingsError, VirestError
 from virest.restoration.capture import RestorationPlan
+from virest.restoration.plan_notes import NoteCode
 
 log = logging.getLogger(__name__)
 
@@ -234,7 +235,7 @@ def _run(
     finish_run(job.run, logs, account, finished.changed if options.finish.any else None)
     if options.json_lines and not at_once:
         _emit_lines(job.run)
-    _warn_about(job.name, account["counts"], len(job.selected))
+    _warn_about(job.name, account["counts"], len(job.selected), plan.copy_reason)
     return CaptureOutcome(
         job.name,
         job.path,
@@ -315,14 +316,15 @@ def _leave_account(
         log.warning("%s: this failure leaves no account: %s", shown(turn.name), shown(str(fault)))
 
 
-def _warn_about(name: str, counts: dict[str, int], selected: int) -> None:
+def _warn_about(name: str, counts: dict[str, int], selected: int, copy_reason: str | None) -> None:
+    """What a user must know of the frames, unless planning said it (``copy_reason``)."""
     if not selected:
         log.warning("%s: --frames selects no frame of this movie", name)
     elif counts["failed"]:
         log.warning(
             "%s: %d of %d frames failed; their lines in parameters.jsonl say why", name, counts["failed"], selected
         )
-    elif not counts["restored"]:
+    elif not counts["restored"] and copy_reason is None:
         log.warning(
             "%s: no frame was restored: %d copied, %d skipped; parameters.jsonl says why",
             name,
@@ -342,6 +344,8 @@ def _repeat_finished(job: Job, options: ProcessOptions) -> CaptureOutcome:
 
 def _advice(plan: RestorationPlan) -> str:
     """The command that would make more of a capture whose profile is unknown, or contradicted by the frames."""
+    if plan.refuses(NoteCode.NOT_FOLLOWING):
+        return "record again with electronic stabilisation off; virest inspect CAPTURE lists what this recording holds"
     if plan.contradicted is not None:
         return "the frames contradict the profile: virest diagnose CAPTURE, then process with --config extended.yaml"
     unknown = [

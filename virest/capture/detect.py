@@ -61,8 +61,8 @@ def choose_reader(folder: Path) -> Reader:
         return reader
     if is_bag(folder):
         raise CaptureError(f"{folder.name}: is a ROS 2 bag", hint="unpack it first: virest import BAG FOLDER")
-    shown = ", ".join(names[:6]) or "nothing"
-    text = f"{folder.name}: holds no {MOVIE} and no {GYRO} (but {shown})"
+    instead = f" (but {', '.join(names[:6])})" if names else "; it is empty"
+    text = f"{folder.name}: holds no {MOVIE} and no {GYRO}{instead}"
     raise CaptureError(text, hint=HINT)
 
 

@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.image_formation import transforms
+
 Image = NDArray[np.float32]
 FAST_SIZES = (64, 80, 96, 128, 144, 160, 176, 192, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
 
@@ -138,10 +140,10 @@ class SpaceVariantBlur:
     def _spectrum(self, kernel: Image) -> Image:
         buffer = np.zeros((self._size, self._size), np.float32)
         buffer[: kernel.shape[0], : kernel.shape[1]] = kernel
-        return cv2.dft(buffer)
+        return transforms.forward(buffer)
 
     def _correlate(self, buffer: Image, spectrum: Image, conjugate: bool) -> Image:
         """Good until the next."""
-        transformed = cv2.dft(buffer, self._transformed)
+        transformed = transforms.forward(buffer, self._transformed)
         product = cv2.mulSpectrums(transformed, spectrum, 0, transformed, conjB=conjugate)
-        return cv2.idft(product, self._moved, flags=cv2.DFT_SCALE)
+        return transforms.inverse(product, self._moved)

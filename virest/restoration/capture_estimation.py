@@ -21,6 +21,7 @@ from virest.image_formation.row_motion import FrameTranslation, frame_times_s
 from virest.inference.alignment import (
     AGREEMENT_SLACK_S,
     COARSE_STEP_S,
+    MIN_EXPLAINED,
     OffsetEstimate,
     check_agreement,
     choose_pairs,
@@ -176,7 +177,7 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     if np.any(np.abs(values) > 3 * spread):
         held = tuple(float(value) for value in values)
         profile = profile.with_estimate("gyro_bias_rad_s", list(held), spread.tolist(), source, gyro_bias_rad_s=held)
-    plan = replace(plan.without(NoteCode.TIME_OFFSET), profile=profile)
+    plan = replace(plan.without(NoteCode.TIME_OFFSET).without(NoteCode.NOT_FOLLOWING), profile=profile)
     return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
 
 
@@ -395,8 +396,11 @@ def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> 
         return plan
     if not estimate.determined:
         plan = plan.noted(NoteCode.TIME_OFFSET, f"time offset not determined ({estimate.reason})")
-        refused = plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")
-        return plan if plan.refusal else refused
+        if plan.refusal:
+            return plan
+        if estimate.explained < MIN_EXPLAINED:
+            return plan.refused(NoteCode.NOT_FOLLOWING, "the pictures do not follow the gyroscope")
+        return plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")
     offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
     profile = plan.profile.with_estimate(
         "time_offset_s", offset_s, estimate.std_s, "tracked points against the gyroscope", time_offset_s=offset_s

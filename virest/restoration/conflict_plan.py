@@ -60,7 +60,7 @@ def settle(
     if offset_known:
         plan = replace(plan, profile=found.profile, refusal=None)
         return plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_rest(found)), followed
-    open_yet = plan.refuses(NoteCode.TIME_OFFSET, NoteCode.FOCAL_LENGTH)
+    open_yet = plan.refuses(NoteCode.TIME_OFFSET, NoteCode.NOT_FOLLOWING, NoteCode.FOCAL_LENGTH)
     if not found.taken and not (followed and (open_yet or found.contradicted)):
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     return _with_open_values(plan, found), followed

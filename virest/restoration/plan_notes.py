@@ -13,6 +13,8 @@ class NoteCode(Enum):
     """A value that the profile leaves open is the documented default."""
     TIME_OFFSET = auto()
     """The offset that the profile leaves open: estimated, or why not."""
+    NOT_FOLLOWING = auto()
+    """At no offset does the gyroscope explain half of the rotation: stabilised in the camera, or another log."""
     OTHER_OFFSET = auto()
     """The frames contradict a stated offset."""
     FOCAL_LENGTH = auto()

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.image_formation import transforms
 from virest.image_formation.blur import FAST_SIZES, Image, TileGrid, fast_size, tile_grid
 from virest.restoration.deconvolution import richardson_lucy
 
@@ -95,7 +96,7 @@ class TileDeconvolution:
         for number, (top, left) in enumerate(self.grid.corners()):
             spectrum = self._without_highlights.get(number)
             if spectrum is None:
-                spectrum = cv2.dft(self.periodic(padded, top, left), self._spectrum)
+                spectrum = transforms.forward(self.periodic(padded, top, left), self._spectrum)
             inner = _inner_numbers(projected[number])
             np.multiply(_inner_numbers(spectrum), _inner_numbers(self.kernels[number]), out=inner)
             ends[number] = _ends(spectrum)
@@ -118,7 +119,10 @@ class TileDeconvolution:
         one, back = np.empty((2, self.size, self.size), np.float32)
         for number, kernel in zip(used.tolist(), _kernel_spectra(kernels[used], self.size), strict=True):
             for plane, joined in zip(padded, self._joined, strict=True):
-                spectrum, weight = cv2.dft(self.periodic(plane, *corners[number]), self._spectrum), weights[number]
+                spectrum, weight = (
+                    transforms.forward(self.periodic(plane, *corners[number]), self._spectrum),
+                    weights[number],
+                )
                 np.multiply(_inner_numbers(spectrum), _inner_numbers(kernel), out=_inner_numbers(back))
                 _ends(back)[:] = _ends_product(np.array(_ends(spectrum)), np.array(_ends(kernel)))
                 cv2.scaleAdd(cv2.multiply(back, sharpness, back), weight, joined[number], joined[number])
@@ -169,7 +173,9 @@ class TileDeconvolution:
             lamp = cv2.subtract(found, rest)
             blurred_rest, blurred_lamp = (_through(part, self.kernels[number], True) for part in (rest, lamp))
             left_over = recorded - blurred_lamp - blurred_rest
-            self._without_highlights[number] = cv2.dft(cv2.add(blurred_rest, cv2.multiply(measured, left_over)))
+            self._without_highlights[number] = transforms.forward(
+                cv2.add(blurred_rest, cv2.multiply(measured, left_over))
+            )
             near = cv2.max(_through(blurred_lamp, self.kernels[number], False), 0.0)
             share = near / (near + np.float32(LAMP_DOUBT * top_light))
             inner = np.s_[margin : margin + self.grid.side, margin : margin + self.grid.side]
@@ -197,7 +203,7 @@ class TileDeconvolution:
         """Spectrum of each tile of a channel (height, width)."""
         padded = self.padded(channel)
         for top, left in self.grid.corners():
-            yield cv2.dft(self.periodic(padded, top, left))
+            yield transforms.forward(self.periodic(padded, top, left))
 
     def solutions(self, projected: Iterable[Image], inner: Image, at_border: Image) -> Iterator[Image]:
         """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border.
@@ -217,7 +223,7 @@ class TileDeconvolution:
         tile, spectrum = np.zeros_like(self._tile), self._spectrum
         for (top, left), back, border in zip(self.grid.corners(), projected, self.at_border, strict=True):
             tile[:patch, :patch] = padded[top : top + patch, left : left + patch]
-            cv2.dft(tile, spectrum)
+            transforms.forward(tile, spectrum)
             yield cv2.scaleAdd(spectrum, at_border if border else inner, back, spectrum)
 
     def blend(self, spectra: Iterable[Image]) -> Image:
@@ -226,7 +232,7 @@ class TileDeconvolution:
         result = np.zeros((grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
         tile = self._tile
         for (top, left), window, spectrum in zip(grid.corners(), self._windows, spectra, strict=True):
-            cv2.idft(spectrum, tile, flags=cv2.DFT_SCALE)
+            transforms.inverse(spectrum, tile)
             inner = tile[margin : margin + side, margin : margin + side]
             cv2.accumulateProduct(inner, window, result[top : top + side, left : left + side])
         return result[: grid.height, : grid.width]
@@ -261,7 +267,7 @@ def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
 
 def _through(picture: Image, kernel: Image, forward: bool) -> Image:
     """A periodic tile blurred by a kernel's spectrum, or with ``forward`` False, by its transpose."""
-    return cv2.idft(cv2.mulSpectrums(cv2.dft(picture), kernel, 0, conjB=forward), flags=cv2.DFT_SCALE)
+    return transforms.inverse(cv2.mulSpectrums(transforms.forward(picture), kernel, 0, conjB=forward))
 
 
 @lru_cache(maxsize=64)
@@ -295,7 +301,7 @@ def _kernel_spectra(kernels: Image, size: int, into: Iterable[Image] | None = No
         buffer[: radius + 1, size - radius :] = kernel[radius:, :radius]
         buffer[size - radius :, : radius + 1] = kernel[:radius, radius:]
         buffer[size - radius :, size - radius :] = kernel[:radius, :radius]
-        yield cv2.dft(buffer, spectrum)
+        yield transforms.forward(buffer, spectrum)
 
 
 def _bridge(length: int) -> Image:

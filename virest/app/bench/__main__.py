@@ -40,6 +40,7 @@ from virest.app.bench.speed import speed_section
 from virest.app.bench.summary import summary_text
 from virest.app.bench.workload import PRESETS, Scale
 from virest.app.console import emit
+from virest.app.doctor import processor
 
 Section = Callable[[Path, Scale], tuple[dict[str, Any], str]]
 SECTIONS: dict[str, Section] = {
@@ -75,11 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
     work = options.keep or Path(tempfile.mkdtemp(prefix="work-", dir=options.out))
     try:
-        for name in options.only or SECTIONS:
+        for number, name in enumerate(options.only or SECTIONS):
             report[name], text = SECTIONS[name](work, scale)
-            emit(text + "\n")
+            emit("\n" * bool(number) + text)
             _write(options.out / "bench.json", report)
-        emit(summary_text(report))
+        if closing := summary_text(report):
+            emit("\n" + closing)
     finally:
         if work != options.keep:
             shutil.rmtree(work, ignore_errors=True)
@@ -104,7 +106,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _versions() -> dict[str, Any]:
     libraries = {name: _version(name) for name in LIBRARIES}
-    machine = {"machine": platform.machine(), "processor": _processor(), "cores": len(os.sched_getaffinity(0))}
+    machine = {"machine": platform.machine(), "processor": processor(), "cores": len(os.sched_getaffinity(0))}
     program = {"virest": __version__, "commit": _commit(), "python": platform.python_version()}
     return {**program, **libraries, **machine, "load": os.getloadavg()[0]}
 
@@ -123,15 +125,6 @@ def _commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def _processor() -> str | None:
-    """The model's name as Linux tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return None
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), None)
 
 
 def _write(path: Path, report: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What ten thousand captures of five minutes cost, from the frames a second that the section ``speed`` measured.
+"""What ten thousand captures of five minutes cost, from the CPU times that the section ``speed`` measured.
 
 $ python -m virest.app.bench --only speed --only cost
 """
@@ -37,12 +37,12 @@ def cost_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def _measured(path: Path) -> dict[str, float]:
-    """Frames a second of each preset with JOBS processes."""
+    """Frames a second of each preset with JOBS processes, by CPU time: core hours are paid, waiting is not."""
     if not path.is_file():
         return {}
     report = json.loads(path.read_text(encoding="utf-8"))
     presets = report.get("speed", {}).get("presets", [])
-    return {entry["preset"]: entry["frames_per_s"] or entry["frames_per_s_by_cpu"] for entry in presets}
+    return {entry["preset"]: entry["frames_per_s_by_cpu"] for entry in presets}
 
 
 def _bytes_per_frame(work: Path) -> tuple[float, float]:

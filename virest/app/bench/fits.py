@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, Workload, honesty_workloads, simulated
-from virest.app.console import emit
+from virest.app.console import CONSOLE
 from virest.app.evaluation_captures import TrueCapture, open_true_capture
 from virest.evaluation.fidelity import psnr_db
 from virest.restoration.capture import RestorationPlan
@@ -66,7 +66,7 @@ def fits_section(work: Path, scale: Scale) -> tuple[Row, str]:
         rows += list(_promises(truth, plan, workload, straight_db))
         for swept in SWEPT:
             gains[swept.name].append(_swept_gains(truth, plan, swept, straight_db))
-        emit(f"{workload.name}: {len(straight_db)} frames")
+        CONSOLE.line(f"{workload.name}: {len(straight_db)} frames")
     promise = fit_left_over(rows)
     best = {swept.name: best_value(swept.values, np.array(gains[swept.name])) for swept in SWEPT}
     facts = {"left_over": promise, "swept": best, "frames": rows}

@@ -19,10 +19,12 @@ from virest.app.bench.workload import (
     simulated,
     truth_frame,
 )
-from virest.app.console import emit
+from virest.app.console import CONSOLE
 from virest.evaluation.fidelity import psnr_db
 
 METHODS = (*PRESETS, *PEERS)
+SHORT = {"unsupervised_wiener": "unsup. wiener", "richardson_lucy": "rich.-lucy"}
+"""Heads of columns."""
 KIND_TITLES = {
     "ordinary": "ordinary: 5-20 px",
     "photographs": "photographs: 5-20 px",
@@ -40,7 +42,7 @@ def quality_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         found = measure_workload(work, workload)
         rows += found
         means = {m: np.mean([row["gain_db"][m] for row in found]) for m in METHODS}
-        emit(f"{workload.name}: " + ", ".join(f"{method} {mean:+.2f}" for method, mean in means.items()))
+        CONSOLE.line(f"{workload.name}: " + ", ".join(f"{method} {mean:+.2f}" for method, mean in means.items()))
     summary = summarise(rows)
     return {"frames": rows, "summary": summary}, _text(summary)
 
@@ -105,18 +107,23 @@ def _summary(kind: str, name: str | None, rows: list[dict[str, Any]]) -> dict[st
 
 
 def _text(summary: list[dict[str, Any]]) -> str:
-    header = ["capture", "frames", "straight dB", *METHODS, *(f"min {preset}" for preset in PRESETS)]
-    rows = []
-    for entry in summary:
+    """Means and minima; a kind's own rows only where it has several captures."""
+    several = {kind for kind in KIND_TITLES if sum(entry["kind"] == kind for entry in summary) > 2}
+    shown = [entry for entry in summary if entry["capture"] or entry["kind"] in several]
+    means, minima = [], []
+    for entry in shown:
         name = entry["capture"] or f"ALL {KIND_TITLES[entry['kind']]}"
-        means = [_decibels(entry["mean_gain_db"][method]) for method in METHODS]
-        minima = [_decibels(entry["min_gain_db"][preset]) for preset in PRESETS]
         straight = "-" if entry["straightened_db"] is None else f"{entry['straightened_db']:.2f}"
-        rows.append([name, f"{entry['frames']}/{entry['of']}", straight, *means, *minima])
+        gains = [_decibels(entry["mean_gain_db"][method]) for method in METHODS]
+        means.append([name, f"{entry['frames']}/{entry['of']}", straight, *gains])
+        minima.append([name, str(entry["of"]), *(_decibels(entry["min_gain_db"][preset]) for preset in PRESETS)])
     return (
         "QUALITY: mean PSNR gain in dB over straightening alone, inside valid_px less 16 px\n"
-        "(mean over the frames whose blur is in range; min over all frames; peers: true centre kernel, linear light,\n"
-        " blended border, same warp, best setting for each frame by PSNR against truth)\n" + table(header, rows)
+        "(over the frames whose blur is in range; peers: true centre kernel, linear light,\n"
+        " blended border, same warp, best setting for each frame by PSNR against truth)\n"
+        + table(["capture", "frames", "straight dB", *(SHORT.get(method, method) for method in METHODS)], means)
+        + "\n\nthe same of the worst frame, whatever its blur\n"
+        + table(["capture", "of", *PRESETS], minima)
     )
 
 

@@ -1,7 +1,8 @@
-"""Measured captures (the folder named by VIREST_REALDATA): what calibrate and diagnose say of them."""
+"""Measured captures (the folder named by VIREST_REALDATA): what process, calibrate and diagnose say of them."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 from dataclasses import replace
@@ -9,39 +10,50 @@ from pathlib import Path
 from typing import Any
 
 from virest.app.bench.tables import table
-from virest.app.bench.workload import Scale
+from virest.app.bench.workload import Scale, run_process
 from virest.app.calibrate import plan_calibration
-from virest.app.diagnose import open_source
+from virest.app.diagnose import climb_as_command, open_source
 from virest.calibration.geometry import calibrate_geometry
 from virest.capture.video import GrayReader, probe_movie
 from virest.diagnosis.findings import Diagnosis
 from virest.diagnosis.geometric_ladder import shown
-from virest.diagnosis.ladder import diagnose_capture
 from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided
 
 log = logging.getLogger(__name__)
 
+PROCESSED = ("lhaippp_car", "honor_v10", "nexus5_162941", "gopro_karma", "gopro_hero7")
 CALIBRATED = {"lhaippp_car": (), "nexus5_162941": ("clock-skew",), "gopro_karma": (), "gopro_hero7": ()}
 DIAGNOSED = ("lhaippp_car", "nexus5_162941", "honor_v10", "gopro_hero7")
+PRESET, COUNTED = "fast", ("deblurred", "straightened", "copied", "skipped", "failed")
 ON_TIME = ("nexus5_162941",)
 """Whose unknown offset is also given as 0, for the diagnosis to find."""
 Row = list[str]
 
 
-def real_section(_work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
-    """Calibrate and diagnose the captures that are there."""
+def real_section(work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
+    """Process, calibrate and diagnose the captures that are there."""
     root = Path(os.environ.get("VIREST_REALDATA") or "/nonexistent")
     if not root.is_dir():
         return {
             "skipped": "VIREST_REALDATA names no folder"
         }, "Measured captures: skipped, VIREST_REALDATA names no folder"
+    processed = [_processed(root / name, work) for name in PROCESSED]
     calibrated = [row for name, extra in CALIBRATED.items() for row in _calibrated(root / name, extra)]
     diagnosed = [row for name in DIAGNOSED for row in _diagnosed(root / name)]
     diagnosed += [row for name in ON_TIME for row in _diagnosed(root / name, offset_s=0.0)]
-    text = table(["calibrate", "value", "found", "std", "determined"], calibrated)
+    text = table(["process", "frames", *COUNTED, "verdict"], processed)
+    text += "\n\n" + table(["calibrate", "value", "found", "std", "determined"], calibrated)
     text += "\n\n" + table(["diagnose", "verdict", "cause", "found", "std", "before", "after", "rivals"], diagnosed)
-    return {"calibrate": calibrated, "diagnose": diagnosed}, f"Measured captures\n{text}"
+    return {"process": processed, "calibrate": calibrated, "diagnose": diagnosed}, f"Measured captures\n{text}"
+
+
+def _processed(folder: Path, work: Path) -> Row:
+    """What became of the frames, by run.json."""
+    run = run_process(folder, work / "real", "--preset", PRESET)
+    account = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))
+    verdict = account["verdict"].partition(":")[0]
+    return [folder.name, str(len(run.lines)), *(str(account["counts"][name]) for name in COUNTED), verdict]
 
 
 def _calibrated(folder: Path, extra: tuple[str, ...]) -> list[Row]:
@@ -65,7 +77,7 @@ def _diagnosed(folder: Path, offset_s: float | None = None) -> list[Row]:
     profile, name = source.profile, folder.name
     if offset_s is not None:
         profile, name = replace(profile, time_offset_s=offset_s), f"{name}, offset given as {offset_s:g}"
-    return _rows(name, diagnose_capture(source.capture, profile, source.pictures, source.gray))
+    return _rows(name, climb_as_command(replace(source, profile=profile)))
 
 
 def _rows(name: str, found: Diagnosis) -> list[Row]:

@@ -26,9 +26,11 @@ from virest.app.bench.peers import (
 )
 from virest.app.bench.tables import table
 from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process
+from virest.app.doctor import processor
 from virest.app.jobs import prepare_worker
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_gray
+from virest.image_formation import transforms
 from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.settings import PRESETS as SETTINGS
 
@@ -49,6 +51,8 @@ CAPTURE_S, FPS = 30.0, 30.0
 """Length of the capture of which the share of estimation, planning included, is told."""
 LEAST_S = 1e-5
 """A stage that takes less has nothing to do."""
+CONTENT = "dead leaves"
+"""What the looped capture shows: the simulator's default scene."""
 Facts = dict[str, Any]
 
 
@@ -62,6 +66,10 @@ def speed_section(work: Path, scale: Scale) -> tuple[Facts, str]:
     facts = {
         "jobs": JOBS,
         "size": "720x1280",
+        "content": CONTENT,
+        "blur_px": measured[0]["blur_px"],
+        "processor": processor() or "unknown processor",
+        "transforms": transforms.in_use(),
         "planning_cpu_s": planning_s,
         **judged(measured, planning_s),
         "peers_s_per_frame": peers,
@@ -107,6 +115,9 @@ def per_frame(shorter: Run, longer: Run, frames: int) -> Facts:
         "frames": [len(shorter.lines), len(longer.lines)],
         "wall_s": [shorter.wall_s, longer.wall_s],
         "s_per_frame": wall_s,
+        "blur_px": float(
+            np.median([line["blur"]["length_px"] for line in longer.lines if line["status"] != "skipped"])
+        ),
         "frames_per_s": over(1.0, wall_s),
         "cpu_s_per_frame": cpu_s,
         "stage_s": stage_s,
@@ -219,7 +230,9 @@ def _program_text(facts: Facts) -> str:
     planned = f"its {facts['planning_cpu_s']:.1f} s in a capture of {CAPTURE_S:.0f} s"
     pure = "decode, warp and PNG only" if facts["floor"]["pure"] else "NOT MEASURED: these frames are not all warped"
     return (
-        f"SPEED: {facts['size']} colour, decode to PNG, --jobs {facts['jobs']}; from runs over N and 2 N frames\n"
+        f"SPEED: {facts['processor']}, --jobs {facts['jobs']}, transforms by {facts['transforms']}\n"
+        f"{facts['size']} colour, {facts['content']}, blur of {facts['blur_px']:.1f} px (median), decode to PNG; "
+        "from runs over N and 2 N frames\n"
         f"(floor: --deblur none, {pure}; by stages: decode + shutter + write of the preset's own run;\n"
         f" by CPU: what the CPU times allow; stages: frames/s of one core by CPU time; with planning: {planned};\n"
         " others' cores: what else kept the machine busy)\n" + table(header, rows)

@@ -12,7 +12,6 @@ from virest.app.bench.speed import STAGES, figure, percent, ratio_to_peer, stage
 from virest.app.bench.tables import table
 
 Report = dict[str, Any]
-NOT_RUN = "not run"
 LEAST_FLOOR_SHARE, LEAST_SCALING, MOST_ESTIMATION = 0.6, 1.8, 0.05
 LEAST_PHONE_GAIN_DB = {"fast": 1.2, "balanced": 1.6, "best": 1.8}
 MOST_PROMISE_OFF_DB = 0.5
@@ -50,20 +49,18 @@ def judge(by_wall: bool, by_cpu: bool, others_cores: float, *, ratio: bool = Fal
 
 
 def summary_rows(report: Report) -> list[Row]:
-    """All rows; those of sections that were not run say so."""
-    rows: list[Row] = []
-    for section, (build, what) in SECTIONS.items():
-        rows += build(report[section]) if report.get(section) else [Row(what, "-", f"{NOT_RUN}: --only {section}")]
-    return rows
+    """All rows of the sections that were run."""
+    return [row for section, build in SECTIONS.items() if report.get(section) for row in build(report[section])]
 
 
 def summary_text(report: Report) -> str:
-    """The table; the load beside it, since a busy machine measures itself."""
+    """The table, empty where no section asks for anything; the load beside it, since a busy machine measures itself."""
+    rows = summary_rows(report)
+    if not rows:
+        return ""
     versions = report.get("versions", {})
     load = f"{versions.get('cores')} cores, load {versions.get('load', 0.0):.1f} at the start"
-    body = table(
-        ["figure", "asked", "measured", "met"], [[r.figure, r.asked, r.measured, r.met] for r in summary_rows(report)]
-    )
+    body = table(["figure", "asked", "measured", "met"], [[r.figure, r.asked, r.measured, r.met] for r in rows])
     return f"SUMMARY: virest {versions.get('virest')}, scale {report.get('scale')}, {load}\n" + body
 
 
@@ -196,10 +193,10 @@ def _honesty_rows(honesty: Report) -> list[Row]:
     return rows
 
 
-SECTIONS: dict[str, tuple[Callable[[Report], list[Row]], str]] = {
-    "speed": (_speed_rows, "speed, floor, scaling, estimation, peers"),
-    "growth": (_growth_rows, "growth with frames, pixels, tiles"),
-    "memory": (_memory_rows, "memory"),
-    "commands": (_command_rows, "help, inspect, calibrate, diagnose"),
-    "honesty": (_honesty_rows, "gain, frames made worse, promises"),
+SECTIONS: dict[str, Callable[[Report], list[Row]]] = {
+    "speed": _speed_rows,
+    "growth": _growth_rows,
+    "memory": _memory_rows,
+    "commands": _command_rows,
+    "honesty": _honesty_rows,
 }

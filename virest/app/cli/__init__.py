@@ -101,16 +101,20 @@ def _terminate(number: int, _frame: Any) -> NoReturn:
 def program() -> Any:
     """The commands as the parser has them; arguments are shown by name, without their Python type."""
     command = typer.main.get_command(app)
-    _hide_types(command)
+    _name_arguments(command)
     return command
 
 
-def _hide_types(command: Any) -> None:
+def _name_arguments(command: Any) -> None:
+    """Show arguments as manual pages do: NAME, [NAME] where it may be left out, NAME... where several are taken."""
     for parameter in command.params:
         if parameter.param_type_name == "argument":
+            name = parameter.metavar or parameter.name.upper()
+            shown = (name if parameter.required else f"[{name}]") + ("..." if parameter.nargs == -1 else "")
             parameter.display_type_rich = lambda ctx: None
+            parameter.get_usage_pieces = lambda ctx, shown=shown: [shown]
     for inner in getattr(command, "commands", {}).values():
-        _hide_types(inner)
+        _name_arguments(inner)
 
 
 def run(arguments: list[str] | None = None) -> int:

@@ -35,10 +35,12 @@ def calibrate_curve(
     """Fit the exposure characteristic curve to pictures of one still scene at several exposures.
 
     \b
-    $ virest calibrate-curve bracket --exposures bracket/exposures.csv --plot curve.png
-    gamma 2.1998
-    fit error 0.47 grey levels rms, exposures 0.0009 to 0.92 covered
-    the curve is known to ± 0.24 grey levels there
+    $ virest calibrate-curve bracket --plot curve.png
+    five_segment b (0.1572, 0.0823), c (0.7915, 0.793), y_max 1
+    fit error 1.29 grey levels rms, exposures 0.06232 to 1 covered
+    the curve is known to ± 0.37 grey levels there
+    ...
+    $ virest calibrate-curve stills --exposures stills/exposures.csv
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     one_thread_each()

@@ -27,16 +27,15 @@ def diagnose(
     """Say what the camera model gets wrong on a capture, why, what to add, and what that gains.
 
     \b
-    $ virest diagnose shaken
-    shaken: 13774 tracks in 60 frames, residual 1.336 px (tracking noise 0.1759 px)
-    cause              parameter  given    found          ±  before   after  gain  held out         rivals
-    readout_time  readout_time_s  0.022  0.01493  5.607e-05   1.339  0.1836  100%  geometry_rms_px  -
-    readout_time: the rows are read within 0.01493 s
-    restored: sharpness 7.018 recorded, 7.575 as given, 7.72 extended; neighbours disagree by 1.657 -> 0.1961 px
-    unexplained: no significant residual; 0.02081 px along time
-    wrote virest-out/shaken/diagnosis.json, extended.yaml and figures
+    $ virest diagnose trip
+    trip: 11949 tracks in 60 frames, residual 1.25 px (tracking noise 0.144 px)
+    cause              parameter  given    found          ±  before   after  gain ...
+    readout_time  readout_time_s  0.022  0.01494  2.856e-05   1.255  0.1512  100% ...
+    readout_time: the rows are read within 0.01494 s
+    ...
+    wrote virest-out/trip/diagnosis.json, extended.yaml and figures
     verdict: explained
-    $ virest process shaken --config virest-out/shaken/extended.yaml --out better
+    $ virest process trip --config virest-out/trip/extended.yaml --out better
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     one_thread_each()

@@ -11,7 +11,6 @@ def doctor(json: Json = False, quiet: Quiet = False, verbose: Verbose = False, v
 
     \b
     $ virest doctor
-    virest 0.2.0, Python 3.11.9, Linux x86_64
     ...
     everything that virest needs is here
     """  # noqa: D301

@@ -15,9 +15,7 @@ from virest.restoration.settings import PRESETS
 def slam(
     captures: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[CAPTURE]...", help="Capture folders with truth/; - reads names from stdin. [simulated]"
-        ),
+        typer.Argument(metavar="CAPTURE", help="Capture folders with truth/; - reads names from stdin. [simulated]"),
     ] = None,
     command: Annotated[
         str | None,
@@ -44,11 +42,13 @@ def slam(
     """Compare trajectories from global-shutter, rolling-shutter and restored frames with the true one.
 
     \b
-    $ virest evaluate slam
-    sequence  readout ms  ...         global mm              rolling mm       restored mm  removed
-    relief            25  ...  0.39 (0.39-0.39)     27.98 (27.96-28.01)  1.23 (1.23-1.23)  97.0 %   leaves, some at 1 m
-    print           29.5  ...  0.51 (0.29-0.51)     32.37 (32.29-32.72)  0.78 (0.48-1.51)  99.1 %   text, sideways
-    shaken        20.733  ...  0.53 (0.53-0.53)  107.73 (101.50-136.34)  0.83 (0.83-0.83)  99.7 %   leaves, upright
+    $ virest evaluate slam --devices
+    sequence  readout ms  exposure ms ...
+    relief            25            8 ...
+    print           29.5            6 ...
+    shaken        20.733           12 ...
+    ...
+    of the error that the rolling shutter adds, restored frames take away 98.9 % (median), 98.3 % at the least
     ...
     $ virest evaluate slam walk --command 'mono_euroc_tum ORBvoc.txt {settings} {sequence} {times} {trajectory}'
     """  # noqa: D301

@@ -50,13 +50,10 @@ def export(
     """Write frames (raw or restored) and IMU as SLAM tools read them, without ROS, with calibration files.
 
     \b
-    $ virest export walk --format euroc --restored virest-out/walk
-    walk: 60 restored frames over 1.97 s and 640 inertial rows as euroc
+    $ virest export sample_data/text --format euroc --restored virest-out/text
+    text: 4 restored frames over 0.10 s and 320 inertial rows as euroc
     a frame shows the instant 0.00 ms after its stamp
-    wrote virest-export/walk
-
-    \b
-    $ mono_inertial_euroc ORBvoc.txt virest-export/walk/orb_slam3.yaml virest-export/walk virest-export/walk/times.txt
+    wrote virest-export/text
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     chosen = parse_frames(frames)

@@ -20,8 +20,12 @@ def inspect(
     """Say what is in a capture and what is wrong with it, before any work.
 
     \b
-    $ virest inspect honor_v10
-    $ virest inspect honor_v10 --json | jq .frames
+    $ virest inspect sample_data/text
+    text: usable
+      kind          MARSLogger
+      movie         720x1280, 12 frames, 1 key frames
+    ...
+    $ virest inspect sample_data/text --json | jq .frames
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     paths = capture_paths(captures)

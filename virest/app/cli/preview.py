@@ -20,7 +20,7 @@ def preview(
     config: Config = None,
     frame: Annotated[int | None, typer.Option(metavar="N", help="This frame. [the one with the most blur]")] = None,
     preset: Annotated[
-        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="[balanced]")
+        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Quality against speed.")
     ] = "balanced",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
     json: Json = False,
@@ -32,7 +32,7 @@ def preview(
 
     \b
     $ virest preview sample_data/text
-    text: frame 8 restored, blur 9.3 px at the centre, rows moved by up to 21.0 px, predicted gain 5.6 dB
+    text: frame 5 restored, blur 17.1 px at the centre, ...
     wrote text-preview.png
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)

@@ -96,12 +96,11 @@ def process(
     """Deblur and straighten captures: PNGs, parameters.jsonl and run.json in OUT/<capture>.
 
     \b
-    $ virest process 2022_03_09_15_21_07 --frames 30:90
-    virest: 2022_03_09_15_21_07: camera profile from the capture's metadata
-    capture              restored  copied  skipped  failed  frames/s  verdict
-    2022_03_09_15_21_07        58       2        0       0       4.3  restored
-    wrote virest-out/2022_03_09_15_21_07
-    next: virest report virest-out/2022_03_09_15_21_07 shows it; ...
+    $ virest process sample_data/text --preset fast
+    capture  restored  copied  skipped  failed  frames/s  verdict
+    text           12       0        0       0 ...
+    wrote virest-out/text
+    next: virest report virest-out/text shows it; ...
 
     \b
     $ virest process walk --video walk.mp4 --side-by-side --no-frames

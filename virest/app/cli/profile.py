@@ -18,7 +18,7 @@ profile = typer.Typer(
 @profile.command("new", short_help="Write a camera profile to start from.")
 def new(
     capture: Annotated[
-        str | None, typer.Argument(metavar="[CAPTURE]", help="Take what this capture's recorder logged.")
+        str | None, typer.Argument(metavar="CAPTURE", help="Take what this capture's recorder logged.")
     ] = None,
     device: Annotated[
         str | None, typer.Option(metavar="NAME", help="Readout time from the table of known phones.")
@@ -57,7 +57,7 @@ def new(
 
 @profile.command("devices", short_help="Readout times of known phones.")
 def devices(
-    text: Annotated[str, typer.Argument(metavar="[TEXT]", help="Only devices whose name holds these words.")] = "",
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="Only devices whose name holds these words.")] = "",
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,

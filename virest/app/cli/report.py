@@ -35,10 +35,10 @@ def report(
     """Show a run or a diagnosis as one HTML page that needs no network: before and after, curves, verdict.
 
     \b
-    $ virest process sample_data/text
+    $ virest process sample_data/text --frames 0:4 --preset fast --quiet
     $ virest report virest-out/text
-    text: restored (12 restored)
-    wrote virest-out/text/report.html, 1.3 MB
+    text: restored (4 deblurred)
+    wrote virest-out/text/report.html, ...
 
     \b
     $ virest report virest-out --json | jq -r '.captures[] | select(.counts.failed > 0) | .capture'

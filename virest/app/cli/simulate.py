@@ -119,8 +119,8 @@ def simulate(
     """Write a capture with known truth: movie, logs, camera.yaml, and truth/ with sharp frames and the motion.
 
     \b
-    $ virest simulate leaves --frames 20 --rate 1.5 --effect time_offset=0.012
-    leaves: 20 frames of 720x1280, blur 9.1 px, effects: time_offset (time_offset_s 0.012)
+    $ virest simulate leaves --width 360 --height 640 --frames 20 --rate 1.5 --effect time_offset=0.012
+    leaves: 20 frames of 360x640, blur 6.26 px, effects: time_offset (time_offset_s 0.012)
     $ virest process leaves
 
     \b
@@ -129,7 +129,6 @@ def simulate(
 
     \b
     $ virest simulate phone --isp phone --sharpen 0 --offset-ms 5 --noise 3
-    phone: 12 frames of 720x1280, blur 5.9 px, effects: none, phone: tone 0.4, local_tone 0.2, ...
 
     \b
     $ virest simulate again --like 2022_03_09_15_21_07 --frames 30:90 --effect flicker=0.2,100
