@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from virest.calibration.physical_limits import limit_reasons
 from virest.calibration.unfitted_parameters import OPTIONAL, HeldValue, held_notes, held_values
 from virest.camera.intrinsics import Intrinsics
+from virest.camera.kalibr import measure_imu_noise
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
@@ -25,13 +26,14 @@ from virest.errors import CalibrationError
 from virest.image_formation.point_model import TrackTable, ground
 from virest.image_formation.row_clock import row_time_s
 from virest.inference import profile_terms as terms_of
+from virest.inference.blur_bias import blur_bias_px
 from virest.inference.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
 from virest.inference.tracking import TrackPair
-from virest.inference.tracking_bias import bias_std
+from virest.inference.tracking_bias import bias_std, remaining_std
 from virest.motion.displacement import drift_std_m
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
@@ -168,12 +170,12 @@ def calibrate_geometry(
         raise CalibrationError(f"{len(observed.pairs)} pairs of frames lie inside the inertial data")
     say("coarse")
     wanted = [terms_of.TIME_OFFSET, terms_of.GYRO_BIAS, terms_of.IMU_ROTATION]
-    wanted += [terms_of.FOCAL] if unknown_focal or "focal" in extra else []
-    rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, wanted)
-    say("readout")
-    wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS]
     names = list(dict.fromkeys([*extra, *(["focal"] if unknown_focal else [])]))
-    wanted += [OPTIONAL[name] for name in names if name in OPTIONAL]
+    asked = [OPTIONAL[name] for name in names if name in OPTIONAL]
+    wanted += [term for term in asked if term is terms_of.FOCAL]
+    rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, wanted, asked)
+    say("readout")
+    wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS, *asked]
     left_out = 0.0
     for _ in range(ASTRAY_PASSES):
         table = observed.table(MANY_POINTS)
@@ -182,13 +184,17 @@ def calibrate_geometry(
         left_out += (1 - left_out) * astray
         if not astray:
             break
+    corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
+    if corrected:  # where no accelerometer tells the travel, nothing tells its part of the blur
+        table = replace(table, second_px=table.second_px - blur_bias_px(fit.ground, table))
+        fit = fit_tracks(capture.imu, table, fit.profile, wanted, fit.scene)
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(capture.imu, table, fit, float(np.median(observed.noise_px)), vary)
     if _clocks_drift(held.get("clock-skew"), float(np.ptp(fit.seconds))):
         found = calibrate_geometry(capture, profile, pairs, (*extra, "clock-skew"))
         say("joint")
         return replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
-    found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out)
+    found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out, corrected)
     say("joint")
     found = replace(found, notes=(*found.notes, *held_notes(held, names)))
     return found if lag is None else _with_lag(found, lag)
@@ -301,18 +307,24 @@ class _Rough:
     """With the starting profile's readout and nothing but what was asked for."""
 
 
-def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term]) -> _Rough:
-    """Fit a readout of either sense along the rows and along the columns, and keep the better axis."""
+def _readout_axis(
+    imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term], asked: list[Term]
+) -> _Rough:
+    """Fit a readout of either sense along the rows and along the columns, and keep the better axis.
+
+    asked: the terms of the joint fit beside the usual ones.  They are fitted here only where the points need no
+    translation with them: a wrong lens alone looks like travel.
+    """
     along = "left_to_right" if start.shutter.reads_columns else "top_to_bottom"
     across = "top_to_bottom" if start.shutter.reads_columns else "left_to_right"
     before = fit_tracks(imu, table, start, wanted[:1], max_iterations=4)
-    first = _fit_with_translation(imu, table, _without_readout(start, along), [*wanted, terms_of.READOUT])
-    scene = None if first.scene is None else first.scene
-    second = fit_tracks(imu, table, _without_readout(start, across), [*wanted, terms_of.READOUT], scene)
+    first = _fit_with_translation(imu, table, _without_readout(start, along), [*wanted, terms_of.READOUT], asked)
+    scene, fitted = first.scene, first.terms
+    second = fit_tracks(imu, table, _without_readout(start, across), fitted, scene)
     difference = (first.cost - second.cost) / max(min(first.scale, second.scale) ** 2, 1e-9)
     best = second if difference > 0 else first
     if best is second and best.scene is not None:
-        plain = fit_tracks(imu, table, best.profile, [*wanted, terms_of.READOUT])
+        plain = fit_tracks(imu, table, best.profile, fitted)
         best = plain if plain.scale < EXPLAINED_SCALE else best
     log.debug("readout: cost %.1f %s, %.1f %s", first.cost, along, second.cost, across)
     return _Rough(best.profile, best.scene, abs(difference) > DIRECTION_COST, before)
@@ -327,11 +339,19 @@ def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
     )
 
 
-def _fit_with_translation(imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term]) -> TrackFit:
-    """The simplest translation that explains the points: none, the accelerometer's, or a direction of travel."""
+def _fit_with_translation(
+    imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term], asked: list[Term]
+) -> TrackFit:
+    """The simplest translation that explains the points: none, the accelerometer's, or a direction of travel.
+
+    None where the terms asked for explain them too.
+    """
     plain = fit_tracks(imu, table, start, wanted)
     if plain.scale < EXPLAINED_SCALE:
         return plain
+    beside = [term for term in asked if term not in wanted]
+    if beside and (lens := fit_tracks(imu, table, plain.profile, [*wanted, *beside])).scale < EXPLAINED_SCALE:
+        return lens
     known = ground(imu, start, translation=True)
     if known.displacement is not None:
         scene = start_scene(imu, known, table, START_INVERSE_DEPTH_PER_M)
@@ -355,9 +375,16 @@ def _conclude(
     rough: _Rough,
     fit: TrackFit,
     astray: float,
+    corrected: bool,
 ) -> GeometryCalibration:
+    """corrected: blur's bias was taken out of the points, and that moved the values by the fit's change."""
     noise = float(np.median(observed.noise_px))
-    variances = _variances(fit, noise, _drift_rad(fit, imu))
+    if corrected:
+        gyro_rad_s = _gyro_mean_std_rad_s(imu, float(np.ptp(fit.seconds)))
+        bias = {term.name: remaining_std(fit, term.name, fit.value(term.name), gyro_rad_s) for term in fit.terms}
+    else:
+        bias = {term.name: bias_std(fit, term.name, noise) for term in fit.terms}
+    variances = _variances(fit, bias, _drift_rad(fit, imu))
     beyond = _beyond_limits(fit, observed)
     determined = {
         term.name: term.name not in beyond and _is_determined(fit, term.name, variances[term.name])
@@ -435,9 +462,15 @@ def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
     return drift_std_m(imu, span_s) * nearness, max(span_s, 0.1)
 
 
-def _variances(fit: TrackFit, noise_px: float, drift: tuple[float, float]) -> dict[str, Array]:
-    """Variance of each term's values, with tracking's own bias; the offset is that of the first row read."""
-    found = {term.name: fit.std(term.name) ** 2 + bias_std(fit, term.name, noise_px) ** 2 for term in fit.terms}
+def _gyro_mean_std_rad_s(imu: ImuSamples, span_s: float) -> float:
+    """Standard deviation of the mean of the gyroscope's white noise over a time: no picture tells it from a bias."""
+    noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
+    return (noise.gyro_density or 0.0) / max(span_s, 0.1) ** 0.5 if noise else 0.0
+
+
+def _variances(fit: TrackFit, bias: dict[str, Array], drift: tuple[float, float]) -> dict[str, Array]:
+    """Variance of each term's values, with what remains of tracking's bias; the offset is that of the first row."""
+    found = {term.name: fit.std(term.name) ** 2 + bias[term.name] ** 2 for term in fit.terms}
     found["imu_rotation"] = found["imu_rotation"] + (0.5 * drift[0]) ** 2
     found["gyro_bias"] = found["gyro_bias"] + (drift[0] / drift[1]) ** 2
     if "readout_time" in found:

@@ -201,13 +201,20 @@ def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
     return rank
 
 
+def shrink_factor(width: int, height: int, limit_px: int = TrackingSettings().halve_above_px) -> int:
+    """How many stored pixels a pixel of the pictures that are tracked is wide."""
+    factor = 1
+    while max(width, height) // factor > limit_px and min(width, height) // factor >= 64:
+        factor *= 2
+    return factor
+
+
 def _halved(picture: NDArray[np.uint8], limit_px: int) -> tuple[NDArray[np.uint8], int]:
     """Return the picture halved until it fits, by means of 2 x 2 pixels, and the factor."""
-    factor = 1
-    while max(picture.shape) > limit_px and min(picture.shape) >= 64:
+    factor = shrink_factor(picture.shape[0], picture.shape[1], limit_px)
+    for _ in range(factor.bit_length() - 1):
         even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
         picture = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
-        factor *= 2
     return picture, factor
 
 

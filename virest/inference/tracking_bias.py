@@ -1,5 +1,8 @@
 """What tracking gets wrong in the same way all over a capture, so that no statistics of the capture show it.
 
+:func:`bias_std` holds for points as they were tracked, :func:`remaining_std` for points that
+:mod:`virest.inference.blur_bias` has corrected.
+
 Followed points lag and shrink a little where blur changes from frame to frame, and more where the codec's predicted
 blocks replace what was seen.  Measured on simulated captures with H.264 at 0.12 to 2 bits a pixel; it grows with the
 noise of a tracked step, of which 0.15 px is typical.
@@ -15,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.inference.blur_bias import UNSURE
 from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
@@ -66,3 +70,47 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
     if name == "gyro_bias" and own is not None:
         floor = np.hypot(floor, SHARED_RELIEF * fit.by_relief[own])
     return np.asarray(floor)
+
+
+# ── points without the bias of their blur ────────────────────────────────────────────────────────────────────────
+
+STILL_SHARED = {
+    "time_offset": 0.010,
+    "readout_time": 0.026,
+    "imu_rotation": 0.006,
+    "gyro_bias": 0.005,
+    "focal_length": 0.014,
+    "radial_distortion": 0.012,
+    "principal_point": 0.018,
+    "exposure_time": 0.010,
+}
+"""Part of a step's noise that is correlated with a value's own pattern once blur's bias is taken out: what remains is
+mostly the codec's, whose predicted blocks shear less than rows do.  Those of 52 captures that were drawn as
+``python -m virest.app.bench --only calibration`` draws them; that command prints what its captures ask for."""
+STILL_SHARED_OTHER = 0.012
+"""The same for all other values: the typical one."""
+DECODED_LAG_S = 1.5e-5
+"""By how much decoded frames lag behind what was seen, rms, where points tell the offset to a few microseconds."""
+GYRO_WANDER_RAD_S = 5e-5
+"""Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
+
+
+def remaining_std(fit: TrackFit, name: str, moved: Array, gyro_mean_std_rad_s: float) -> Array:
+    """Standard deviation (k,) of what is left of a term's bias in points that blur's bias was taken out of.
+
+    moved (k,): by how much that moved the values.  gyro_mean_std_rad_s: of the gyroscope's noise, over the capture.
+    """
+    own = fit.slices[name]
+    std = np.hypot(shared_std(fit, name), UNSURE * moved)
+    if name == "time_offset":
+        return np.hypot(std, DECODED_LAG_S)
+    if name == "gyro_bias":
+        wander = np.hypot(GYRO_WANDER_RAD_S, gyro_mean_std_rad_s)
+        return np.asarray(np.hypot(np.hypot(std, wander), SHARED_RELIEF * fit.by_relief[own]))
+    return np.asarray(std)
+
+
+def shared_std(fit: TrackFit, name: str) -> Array:
+    """The part (k,) of :func:`remaining_std` that STILL_SHARED makes."""
+    told = np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[fit.slices[name]])
+    return np.asarray(STILL_SHARED.get(name, STILL_SHARED_OTHER) * told)

@@ -18,6 +18,7 @@ COVARIATES = {"row": "part of the readout", "time": "time, s", "radius": "radius
 """What residuals are drawn over, and how the axes are called."""
 RESIDUALS = ("x_px", "y_px")
 BINS, MIN_IN_BIN = 24, 8
+MOST_DEVIATIONS, DEVIATION_BARS = 4.0, 16
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -143,6 +144,30 @@ def residual_figure(
         line[0].set_ylabel(f"residual along {component[0]}, px")
     if axes[0][0].get_legend_handles_labels()[0]:
         axes[0][0].legend(loc="upper right", fontsize=8)
+    figure.suptitle(literal(title))
+    return as_file(figure, image_format)
+
+
+def deviation_figure(ratios: Mapping[str, Sequence[float]], title: str = "", image_format: str = "png") -> bytes:
+    """Histograms of errors in standard deviations, one for each name, beside the normal distribution.
+
+    ratios: name → errors over their deviations; those beyond ± 4 are drawn in the outermost bars.
+    """
+    columns = min(max(len(ratios), 1), 4)
+    lines = -(-max(len(ratios), 1) // columns)
+    figure = canvas(2.6 * columns, 0.4 + 2.1 * lines)
+    axes = figure.subplots(lines, columns, squeeze=False, sharex=True)
+    edges = np.linspace(-MOST_DEVIATIONS, MOST_DEVIATIONS, DEVIATION_BARS + 1)
+    along = np.linspace(-MOST_DEVIATIONS, MOST_DEVIATIONS, 161)
+    for place in axes.flat[len(ratios) :]:
+        place.set_axis_off()
+    for place, (name, values) in zip(axes.flat, ratios.items(), strict=False):
+        inside = np.clip(np.asarray(values, float), edges[0] + 1e-9, edges[-1] - 1e-9)
+        place.hist(inside, edges, density=True, color="steelblue")
+        place.plot(along, np.exp(-(along**2) / 2) / np.sqrt(2 * np.pi), color="0.3", lw=1.2)
+        place.set_title(literal(f"{name}: {len(inside)}"), fontsize=9)
+        place.set_yticks([])
+    figure.supxlabel("error / standard deviation")
     figure.suptitle(literal(title))
     return as_file(figure, image_format)
 

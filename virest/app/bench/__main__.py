@@ -3,6 +3,7 @@
 $ python -m virest.app.bench --only quality --quick
 $ python -m virest.app.bench --only honesty --quick --preset balanced --keep captures
 $ python -m virest.app.bench --only fits --keep captures
+$ python -m virest.app.bench --only calibration --seeds 100
 $ python -m virest.app.bench --compare OLD.json NEW.json
 """
 
@@ -71,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         emit(compare_text(old, new, options.noise))
         return
     presets = tuple(options.preset or PRESETS)
-    scale = Scale(quick=options.quick, full=options.full, presets=presets, seeds=options.seeds)
+    scale = Scale(quick=options.quick, full=options.full, presets=presets, seeds=options.seeds, figures=options.out)
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
     work = options.keep or Path(tempfile.mkdtemp(prefix="work-", dir=options.out))

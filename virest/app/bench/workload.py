@@ -44,6 +44,8 @@ class Scale:
     """Those that ``honesty`` measures."""
     seeds: int = 100
     """Captures that calibrations are compared with truth on."""
+    figures: Path | None = None
+    """Folder that figures are drawn into."""
 
     @property
     def name(self) -> str:

@@ -1,0 +1,91 @@
+"""Errors of calibrations over their deviations: what is drawn, compared, summed up and shown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from virest.app.bench import calibration
+from virest.app.bench.workload import Scale
+from virest.app.calibrate import plan_calibration
+from virest.app.simulate import simulate_command
+from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
+from virest.camera.profile import read_profile
+from virest.capture.video import GrayReader, probe_movie
+from virest.inference.guide_choice import track_guided
+
+
+def _row(ratio: float, shared: float = 0.5) -> dict[str, object]:
+    return {"value": "k1", "error": ratio, "std": 1.0, "shared_std": shared, "error_in_std": ratio}
+
+
+def test_errors_are_summed_up() -> None:
+    """Median, part within two, mean, bars; a share that would make the median usual."""
+    one = calibration.summed([_row(ratio) for ratio in (-2.5, -0.5, 0.5, 1.5)])
+    assert (one["count"], one["median"], one["within_two"], one["mean"]) == (4, 1.0, 0.75, -0.25)
+    assert one["histogram"] == [0, 1, 0, 1, 1, 1, 0, 0]
+    rng = np.random.default_rng(1)
+    asked = [calibration.summed([_row(wide * r) for r in rng.normal(size=4000)]) for wide in (1.0, 1.5, 1.2)]
+    shares = [one["share_asked"] / one["share_in_use"] for one in asked]
+    expected = [np.sqrt(wide**2 - 0.75) / 0.5 for wide in (1.0, 1.5, 1.2)]
+    np.testing.assert_allclose(shares, expected, rtol=0.15)
+
+
+def test_a_table_and_a_figure_come_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One capture a seed, from the first that nobody looked at; refused captures leave no row."""
+    seeds: list[int] = []
+
+    def rows(_work: Path, seed: int) -> list[dict[str, object]]:
+        seeds.append(seed)
+        return [_row(0.3), _row(-5.0)] if seed % 2 else []
+
+    monkeypatch.setattr(calibration, "calibrated_rows", rows)
+    facts, text = calibration.calibration_section(tmp_path, Scale(seeds=3, figures=tmp_path))
+    assert seeds == [calibration.FIRST_SEED + k for k in range(3)]
+    assert "3 simulated captures" in text
+    assert facts["summary"]["k1"]["count"] == 4
+    assert (tmp_path / calibration.FIGURE).read_bytes().startswith(b"\x89PNG")
+
+
+def test_captures_differ_and_are_repeated() -> None:
+    """A seed always draws the same; over seeds all kinds are drawn."""
+    assert calibration.drawn_capture(7) == calibration.drawn_capture(7)
+    drawn = [calibration.drawn_capture(seed) for seed in range(60)]
+    assert {taken["scene"] for taken, _, _ in drawn} == set(calibration.SCENES)
+    assert {"depth_m" in taken for taken, _, _ in drawn} == {True, False}
+    for taken, hidden, extra in drawn:
+        assert ("exposure_time" in hidden) == ("exposure-scale" in extra) == ("auto_exposure_ev" in taken)
+
+
+@pytest.fixture(scope="module")
+def wrong_lens(tmp_path_factory: pytest.TempPathFactory) -> tuple[GeometryCalibration, Path]:
+    """A far scene through a lens that the profile has wrong, calibrated with what is wrong."""
+    folder = tmp_path_factory.mktemp("lens") / "capture"
+    hidden = ("time_offset=0.006", "focal_length=0.94", "radial_distortion=-0.1")
+    simulate_command(
+        folder, width=320, height=240, frames=45, exposure_ms=8, noise_levels=1.0, bitrate_bits_per_px=1.0, seed=21,
+        effects=hidden,
+    )  # fmt: skip
+    plan = plan_calibration(folder, None, ("focal", "distortion"))
+    movie = plan.capture.movie
+    pairs = track_guided(plan.capture, plan.profile, GrayReader(movie, probe_movie(movie)), plan.frames)
+    return calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra), folder
+
+
+@pytest.mark.scenario
+def test_a_wrong_lens_is_not_taken_for_travel(wrong_lens: tuple[GeometryCalibration, Path]) -> None:
+    """Points that the lens explains need no translation."""
+    assert wrong_lens[0].translation == "none"
+
+
+@pytest.mark.scenario
+def test_each_value_comes_with_its_error(wrong_lens: tuple[GeometryCalibration, Path]) -> None:
+    """All that was asked for, in the profile's units, and within four deviations."""
+    found, folder = wrong_lens
+    rows = calibration.errors_of(found, read_profile(folder / "truth" / "camera.yaml"))
+    assert {"time_offset_s", "readout_time_s", "rotation_rad", "gyro_bias_rad_s", "fx_px"} <= {r["value"] for r in rows}
+    for row in rows:
+        assert abs(row["error_in_std"]) < 4, row
+        assert 0 < row["shared_std"] < row["std"], row

@@ -1,0 +1,103 @@
+"""Lucas-Kanade between differently blurred pictures of one texture, against what the paths alone predict."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from virest.inference.blur_bias import matched_shift_px
+from virest.inference.tracking import track_pairs
+
+Array = np.ndarray
+SIDE, MARGIN, PAIRS, INSTANTS = 288, 32, 30, 24
+
+
+def test_even_paths_are_found_where_they_are() -> None:
+    """A path at an even speed is symmetric about its mean, however long it is."""
+    rng = np.random.default_rng(1)
+    speed, still = rng.normal(0, 3, (2, 50, 2)), np.zeros((50, 2))
+    assert np.abs(matched_shift_px((speed[0], still), (speed[1], still))).max() < 1e-5
+
+
+def test_the_pictures_may_change_places() -> None:
+    """e is odd: back is the opposite of forth."""
+    rng = np.random.default_rng(2)
+    speed, bend = rng.normal(0, 3, (2, 50, 2)), rng.normal(0, 0.3, (2, 50, 2))
+    forth = matched_shift_px((speed[0], bend[0]), (speed[1], bend[1]))
+    back = matched_shift_px((speed[1], bend[1]), (speed[0], bend[0]))
+    assert np.abs(forth).max() > 0.01
+    np.testing.assert_allclose(forth, -back, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_steps_of_blurred_points_are_too_short_as_predicted(seed: int) -> None:
+    """What tracked steps lack in proportion to the step and to what acceleration does: most of both is predicted."""
+    rng = np.random.default_rng(seed)
+    texture, error, predicted, steps, bends = _letters(rng), [], [], [], []
+    for _ in range(PAIRS):
+        first, second, step = _hand(rng)
+        pair = track_pairs(enumerate((_blurred(texture, first), _blurred(texture, second + step))))[0]
+        shift = second.mean(axis=0) - first.mean(axis=0)
+        found = pair.points_second_px - pair.points_first_px - step - shift
+        error.append(found)
+        expected = matched_shift_px(_speed_and_bend(first), _speed_and_bend(second))
+        predicted.append(np.broadcast_to(expected, found.shape))
+        steps.append(np.broadcast_to(step, found.shape))
+        bends.append(np.broadcast_to(shift, found.shape))
+    error, predicted, steps, bends = map(np.concatenate, (error, predicted, steps, bends))
+    before, after = (_slopes(left, steps, bends) for left in (error, error - predicted))
+    assert before[0] < -4e-4
+    assert before[1] < -0.05
+    assert abs(after[0]) < 0.7 * abs(before[0])
+    assert abs(after[1]) < 0.7 * abs(before[1])
+
+
+def _slopes(error: Array, steps: Array, bends: Array) -> Array:
+    """Parts (2,) of steps and of shifts by acceleration that errors are, by robust weights."""
+    distance = np.linalg.norm(error, axis=1)
+    weight = np.repeat(1 / (1 + (distance / (2 * np.median(distance))) ** 2), 2)
+    rows = np.stack([steps.ravel(), bends.ravel()], axis=-1)
+    return np.linalg.solve((rows * weight[:, None]).T @ rows, (rows * weight[:, None]).T @ error.ravel())
+
+
+def _hand(rng: np.random.Generator, frame_s: float = 1 / 30, exposure_s: float = 0.013) -> tuple[Array, Array, Array]:
+    """Paths (INSTANTS, 2) about two instants, and the step between those: 400 px/s rms between 0.5 and 12 Hz."""
+    frequency = np.exp(np.linspace(np.log(0.5), np.log(12), 30))
+    speed = (frequency / 2) / (1 + frequency / 2) / (1 + (frequency / 8) ** 2) * rng.uniform(0.6, 1.4, (2, 30))
+    speed *= 400 / np.sqrt((speed**2).sum() / 2)
+    omega, phase = 2 * np.pi * frequency, rng.uniform(0, 2 * np.pi, (2, 30))
+
+    def place(time_s: Array) -> Array:
+        return (speed / omega * np.sin(omega * time_s[:, None, None] + phase)).sum(axis=-1)
+
+    within = ((np.arange(INSTANTS) + 0.5) / INSTANTS - 0.5) * exposure_s
+    begin, end = place(np.zeros(1)), place(np.full(1, frame_s))
+    return place(within) - begin, place(frame_s + within) - end, (end - begin)[0]
+
+
+def _speed_and_bend(path: Array) -> tuple[Array, Array]:
+    """Of p(u) = c + speed u + bend u², u from -1 to 1: (1, 2) each."""
+    u = 2 * (np.arange(INSTANTS) + 0.5) / INSTANTS - 1
+    fitted = np.polynomial.polynomial.polyfit(u, path, 2)
+    return fitted[1][None], fitted[2][None]
+
+
+def _letters(rng: np.random.Generator) -> Array:
+    """Upright bars, long and thin either way, over each other; linear light in [0, 1]."""
+    picture = np.full((SIDE, SIDE), 0.6, np.float32)
+    for _ in range(500):
+        left, top = rng.integers(0, SIDE, 2)
+        width, height = rng.permutation([rng.integers(3, 7), rng.integers(8, 26)])
+        picture[top : top + height, left : left + width] = rng.uniform(0.03, 0.9)
+    return cv2.GaussianBlur(picture, (0, 0), 0.6)
+
+
+def _blurred(texture: Array, path: Array) -> Array:
+    """Grey picture of a texture that moves along a path during the exposure."""
+    spectrum = np.fft.rfft2(texture)
+    fy, fx = np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None]
+    down, across = (np.exp(-2j * np.pi * f.ravel()[:, None] * path[:, axis]) for f, axis in ((fy, 1), (fx, 0)))
+    light = np.fft.irfft2(spectrum * (down @ across.T / len(path)), s=texture.shape)
+    grey = 255 * np.clip(light, 0, 1) ** (1 / 2.2)
+    return np.rint(grey).astype(np.uint8)[MARGIN:-MARGIN, MARGIN:-MARGIN].copy()
