@@ -14,10 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.records import Capture
-from virest.diagnosis.field.design import point_residuals
-from virest.diagnosis.field.forms import OVER, FieldForm, possible_forms
+from virest.diagnosis.field.design import PointResiduals, point_residuals
+from virest.diagnosis.field.forms import (
+    FRAMES_PER_STEP,
+    OVER,
+    FieldForm,
+    possible_forms,
+)
 from virest.diagnosis.field.records import FittedField
-from virest.diagnosis.field.screening import MIN_T, Selection, score_forms, select, t_ratio
+from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, Scored, Selection, score_forms, select, t_ratio
+from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
     FINAL_POINTS,
@@ -33,14 +39,16 @@ from virest.inference.track_fit import Term, TrackFit
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Index = NDArray[np.intp]
 MAX_FIELDS = 3
 SEARCH_POINTS, JUDGE_POINTS = 6000, 4000
 PAIRS_IN_BLOCK = 3
 """Neighbouring pairs share a frame, and so its tracking errors: blocks of three share them at their ends only."""
 MIN_SIZE_PX = 0.025
-"""Structure below 0.02 px may be tracking's own bias."""
+"""Structure below 0.02 px may be tracking's own bias; a smaller one only enters in place of a named cause."""
 MIN_BLOCKS = 8
+LASTING_PART = 0.5
+"""Least part of the loss about a sudden change that goes by what the frames before and after say of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,27 +71,23 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         chosen = _asked_for(evidence, capture, model, fitted)
         if chosen is None:
             break
-        form, selection = chosen
-        entered = _entered(evidence, model, form, fitted)
+        entered = _entered(evidence, model, chosen, fitted)
         if entered is None:
             break
-        after_model, before, after = entered
-        model, accepted = _without_stand_ins(evidence, found, after_model, accepted)
+        model_after, accepted_after = _without_stand_ins(evidence, found, entered.model, accepted)
+        small = chosen.selection is not None and chosen.selection.size * evidence.typical_px < MIN_SIZE_PX
+        if small and len(accepted_after) == len(accepted):
+            break
+        model, accepted = model_after, accepted_after
         fitted = evidence.fit(model, model.terms, evidence.table(model, FINAL_POINTS))
         model = replace(model, profile=fitted.profile, scene=fitted.scene)
         typical = evidence.typical_px
+        stability = chosen.selection.stability if chosen.selection else None
+        before_px, after_px = entered.before.rms * typical, entered.after.rms * typical
         fields.append(
-            FittedField(
-                form,
-                selection.rivals,
-                selection.best.p_value,
-                selection.stability,
-                before.rms * typical,
-                after.rms * typical,
-                fitted,
-            )
+            FittedField(entered.form, chosen.rivals, chosen.p_value, stability, before_px, after_px, fitted)
         )
-        log.debug("field: %s, p %.2g, beside %s", form.name, selection.best.p_value, selection.rivals)
+        log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
     if not fields:
         return found
     table = evidence.table(model, FINAL_POINTS)
@@ -99,16 +103,35 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A form that residuals ask for: all of them together, or those between two frames."""
+
+    form: FieldForm
+    selection: Selection | None = None
+    sudden: SuddenChange | None = None
+
+    @property
+    def p_value(self) -> float:
+        """For the whole set of forms, or for all pairs."""
+        return self.selection.best.p_value if self.selection else self.sudden.p_value if self.sudden else 1.0
+
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """Forms that explain the residuals as well."""
+        return self.selection.rivals if self.selection else ()
+
+
 def _asked_for(
     evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit
-) -> tuple[FieldForm, Selection] | None:
+) -> _Asked | None:
     """The form that the residuals of a model ask for, and how sure that is."""
     table = evidence.table(model, SEARCH_POINTS)
     fitted = fit_model(evidence.imu, model, model.terms, table)
     in_model = {term.name for term in model.terms}
     seconds = fitted.seconds
     forms = possible_forms(capture, fitted.profile, (float(seconds.min()), float(seconds.max())))
-    forms = [form for form in forms if form.name not in in_model]
+    forms = [form for form in forms if form.family not in in_model]
     seen = point_residuals(evidence.imu, fitted, table)
     block = table.pair // PAIRS_IN_BLOCK
     if len(np.unique(block)) < MIN_BLOCKS:
@@ -116,8 +139,8 @@ def _asked_for(
     tangent = seen.tangent()
     if model.terms:
         tangent = np.concatenate([tangent, seen.effect(model.terms)], axis=-1)
-    designs = [(form.name, seen.effect((form.term,)), form.over_time) for form in forms]
-    scored = score_forms(seen.left, seen.weight, tangent, designs, block, table.pair)
+    blind_s = FRAMES_PER_STEP * evidence.period_s
+    scored = _scored(seen, tangent, forms, block, blind_s)
     for entry in scored:
         log.debug(
             "%s: p %.2g, gain %.4g (t %.1f), parts t %s",
@@ -128,22 +151,79 @@ def _asked_for(
             None if entry.parts_gain is None else round(t_ratio(entry.parts_gain), 1),
         )
     selection = select(scored, float(seen.weight.sum()))
-    if selection is None or selection.size * evidence.typical_px < MIN_SIZE_PX:
+    if (sudden := sudden_change(seen)) is not None and not any(", a step" in name for name in in_model):
+        form = best_instant(seen, capture, sudden.at_s, sudden.scale, evidence.period_s)
+        return _Asked(form, sudden=sudden)
+    if selection is None:
         return None
-    return next(form for form in forms if form.name == selection.best.name), selection
+    form = next(form for form in forms if form.name == selection.best.name)
+    if form.step_s is not None:
+        scale = lasting_change(seen, tangent, _effect(seen, form, blind_s))
+        form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
+    return _Asked(form, selection)
 
 
-def _entered(
-    evidence: Evidence, model: Model, form: FieldForm, fitted: TrackFit
-) -> tuple[Model, HeldOut, HeldOut] | None:
-    """The model with a form in it, and both on blocks that they were not fitted to; None where these do not gain."""
-    extended = replace(model, terms=(*model.terms, form.term))
-    before, after = (_held_out(evidence, m, fitted) for m in (model, extended))
-    gain = before.block_loss - after.block_loss
-    log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
-    if gain.mean() < MIN_GAIN * before.block_loss.mean() or t_ratio(gain) < MIN_T:
-        return None
-    return extended, before, after
+def _scored(
+    seen: PointResiduals, tangent: Array, forms: Sequence[FieldForm], block: Index, blind_s: float
+) -> list[Scored]:
+    """Scores of forms, best gain first; of the forms of one field the best alone.
+
+    blind_s: how near to a sudden change points are not asked.  Between two frames it moves them by many times their
+    noise, so that an instant that is a frame off would be ruled out by the points that tell it best.
+    """
+    sudden = [form for form in forms if form.step_s is not None]
+    best: dict[str, Scored] = {}
+    for group in ([form for form in forms if form.step_s is None], sudden):
+        designs = [(form.name, _effect(seen, form, blind_s), form.over_time) for form in group]
+        family = {form.name: form.family for form in group}
+        for entry in score_forms(seen.left, seen.weight, tangent, designs, block, seen.table.pair):
+            known = best.get(family[entry.name])
+            if known is None or entry.gain.sum() > known.gain.sum():
+                best[family[entry.name]] = entry
+    return sorted(best.values(), key=lambda entry: -float(entry.gain.sum()))
+
+
+def _effect(seen: PointResiduals, form: FieldForm, blind_s: float) -> Array:
+    effect = seen.effect((form.term,))
+    if form.step_s is not None and blind_s:
+        profile, table = seen.fit.profile, seen.table
+        lasting_s = profile.shutter.readout_time_s + table.second_exposure_s
+        begin_s, end_s = (np.asarray(profile.imu_time_s(t)) for t in (table.first_stamp_s, table.second_stamp_s))
+        near = (begin_s - blind_s < form.step_s) & (form.step_s < end_s + lasting_s + blind_s)
+        effect[near] = 0.0
+    return effect
+
+
+@dataclass(frozen=True, slots=True)
+class _Entered:
+    """A model with a form in it, and what held-out blocks say without and with it."""
+
+    model: Model
+    form: FieldForm
+    before: HeldOut
+    after: HeldOut
+
+
+def _entered(evidence: Evidence, model: Model, asked: _Asked, fitted: TrackFit) -> _Entered | None:
+    """The model with a form in it, with as many knots as pay; None where held-out blocks do not gain."""
+    before = _held_out(evidence, model, fitted)
+    entered, wanted = None, MIN_LOCAL_T if asked.form.over_time else MIN_T
+    finer: FieldForm | None = asked.form
+    while finer is not None:
+        extended = replace(model, terms=(*model.terms, finer.term))
+        last = before if entered is None else entered.after
+        after = _held_out(evidence, extended, fitted)
+        gain = last.block_loss - after.block_loss
+        log.debug("%s held out: %.4f to %.4f, t %.1f", finer.name, last.rms, after.rms, t_ratio(gain))
+        holds = t_ratio(gain) > wanted
+        if asked.sudden is not None:
+            # most of the gain lies in one block; that of the others tells the change, and it must hold there
+            there = asked.sudden.pair // PAIRS_IN_BLOCK
+            holds = bool(gain[there] > LASTING_PART * last.block_loss[there])
+        if gain.mean() < MIN_GAIN * last.block_loss.mean() or not holds:
+            break
+        entered, finer = _Entered(extended, finer, before, after), finer.finer
+    return entered
 
 
 def _held_out(evidence: Evidence, model: Model, scaled: TrackFit) -> HeldOut:
