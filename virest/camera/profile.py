@@ -318,7 +318,7 @@ class _Defocus(_Strict):
 
 class _Field(_Strict):
     version: Literal[1] = 1
-    kind: Literal["delay", "displacement", "scale", "rate"]
+    kind: Literal["delay", "displacement", "scale", "rate", "gain"]
     covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
     knots: Annotated[list[Annotated[list[Number], Field(max_length=200)]], Field(min_length=1, max_length=2)]
     values: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)]

@@ -22,7 +22,7 @@ from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
-from virest.simulation.hidden import NOTHING, Hidden, gyro_reading
+from virest.simulation.hidden import NOTHING, Hidden, gyro_reading, shaded
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
@@ -236,7 +236,7 @@ def render_picture(session: Session, slot: int, phone: PhonePictures | None = No
         session.first_row_start_s(capture),
         session.true_exposure_s(capture),
     )
-    light = sensor_light(light, session.true, _gain(session, slot), defocus=True)
+    light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=True))
     rng = np.random.default_rng([session.settings.seed, 3, capture])
     levels = noisy_levels(_grey(session, light), session.settings.noise_levels, rng)
     return round_levels(levels if phone is None else 255.0 * phone.develop(levels / 255.0))
@@ -250,7 +250,7 @@ def render_truth(session: Session, slot: int, *, middle: bool = False) -> Pictur
     capture = int(session.shows[slot])
     time_s = session.middle_s(capture) if middle else session.first_row_start_s(capture)
     light = instant(session.scene, session.motion, session.view, time_s)
-    light = sensor_light(light, session.true, _gain(session, slot), defocus=False)
+    light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=False))
     return eight_bit(tone_curve(_grey(session, light), session.settings.isp.tone), 0.0, None)
 
 

@@ -143,6 +143,18 @@ def _lens_switch(rng: np.random.Generator, size: float) -> Strangeness:
     return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
 
 
+def _shading(rng: np.random.Generator, size: float) -> Strangeness:
+    """A vignette off centre, or something before one side of the lens."""
+    part, turn, kind = 0.05 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
+    way = np.cos(turn), np.sin(turn)
+
+    def light(x: Array, y: Array) -> Array:
+        along = 2 * ((x - 0.5) * way[0] + (y - 0.5) * way[1])
+        return np.asarray(1 - part * (along + 1) / 2 if kind else 1 - 1.5 * part * np.clip(along, 0, None) ** 2)
+
+    return Strangeness(Hidden(light=light), expected=(_either(("gain", "x, y")),), lasting=False)
+
+
 def _two(rng: np.random.Generator, size: float) -> Strangeness:
     uneven, lens = _uneven(rng, size), _tangential(rng, size)
     return replace(uneven, tangential=lens.tangential, expected=(*uneven.expected, *lens.expected))
@@ -176,6 +188,7 @@ EFFECTS: dict[str, Draw] = {
     "thermal": _thermal,
     "g_sensitivity": _g_sensitivity,
     "lens_switch": _lens_switch,
+    "shading": _shading,
     "two": _two,
     "one_named": _one_named,
 }

@@ -95,18 +95,18 @@ def score_forms(
 ) -> list[Scored]:
     """Score forms, best gain first.
 
-    left: (n, 2) residuals in standard deviations; weight (n,); tangent (n, 2, m); designs: name, effect (n, 2, k) per
+    left: (n, d) residuals in standard deviations; weight (n,); tangent (n, d, m); designs: name, effect (n, d, k) per
     free number, and whether the form runs over time; block (n,) number of the block of time, rising; moment (n,)
     the same of shorter stretches within blocks, by which forms over time are tested: a few blocks hold each knot.
     """
-    root = np.repeat(np.sqrt(weight), 2)[:, None]
+    root = np.repeat(np.sqrt(weight), left.shape[1])[:, None]
     frame = _orthonormal(tangent.reshape(len(root), -1) * root)
     error = left.reshape(-1, 1) * root
     error = (error - frame @ (frame.T @ error))[:, 0]
     moments, fine = np.unique(block if moment is None else moment, return_inverse=True)
     coarse = np.zeros(len(moments), np.intp)
     coarse[fine] = np.unique(block, return_inverse=True)[1]
-    of_row = np.repeat(fine, 2)
+    of_row = np.repeat(fine, left.shape[1])
     summed = (
         _summed(name, design.reshape(len(root), -1) * root, frame, error, of_row, over)
         for name, design, over in designs

@@ -68,25 +68,25 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     model, fitted, accepted = replace(found.model, terms=terms), found.fit, list(found.accepted)
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
-        chosen = _asked_for(evidence, capture, model, fitted)
-        if chosen is None:
-            break
-        entered = _entered(evidence, model, chosen, fitted)
-        if entered is None:
+        forms = _asked_for(evidence, capture, model, fitted)
+        tried = ((asked, _entered(evidence, model, asked, fitted)) for asked in forms)
+        chosen, entered = next((pair for pair in tried if pair[1] is not None), (None, None))
+        if chosen is None or entered is None:
             break
         model_after, accepted_after = _without_stand_ins(evidence, found, entered.model, accepted)
         small = chosen.selection is not None and chosen.selection.size * evidence.typical_px < MIN_SIZE_PX
         if small and len(accepted_after) == len(accepted):
             break
+        before = entered.before
+        if len(accepted_after) < len(accepted):
+            before = _held_out(evidence, _without_form(model_after, entered.form), fitted)
         model, accepted = model_after, accepted_after
         fitted = evidence.fit(model, model.terms, evidence.table(model, FINAL_POINTS))
         model = replace(model, profile=fitted.profile, scene=fitted.scene)
         typical = evidence.typical_px
         stability = chosen.selection.stability if chosen.selection else None
-        before_px, after_px = entered.before.rms * typical, entered.after.rms * typical
-        fields.append(
-            FittedField(entered.form, chosen.rivals, chosen.p_value, stability, before_px, after_px, fitted)
-        )
+        before_px, after_px = before.rms * typical, entered.after.rms * typical
+        fields.append(FittedField(entered.form, chosen.rivals, chosen.p_value, stability, before_px, after_px, fitted))
         log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
     if not fields:
         return found
@@ -122,10 +122,8 @@ class _Asked:
         return self.selection.rivals if self.selection else ()
 
 
-def _asked_for(
-    evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit
-) -> _Asked | None:
-    """The form that the residuals of a model ask for, and how sure that is."""
+def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> list[_Asked]:
+    """The forms that the residuals of a model ask for, the one between two frames first, and how sure that is."""
     table = evidence.table(model, SEARCH_POINTS)
     fitted = fit_model(evidence.imu, model, model.terms, table)
     in_model = {term.name for term in model.terms}
@@ -135,7 +133,7 @@ def _asked_for(
     seen = point_residuals(evidence.imu, fitted, table)
     block = table.pair // PAIRS_IN_BLOCK
     if len(np.unique(block)) < MIN_BLOCKS:
-        return None
+        return []
     tangent = seen.tangent()
     if model.terms:
         tangent = np.concatenate([tangent, seen.effect(model.terms)], axis=-1)
@@ -151,16 +149,17 @@ def _asked_for(
             None if entry.parts_gain is None else round(t_ratio(entry.parts_gain), 1),
         )
     selection = select(scored, float(seen.weight.sum()))
+    asked: list[_Asked] = []
     if (sudden := sudden_change(seen)) is not None and not any(", a step" in name for name in in_model):
         form = best_instant(seen, capture, sudden.at_s, sudden.scale, evidence.period_s)
-        return _Asked(form, sudden=sudden)
+        asked.append(_Asked(form, sudden=sudden))
     if selection is None:
-        return None
+        return asked
     form = next(form for form in forms if form.name == selection.best.name)
     if form.step_s is not None:
         scale = lasting_change(seen, tangent, _effect(seen, form, blind_s))
         form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
-    return _Asked(form, selection)
+    return [*asked, _Asked(form, selection)]
 
 
 def _scored(
@@ -224,6 +223,14 @@ def _entered(evidence: Evidence, model: Model, asked: _Asked, fitted: TrackFit) 
             break
         entered, finer = _Entered(extended, finer, before, after), finer.finer
     return entered
+
+
+def _without_form(model: Model, form: FieldForm) -> Model:
+    """The model without a form, whose values go back to nought."""
+    fields = form.filled(np.zeros(form.basis.shape[1]))
+    kept = [f for f in model.profile.fields if not any(f.is_in_place_of(own) for own in fields)]
+    terms = tuple(term for term in model.terms if term.name != form.name)
+    return replace(model, profile=model.profile.with_fields(kept), terms=terms)
 
 
 def _held_out(evidence: Evidence, model: Model, scaled: TrackFit) -> HeldOut:

@@ -188,7 +188,7 @@ def curve_shape(curve: Array, over_time: bool = False) -> str:
         return "a straight line"
     if not over_time and _is_step(curve):
         return "a step"
-    if _is_sawtooth(curve, u):
+    if not over_time and _is_sawtooth(curve, u):
         return "even blocks with a jump between them"
     if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
         monotone = np.all(np.diff(curve) >= 0) or np.all(np.diff(curve) <= 0)
