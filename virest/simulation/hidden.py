@@ -24,6 +24,8 @@ class Hidden:
 
     row_delay_s: Callable[[Array], Array] | None = None
     """Of the fraction of the readout (rows,): how much later than evenly each row starts."""
+    clock_s: Callable[[float], float] | None = None
+    """Of a stamp: how much later than the clocks say the frame is taken."""
     focal_scale: Callable[[Array], Array] | None = None
     """Of time: factor on the focal length."""
     gyro: Callable[[Array, Array, Array], Array] | None = None

@@ -126,7 +126,8 @@ class Session:
         """Start of the first row's exposure, IMU clock from stamp_0."""
         stamps = self.capture_s
         stamp_s = _stamp_s(capture, self.settings.fps) if stamps is None else float(stamps[capture])
-        return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture))
+        late_s = 0.0 if self.hidden.clock_s is None else self.hidden.clock_s(stamp_s)
+        return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture)) + late_s
 
     def middle_s(self, capture: int) -> float:
         """Start of the first row + half the readout + half the exposure."""
@@ -348,7 +349,8 @@ def _stamp_s(index: int, fps: float) -> float:
 
 def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: float) -> float:
     start_cam = stamp_s - STAMP_PLACE[true.shutter.timestamp] * true_exposure_s
-    return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0)
+    late_s = sum(float(f.at_time(start_cam)[0]) for f in true.extensions.field if f.kind == "delay")
+    return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0) + late_s
 
 
 def shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np.int64]:

@@ -33,12 +33,13 @@ from virest.simulation.session import SessionSettings, nominal_camera, plan_sess
 Array = NDArray[np.float64]
 Row = dict[str, Any]
 Draw = Callable[[np.random.Generator, float], "Strangeness"]
-WIDTH, HEIGHT, FPS = 640, 480, 30.0
+SIZE, SMALL, FPS = (640, 480), (480, 360), 30.0
+"""Of captures with an unknown effect, and of those without."""
 FRAMES, FRAMES_OF_OTHER = 96, 50
 FIRST_SEED, FIRST_NULL = 7100, 8100
 SEEDS = {"quick": 1, "usual": 2, "full": 6}
 NULLS = {"quick": 4, "usual": 16, "full": 50}
-SCENES = ("leaves", "text", "board")
+SCENES = ("leaves", "text", "board", "bright", "photographs")
 SOLVED = 0.8
 """Part of the excess residual that a right field takes away."""
 
@@ -143,6 +144,13 @@ def _lens_switch(rng: np.random.Generator, size: float) -> Strangeness:
     return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
 
 
+def _wandering(rng: np.random.Generator, size: float) -> Strangeness:
+    """Stamps whose clock wanders to and fro."""
+    late_s, hz, phase = 1.5e-3 * size * rng.uniform(0.8, 1.25), rng.uniform(0.35, 0.7), rng.uniform(0, 2 * np.pi)
+    hidden = Hidden(clock_s=lambda stamp_s: late_s * np.sin(2 * np.pi * hz * stamp_s + phase))
+    return Strangeness(hidden, expected=(_either(("delay", "time")),), lasting=False)
+
+
 def _shading(rng: np.random.Generator, size: float) -> Strangeness:
     """A vignette off centre, or something before one side of the lens."""
     part, turn, kind = 0.05 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
@@ -188,6 +196,7 @@ EFFECTS: dict[str, Draw] = {
     "thermal": _thermal,
     "g_sensitivity": _g_sensitivity,
     "lens_switch": _lens_switch,
+    "wandering": _wandering,
     "shading": _shading,
     "two": _two,
     "one_named": _one_named,
@@ -208,9 +217,10 @@ def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tu
     rng = np.random.default_rng([seed, 12 + other])
     frames = FRAMES_OF_OTHER if other else FRAMES
     distortion = ("radtan", (-0.02, 0.0, 0.0, 0.0, 0.0)) if seed % 3 == 0 else ("none", ())
+    size = SIZE if name in EFFECTS else SMALL
     acceleration = name == "g_sensitivity"
     nominal = nominal_camera(
-        WIDTH, HEIGHT, focal_px=float(np.random.default_rng([seed, 14]).uniform(430, 620)),
+        *size, focal_px=float(np.random.default_rng([seed, 14]).uniform(0.67, 0.97) * size[0]),
         readout_time_s=float(np.random.default_rng([seed, 15]).uniform(0.014, 0.026)),
         response=ResponseCurve("srgb"), distortion=distortion, depth_m=2.0 if acceleration else np.inf,
     )  # fmt: skip
@@ -320,7 +330,7 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         f"{summary['of_elsewhere']} solved on another capture; {summary['false_alarms']} false alarms in "
         f"{summary['nulls']} captures without an unknown effect"
     )
-    return {"summary": summary, "rows": rows}, f"Effects that no catalogue names, {FRAMES} frames, 640x480\n{text}"
+    return {"summary": summary, "rows": rows}, f"Effects that no catalogue names, {FRAMES} frames\n{text}"
 
 
 def shown(row: Row) -> list[str]:

@@ -22,11 +22,11 @@ from virest.diagnosis.photometry import PhotometricObservations, Prediction, pre
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-KNOTS = 5
+KNOTS = 4
 FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
 MOST_OBSERVATIONS = 15_000
-MIN_SIZE = 0.5
-"""Grey levels (rms): less is left of textured patches and by the encoder."""
+MIN_SIZE = 0.1
+"""Grey levels (rms): on nine captures without such a field textured patches and the encoder left up to 0.03."""
 CAUCHY, CAP = 2.5, 5.0
 """Noises at which a residual has half its weight, and beyond which it counts as that many."""
 RIDGE = 1e-3
@@ -87,6 +87,10 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile) -
     size = float(np.sqrt(max(scored.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))
     if min(t_ratio(scored.gain), t_ratio(scored.parts_gain)) < MIN_T or size < MIN_SIZE:
         return None
+    if not profile.extensions.vignetting_corner_loss:
+        # what a centred vignetting would say is no one else's then
+        basis, tangent = null_space(_middle(zero, profile)[None]), tangent[:, 1:]
+        design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
     columns = np.concatenate([design, tangent], axis=1)
     numbers, covariance = _solved(columns, left, weight, block, design.shape[1])
     values = basis @ numbers
@@ -111,12 +115,15 @@ def _form(profile: CameraProfile) -> tuple[Field, Array]:
     """A map of nought, and its free numbers: nought in the middle (each patch's own light), no vignetting in it."""
     knots = tuple(tuple(np.linspace(0.0, side - 1, KNOTS).tolist()) for side in (profile.width, profile.height))
     x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
-    middle = (0.5 * (profile.width - 1), 0.5 * (profile.height - 1))
-    radius2 = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
-    here = np.outer(*(cardinal_weights(k, m) for k, m in zip(knots, middle, strict=True))).ravel()
-    rows = np.stack([here, radius2 / np.linalg.norm(radius2)])
+    radius2 = (x - 0.5 * (profile.width - 1)) ** 2 + (y - 0.5 * (profile.height - 1)) ** 2
     field = Field("gain", ("x", "y"), knots, ((0.0,),) * KNOTS**2)
-    return field, null_space(rows)
+    return field, null_space(np.stack([_middle(field, profile), radius2 / np.linalg.norm(radius2)]))
+
+
+def _middle(field: Field, profile: CameraProfile) -> Array:
+    """(knots,) weights of the value in the picture's middle."""
+    middle = (0.5 * (profile.width - 1), 0.5 * (profile.height - 1))
+    return np.outer(*(cardinal_weights(k, m) for k, m in zip(field.knots, middle, strict=True))).ravel()
 
 
 def _weights(field: Field, seen: PhotometricObservations) -> Array:

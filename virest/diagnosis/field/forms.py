@@ -117,7 +117,7 @@ class FieldForm:
     def finer(self) -> FieldForm | None:
         """The same with about twice the knots; None where there is no such form."""
         knots = 2 * len(self.fields[0].knots[0]) - 1
-        return _row_form(knots) if self.kind == "delay" and knots <= MOST_ROW_KNOTS else None
+        return _row_form(knots) if self.covariates == ("row",) and knots <= MOST_ROW_KNOTS else None
 
     @property
     def term(self) -> Term:
@@ -129,8 +129,8 @@ class FieldForm:
 
 def _adds_to(field: Field, known: Field) -> bool:
     """Whether two fields are one, or only one of their kind may be held."""
-    single = field.kind in ("delay", "displacement")
-    return known.kind == field.kind and (single or (known.covariates, known.knots) == (field.covariates, field.knots))
+    alike = (known.kind, known.covariates) == (field.kind, field.covariates)
+    return alike and (field.is_single or known.knots == field.knots)
 
 
 def _at_knots(before: Field, field: Field) -> Array:
@@ -142,6 +142,7 @@ def _at_knots(before: Field, field: Field) -> Array:
 def possible_forms(capture: Capture, profile: CameraProfile, span_s: tuple[float, float]) -> list[FieldForm]:
     """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock."""
     forms = [_place_form(profile), _drift_form("scale", span_s, capture), _drift_form("rate", span_s, capture)]
+    forms.append(_drift_form("delay", span_s, capture))
     forms += step_forms(capture, coarse_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms.append(_row_form())
@@ -190,12 +191,14 @@ def _place_form(profile: CameraProfile) -> FieldForm:
 
 
 def _drift_form(kind: str, span_s: tuple[float, float], capture: Capture) -> FieldForm:
-    """Over time: a focal length from where it begins, rates about their mean (bias)."""
+    """Over time: a focal length from where it begins, rates about their mean (bias), a delay about a line (skew)."""
     count = int(np.clip(round((span_s[1] - span_s[0]) / TIME_STEP_S) + 1, *TIME_KNOTS))
     knots = np.linspace(span_s[0], span_s[1], count)
     field = _zero(kind, (TIME,), [knots], capture.stamp_0_ns)
     if kind == "scale":
         return FieldForm((field,), np.eye(count)[:, 1:])
+    if kind == "delay":
+        return FieldForm((field,), null_space(np.stack([np.ones(count), np.linspace(-1, 1, count)])))
     return FieldForm((field,), np.kron(null_space(np.ones((1, count))), np.eye(3)))
 
 

@@ -30,8 +30,8 @@ RIDGE = 1e-3
 MAX_P = 1e-3
 """False-alarm rate of the whole set of forms."""
 MIN_T, MIN_LOCAL_T = 3.0, 2.0
-"""Least ratio of the held-out gain to its standard error; of a form over time, whose gain may lie in a few blocks: one in
-seven of 30 blocks makes no more than 2.2, however large it is there."""
+"""Least ratio of the held-out gain to its standard error; of a form over time, whose gain may lie in a few blocks: one
+in seven of 30 blocks makes no more than 2.2, however large it is there."""
 RIVAL_T = 2.0
 """Forms whose gains differ by less than this many standard errors cannot be told apart."""
 ALIKE_PART = 0.9

@@ -47,6 +47,11 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "the sensor reads its lines in blocks or pauses between them, or the picture was cropped and scaled by lines",
         "film a lamp that flickers at a known rate, without other light: its bands show each line's time",
     ),
+    ("delay", ("time",)): Pattern(
+        "frames are {lateness} by up to {size} {where} of the capture, {shape} of time: the stamps' clock wanders",
+        "stamps that are taken in software, a queue that fills, or a clock that is corrected while it runs",
+        "film a display that counts milliseconds, and compare the steps of the stamps with the steps shown",
+    ),
     ("displacement", ("x", "y")): Pattern(
         "shifts of up to {size} depend on the position in the picture, {shape}, the same in all frames: {lens}",
         "a lens element off centre or tilted, a window or waterproof case in front, or a correction by the phone that "
