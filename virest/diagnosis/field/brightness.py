@@ -1,7 +1,8 @@
 """A field of brightness: light that differs over the picture as no centred vignetting has it, the same in all frames.
 
 What is left of the patches' grey is regressed on a smooth map of the log light, beside what curve, vignetting and a
-gain for each frame can do.  Each patch's own light is a nuisance, so only patches that cross the picture tell.
+gain for each frame can do.  Each patch's own light is a nuisance, so only patches that cross the picture tell; where
+all move alike, an even slope is a gain of each frame, and stays nought.
 """
 
 from __future__ import annotations
