@@ -64,9 +64,10 @@ def test_a_field_of_gain_multiplies_the_vignetting_in_program_and_simulator_alik
     np.testing.assert_allclose(sensor_light(flat, profile, 1.0, defocus=False)[..., 1], factor, atol=1e-6)
     only = profile.with_fields(profile.fields)
     motion = TurningCamera(replace(only, extensions=replace(only.extensions, vignetting_corner_loss=0.0))).motion
-    light = frame_light(motion, 0.5, straighten=False)
+    light = frame_light(motion, 0.5, straighten=True)
     assert light is not None
     assert light.recorded[0, -1] == pytest.approx(1.1, abs=1e-6)
+    assert (light.recorded.dtype, light.kept.dtype) == (np.float32, np.float32)
 
 
 def test_vignetting_goes_where_the_pixel_goes() -> None:

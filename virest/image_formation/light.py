@@ -89,12 +89,13 @@ def row_light(motion: RowMotion, points_px: Array) -> Array:
 
 
 def vignetting(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:
-    """Part of the light that is left at pixels (x, y), with the profile's fields of gain."""
+    """Part of the light that is left at pixels (x, y), with the profile's fields of gain; float32 stays float32."""
     x, y = np.subtract(x_px, 0.5 * (profile.width - 1)), np.subtract(y_px, 0.5 * (profile.height - 1))
     corner_squared = 0.25 * (profile.width**2 + profile.height**2)
     left = _left(profile.extensions.vignetting_corner_loss / corner_squared, x * x + y * y)
     for field in light_maps(profile):
-        left = left * np.maximum(1.0 + field.at(x_px, y_px)[..., 0], LEAST_LIGHT)
+        gain = np.maximum(1.0 + field.at(x_px, y_px)[..., 0], LEAST_LIGHT)
+        left = left * gain.astype(np.asarray(left).dtype)
     return left
 
 

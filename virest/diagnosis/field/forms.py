@@ -23,7 +23,7 @@ from virest.inference.track_fit import Term
 
 Array = NDArray[np.float64]
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
-MOST_ROW_KNOTS = 40
+MOST_KNOTS = 40
 TIME_STEP_S, TIME_KNOTS = 0.4, (4, 12)
 STEP_EDGE_S, FRAMES_PER_STEP, MOST_STEPS = 1e-3, 2, 100
 """Width of a sudden change, and how densely in time one is looked for."""
@@ -116,8 +116,13 @@ class FieldForm:
     @property
     def finer(self) -> FieldForm | None:
         """The same with about twice the knots; None where there is no such form."""
-        knots = 2 * len(self.fields[0].knots[0]) - 1
-        return _row_form(knots) if self.covariates == ("row",) and knots <= MOST_ROW_KNOTS else None
+        field = self.fields[0]
+        count = 2 * len(field.knots[0]) - 1
+        if self.covariates == ("row",) and count <= MOST_KNOTS:
+            return _row_form(count)
+        if self.covariates == (TIME,) and self.step_s is None and count <= MOST_KNOTS:
+            return _drift_form(self.kind, np.linspace(field.knots[0][0], field.knots[0][-1], count), field.stamp_0_ns)
+        return None
 
     @property
     def term(self) -> Term:
@@ -141,8 +146,9 @@ def _at_knots(before: Field, field: Field) -> Array:
 
 def possible_forms(capture: Capture, profile: CameraProfile, span_s: tuple[float, float]) -> list[FieldForm]:
     """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock."""
-    forms = [_place_form(profile), _drift_form("scale", span_s, capture), _drift_form("rate", span_s, capture)]
-    forms.append(_drift_form("delay", span_s, capture))
+    count = int(np.clip(round((span_s[1] - span_s[0]) / TIME_STEP_S) + 1, *TIME_KNOTS))
+    drifts = [_drift_form(kind, np.linspace(*span_s, count), capture.stamp_0_ns) for kind in ("scale", "rate", "delay")]
+    forms = [_place_form(profile), *drifts]
     forms += step_forms(capture, coarse_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms.append(_row_form())
@@ -190,11 +196,9 @@ def _place_form(profile: CameraProfile) -> FieldForm:
     return FieldForm((field,), null_space(rows / np.linalg.norm(rows, axis=1, keepdims=True)))
 
 
-def _drift_form(kind: str, span_s: tuple[float, float], capture: Capture) -> FieldForm:
+def _drift_form(kind: str, knots: Array, stamp_0_ns: int | None) -> FieldForm:
     """Over time: a focal length from where it begins, rates about their mean (bias), a delay about a line (skew)."""
-    count = int(np.clip(round((span_s[1] - span_s[0]) / TIME_STEP_S) + 1, *TIME_KNOTS))
-    knots = np.linspace(span_s[0], span_s[1], count)
-    field = _zero(kind, (TIME,), [knots], capture.stamp_0_ns)
+    count, field = len(knots), _zero(kind, (TIME,), [knots], stamp_0_ns)
     if kind == "scale":
         return FieldForm((field,), np.eye(count)[:, 1:])
     if kind == "delay":

@@ -205,23 +205,36 @@ class _Entered:
 
 def _entered(evidence: Evidence, model: Model, asked: _Asked, fitted: TrackFit) -> _Entered | None:
     """The model with a form in it, with as many knots as pay; None where held-out blocks do not gain."""
-    before = _held_out(evidence, model, fitted)
-    entered, wanted = None, MIN_LOCAL_T if asked.form.over_time else MIN_T
-    finer: FieldForm | None = asked.form
-    while finer is not None:
+    form, wanted = asked.form, MIN_LOCAL_T if asked.form.over_time else MIN_T
+    extended = replace(model, terms=(*model.terms, form.term))
+    before, after = (_held_out(evidence, m, fitted) for m in (model, extended))
+    gain = before.block_loss - after.block_loss
+    log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
+    holds = t_ratio(gain) > wanted
+    if asked.sudden is not None:
+        # most of the gain lies in one block; that of the others tells the change, and it must hold there
+        there = asked.sudden.pair // PAIRS_IN_BLOCK
+        holds = bool(gain[there] > LASTING_PART * before.block_loss[there])
+    if gain.mean() < MIN_GAIN * before.block_loss.mean() or not holds:
+        return None
+    return _refined(evidence, model, _Entered(extended, form, before, after), fitted)
+
+
+def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackFit) -> _Entered:
+    """The same with twice the knots, as often as held-out points gain.
+
+    A form over time is judged on other points of the frames that it was fitted to: fine knots lie as close as blocks.
+    """
+    by_point = entered.form.over_time
+    last = _held_out(evidence, entered.model, fitted, by_point) if by_point else entered.after
+    while (finer := entered.form.finer) is not None:
         extended = replace(model, terms=(*model.terms, finer.term))
-        last = before if entered is None else entered.after
-        after = _held_out(evidence, extended, fitted)
+        after = _held_out(evidence, extended, fitted, by_point)
         gain = last.block_loss - after.block_loss
-        log.debug("%s held out: %.4f to %.4f, t %.1f", finer.name, last.rms, after.rms, t_ratio(gain))
-        holds = t_ratio(gain) > wanted
-        if asked.sudden is not None:
-            # most of the gain lies in one block; that of the others tells the change, and it must hold there
-            there = asked.sudden.pair // PAIRS_IN_BLOCK
-            holds = bool(gain[there] > LASTING_PART * last.block_loss[there])
-        if gain.mean() < MIN_GAIN * last.block_loss.mean() or not holds:
+        log.debug("%d knots: %.4f to %.4f, t %.1f", len(finer.basis), last.rms, after.rms, t_ratio(gain))
+        if gain.mean() < MIN_GAIN * last.block_loss.mean() or t_ratio(gain) < MIN_T:
             break
-        entered, finer = _Entered(extended, finer, before, after), finer.finer
+        entered, last = _Entered(extended, finer, entered.before, after), after
     return entered
 
 
@@ -233,14 +246,18 @@ def _without_form(model: Model, form: FieldForm) -> Model:
     return replace(model, profile=model.profile.with_fields(kept), terms=terms)
 
 
-def _held_out(evidence: Evidence, model: Model, scaled: TrackFit) -> HeldOut:
-    """Fit on every other block of a few pairs, judge on those between, and the other way round."""
+def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool = False) -> HeldOut:
+    """Fit on every other block of a few pairs, judge on those between, and the other way round.
+
+    by_point: on every other point of all pairs instead.
+    """
     table = evidence.table(model, JUDGE_POINTS)
     block = table.pair // PAIRS_IN_BLOCK
+    fold = (np.arange(len(table)) if by_point else block) % 2
     left = np.zeros(len(table))
-    for fold in (0, 1):
-        part = fit_model(evidence.imu, model, model.terms, table.chosen(block % 2 == fold))
-        left[block % 2 != fold] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[block % 2 != fold]
+    for number in (0, 1):
+        part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number))
+        left[fold != number] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[fold != number]
     counts = np.maximum(np.bincount(block), 1)
     return HeldOut(np.bincount(block, loss(left, 1.0)) / counts, capped_rms(left))
 
