@@ -48,6 +48,8 @@ class FieldForm:
     """(values of all fields, numbers): values at the knots per free number; columns are orthonormal."""
     step_s: float | None = None
     """Time of a sudden change; None: the form is smooth."""
+    known: frozenset[str] = frozenset()
+    """Causes that say part of what the form could."""
 
     @property
     def kind(self) -> str:
@@ -121,7 +123,8 @@ class FieldForm:
         if self.covariates == ("row",) and count <= MOST_KNOTS:
             return _row_form(count)
         if self.covariates == (TIME,) and self.step_s is None and count <= MOST_KNOTS:
-            return _drift_form(self.kind, np.linspace(field.knots[0][0], field.knots[0][-1], count), field.stamp_0_ns)
+            knots = np.linspace(field.knots[0][0], field.knots[0][-1], count)
+            return _drift_form(self.kind, knots, field.stamp_0_ns, self.known)
         return None
 
     @property
@@ -144,10 +147,16 @@ def _at_knots(before: Field, field: Field) -> Array:
     return before.at(*(axis.ravel() for axis in grid))
 
 
-def possible_forms(capture: Capture, profile: CameraProfile, span_s: tuple[float, float]) -> list[FieldForm]:
-    """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock."""
+def possible_forms(
+    capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
+) -> list[FieldForm]:
+    """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock.
+
+    known: causes that are in the model and say what the forms need not.
+    """
     count = int(np.clip(round((span_s[1] - span_s[0]) / TIME_STEP_S) + 1, *TIME_KNOTS))
-    drifts = [_drift_form(kind, np.linspace(*span_s, count), capture.stamp_0_ns) for kind in ("scale", "rate", "delay")]
+    knots = np.linspace(*span_s, count)
+    drifts = [_drift_form(kind, knots, capture.stamp_0_ns, known) for kind in ("scale", "rate", "delay")]
     forms = [_place_form(profile), *drifts]
     forms += step_forms(capture, coarse_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
@@ -196,13 +205,18 @@ def _place_form(profile: CameraProfile) -> FieldForm:
     return FieldForm((field,), null_space(rows / np.linalg.norm(rows, axis=1, keepdims=True)))
 
 
-def _drift_form(kind: str, knots: Array, stamp_0_ns: int | None) -> FieldForm:
-    """Over time: a focal length from where it begins, rates about their mean (bias), a delay about a line (skew)."""
+def _drift_form(kind: str, knots: Array, stamp_0_ns: int | None, known: frozenset[str]) -> FieldForm:
+    """Over time: a focal length from where it begins, rates about their mean (bias), a delay.
+
+    Where an offset or a skew of the clocks is in the model the delay has no mean or slope.
+    """
     count, field = len(knots), _zero(kind, (TIME,), [knots], stamp_0_ns)
     if kind == "scale":
         return FieldForm((field,), np.eye(count)[:, 1:])
     if kind == "delay":
-        return FieldForm((field,), null_space(np.stack([np.ones(count), np.linspace(-1, 1, count)])))
+        line = {"time_offset": np.ones(count), "clock_skew": np.linspace(-1, 1, count)}
+        held = [row for name, row in line.items() if name in known]
+        return FieldForm((field,), null_space(np.stack(held)) if held else np.eye(count), known=known)
     return FieldForm((field,), np.kron(null_space(np.ones((1, count))), np.eye(3)))
 
 

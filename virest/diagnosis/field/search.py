@@ -128,7 +128,7 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     fitted = fit_model(evidence.imu, model, model.terms, table)
     in_model = {term.name for term in model.terms}
     seconds = fitted.seconds
-    forms = possible_forms(capture, fitted.profile, (float(seconds.min()), float(seconds.max())))
+    forms = possible_forms(capture, fitted.profile, (float(seconds.min()), float(seconds.max())), frozenset(in_model))
     forms = [form for form in forms if form.family not in in_model]
     seen = point_residuals(evidence.imu, fitted, table)
     block = table.pair // PAIRS_IN_BLOCK

@@ -22,6 +22,8 @@ ALIKE = 0.95
 """Part of a field's variance that a shape must explain to name it."""
 STEP_SPAN, STEP_PART = 0.25, 0.8
 """A step: this part of the change within this part of the range."""
+TURNED_PART = 0.1
+"""Of the change: a curve that levels off turns back by no more than this."""
 JUMP_WIDTH = 0.1
 """In half the range: a spline of forty knots makes no sharper jump."""
 SHAPE_PART = 0.9
@@ -196,8 +198,8 @@ def curve_shape(curve: Array, over_time: bool = False) -> str:
     if not over_time and _is_sawtooth(curve, u):
         return "even blocks with a jump between them"
     if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
-        monotone = np.all(np.diff(curve) >= 0) or np.all(np.diff(curve) <= 0)
-        return "levelling off" if monotone and over_time else "a parabola"
+        rises, falls = (float(np.clip(way * np.diff(curve), 0, None).sum()) for way in (1, -1))
+        return "levelling off" if over_time and min(rises, falls) < TURNED_PART * np.ptp(curve) else "a parabola"
     slope = np.abs(np.diff(curve))
     if over_time and slope[: SAMPLES // 4].sum() > 2 * slope[-SAMPLES // 4 :].sum():
         return "levelling off"
