@@ -23,8 +23,8 @@ from virest.diagnosis.findings import CONSISTENT, Diagnosis
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.ladder import diagnose_capture
-from virest.motion.observed_tracks import observe_tracks
-from virest.motion.tracking import track_pairs
+from virest.inference.observed_tracks import observe_tracks
+from virest.inference.tracking import track_pairs
 from virest.simulation.effects import EffectContext, hide_effects
 from virest.simulation.hidden import NOTHING, Hidden
 from virest.simulation.recording import RecordingOptions, write_recording

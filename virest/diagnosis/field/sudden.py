@@ -15,7 +15,7 @@ from scipy import stats
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals
 from virest.diagnosis.field.forms import FieldForm, step_forms
-from virest.motion.track_model import seen_s
+from virest.image_formation.point_model import seen_s
 
 Array = NDArray[np.float64]
 CHANCE = 1e-4
