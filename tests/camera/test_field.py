@@ -30,7 +30,9 @@ def every_kind() -> list[Field]:
     """One field of each kind."""
     zoom = Field("scale", ("time",), ((0.0, 1.0, 2.0),), ((0.0,), (0.01,), (0.015,)), ((0.0,), (1e-4,), (2e-4,)), 77)
     rate = Field("rate", ("accel_y",), ((-20.0, 20.0),), ((-0.1, 0.02, 0.03), (0.1, -0.02, -0.03)))
-    return [LATE, bent(), zoom, rate]
+    drift = Field("delay", ("time",), ((0.0, 1.0, 2.0),), ((0.0,), (0.002,), (-0.001,)), (), 77)
+    light = Field("gain", ("x", "y"), ((0.0, 639.0), (0.0, 479.0)), ((0.0,), (0.1,), (-0.05,), (0.0,)))
+    return [LATE, bent(), zoom, rate, drift, light]
 
 
 def camera() -> CameraProfile:
@@ -71,7 +73,7 @@ def test_a_profile_with_fields_is_read_as_it_was_written() -> None:
     ("change", "said"),
     [
         ({"kind": "delays"}, "kind"),
-        ({"covariates": ["time"]}, "covariates are"),
+        ({"covariates": ["focus"]}, "covariates are"),
         ({"knots": [[0.0, 0.5, 0.5, 0.8, 1.0]]}, "rising knots"),
         ({"values": [[0.0]]}, "1 numbers for each knot"),
         ({"version": 2}, "version"),

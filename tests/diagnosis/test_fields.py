@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from diagnosis.strange_phone import Strange, StrangePhone
 from motion.synthetic_tracks import Setup
+from numpy.typing import NDArray
 
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
@@ -227,3 +229,69 @@ def test_a_found_field_holds_in_another_capture_of_the_phone() -> None:
     assert before > 3 * HAND.noise_px
     assert excess < 0.2
     assert isinstance(found.model.profile.shutter.uneven, Field)
+
+
+def test_a_lens_switch_is_a_step_and_no_drift() -> None:
+    """One and a half per cent from one instant on, for which a drift of the focal length must not stand in."""
+    phone = StrangePhone(replace(HAND, seed=86), Strange(longer=lambda t: np.where(t < 1.21, 0.0, 0.015)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates, field.shape) == ("scale", ("time",), "a step")
+    assert field.size == pytest.approx(0.015, rel=0.1)
+    # between two frames any instant is as good
+    assert np.mean(field.fields[0].knots[0]) == pytest.approx(1.21, abs=0.04)
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+
+
+def test_a_focal_length_that_settles_soon_is_not_taken_for_another_focal_length() -> None:
+    """The ladder names the constant part; the field, which says all of it, takes its place."""
+
+    def longer(time_s):
+        return 0.02 * (1 - np.exp(-np.maximum(time_s, 0) / 0.4))
+
+    phone = StrangePhone(replace(HAND, seed=87), Strange(longer=longer))
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert (field.covariates, field.shape) == (("time",), "levelling off")
+    assert gained(field) > 0.8
+
+
+def test_a_pause_in_the_readout_is_a_jump_of_the_row() -> None:
+    """Two even blocks with 2 ms between them: six knots do not say it, more are taken."""
+
+    def pause(fraction):
+        return 0.002 * (np.clip((fraction - 0.55) / 0.03, 0, 1) - fraction)
+
+    phone = StrangePhone(replace(HAND, seed=88, points=40), Strange(late_s=pause))
+    _, (field,) = judged(phone, phone.profile)
+    assert len(field.fields[0].knots[0]) > 6
+    assert field.shape == "even blocks with a jump between them"
+    assert gained(field) > 0.8
+
+
+def test_a_clock_that_wanders_is_a_delay_over_time() -> None:
+    """Neither an offset nor a constant skew; the frames' times come back."""
+
+    def late(stamp_s):
+        return 0.003 * np.sin(2 * np.pi * 0.6 * stamp_s)
+
+    phone = WanderingPhone(replace(HAND, seed=89), late)
+    verdict, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates) == ("delay", ("time",))
+    assert "the stamps' clock wanders" in field.sentence
+    profile, stamps = verdict.model.profile, phone.stamp_s
+    off = profile.imu_time_s(stamps) - phone.profile.imu_time_s(stamps) - late(stamps)
+    line = np.polyval(np.polyfit(stamps, off, 1), stamps)
+    assert np.std(off - line) < 5e-4
+
+
+class WanderingPhone(StrangePhone):
+    """A phone whose frames come later than their stamps, by a function of the stamp."""
+
+    def __init__(self, setup: Setup, late: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> None:
+        super().__init__(setup, Strange())
+        self.late = late
+
+    def seen_s(self, points_px, frame):
+        """All rows of a frame are late alike."""
+        return super().seen_s(points_px, frame) + self.late(self.stamp_s)[frame]

@@ -17,6 +17,7 @@ from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
 from virest.capture.video import probe_movie, read_frames
 from virest.diagnosis.curve_from_blur import MixingEvidence, estimate_mixing, judge_mixing, observe_mixing
+from virest.diagnosis.field.brightness import light_field, with_light_field
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
 from virest.diagnosis.photometry_effects import (
@@ -85,6 +86,31 @@ def test_the_true_profile_leaves_nothing_but_noise(rng: np.random.Generator) -> 
     left = residuals(made_observations(true, rng, 0.3), true)
     assert np.std(left) == pytest.approx(NOISE, rel=0.03)
     assert np.std(residuals(made_observations(true, rng, 0.3), NOMINAL)) > 4 * NOISE
+
+
+def test_a_shadow_on_one_side_is_a_field_and_a_vignette_is_none(rng: np.random.Generator) -> None:
+    """A fifth less on one side, beside a vignette that the profile has; the map comes back, and nothing without it.
+
+    Where all patches move alike an even slope is a gain of each frame: only how the map bends can be told.
+    """
+
+    def shadow(x_px):
+        return -0.2 * (x_px / 639) ** 3
+
+    profile = hidden(vignetting_corner_loss=0.3)
+    observed = made_observations(profile, rng)
+    assert light_field(observed, profile) is None
+    factor = np.exp(shadow(observed.x_px))
+    grey = np.asarray(NOMINAL.response.encode(NOMINAL.response.linearise(observed.grey / 255) * factor)) * 255
+    found = light_field(replace(observed, grey=grey), profile)
+    assert found is not None
+    x, y = np.meshgrid(np.linspace(100, 540, 9), np.linspace(80, 400, 7), indexing="ij")
+    off = np.log(1 + found.field.at(x, y)[..., 0]) - shadow(x)
+    plane = np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=-1)
+    bend = off.ravel() - plane @ np.linalg.lstsq(plane, off.ravel(), rcond=None)[0]
+    assert np.abs(bend).max() < 0.03
+    assert found.held_out.gain > 0.8
+    assert light_field(replace(observed, grey=grey), with_light_field(profile, found)) is None
 
 
 def test_each_effect_comes_back_within_its_deviation(rng: np.random.Generator) -> None:

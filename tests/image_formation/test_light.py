@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from laws import TurningCamera, phone
 
+from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.image_formation.kernels import kernel_field
 from virest.image_formation.light import equivalent_length_px, frame_light, row_light, vignetting
 from virest.image_formation.warp import straightened_points
+from virest.simulation.sensor import sensor_light
 
 PIXELS = np.array([[0.0, 0.0], [199, 135], [37, 101], [150, 12]])
 
@@ -47,6 +49,25 @@ def test_vignetting_worked_by_hand() -> None:
     quarter = np.hypot(200, 136) / 4
     x, y = np.array([99.5, 99.5 + quarter, -0.5, 99.5]), np.array([67.5, 67.5, -0.5, 67.5 - quarter])
     np.testing.assert_allclose(vignetting(profile, x, y), [1.0, 0.9, 0.6, 0.9], atol=1e-12)
+
+
+def test_a_field_of_gain_multiplies_the_vignetting_in_program_and_simulator_alike() -> None:
+    """A tenth more light on the right, a loss of 0.4 in the corners: factors multiply."""
+    lens = extended(vignetting_corner_loss=0.4)
+    width, height = lens.width, lens.height
+    ends = ((0.0, width - 1.0), (0.0, height - 1.0))
+    profile = lens.with_fields([Field("gain", ("x", "y"), ends, ((0.0,), (0.0,), (0.1,), (0.1,)))])
+    x, y = np.arange(width)[None, :], np.arange(height)[:, None]
+    factor = vignetting(lens, x, y) * (1 + 0.1 * x / (width - 1))
+    np.testing.assert_allclose(vignetting(profile, x, y), factor, atol=1e-12)
+    flat = np.ones((height, width, 3), np.float32)
+    np.testing.assert_allclose(sensor_light(flat, profile, 1.0, defocus=False)[..., 1], factor, atol=1e-6)
+    only = profile.with_fields(profile.fields)
+    motion = TurningCamera(replace(only, extensions=replace(only.extensions, vignetting_corner_loss=0.0))).motion
+    light = frame_light(motion, 0.5, straighten=True)
+    assert light is not None
+    assert light.recorded[0, -1] == pytest.approx(1.1, abs=1e-6)
+    assert (light.recorded.dtype, light.kept.dtype) == (np.float32, np.float32)
 
 
 def test_vignetting_goes_where_the_pixel_goes() -> None:

@@ -49,6 +49,17 @@ def test_rows_read_late_are_seen_late() -> None:
     np.testing.assert_allclose(after - before, [0.001, 0.003], atol=1e-12)
 
 
+def test_frames_later_than_their_stamps_are_seen_late_and_come_back() -> None:
+    """A clock that wanders by 2 ms at 3 s moves a frame's rows by that, and camera times come back through it."""
+    knots = (0.0, 1.5, 3.0, 4.5)
+    late = Field("delay", ("time",), (knots,), ((0.0,), (-0.001,), (0.002,), (0.0,)))
+    phone = replace(PHONE, shutter=replace(PHONE.shutter, timestamp="exposure_start")).with_fields([late])
+    plain = phone.with_fields([])
+    assert RowClock(phone).time_s(3.0, 0.008) - RowClock(plain).time_s(3.0, 0.008) == pytest.approx(0.002, abs=1e-12)
+    camera_s = np.array([0.4, 1.9, 3.3])
+    np.testing.assert_allclose(RowClock(phone).camera_time_s(phone.imu_time_s(camera_s)), camera_s, atol=1e-9)
+
+
 def test_an_unknown_offset_counts_as_none() -> None:
     """Times then run from the camera's own zero."""
     clock = RowClock(replace(PHONE, time_offset_s=None))

@@ -318,7 +318,7 @@ def _written_extensions(
 
 def _imu_time_ns(capture: Capture, profile: CameraProfile) -> NDArray[np.int64]:
     """Times of the samples on the camera's clock, whole nanoseconds, rising."""
-    camera_s = (capture.imu.time_s - (profile.time_offset_s or 0.0)) / (1.0 + profile.clock_skew)
+    camera_s = profile.camera_time_s(capture.imu.time_s)
     return np.asarray(capture.stamp_0_ns + np.rint(camera_s * 1e9).astype(np.int64), np.int64)
 
 

@@ -86,14 +86,11 @@ def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
     x0, y0, x1, y1 = crop_px
     lens = profile.intrinsics
     if lens is not None:
-        displaced = lens.displaced
-        if displaced is not None:
-            across, down = (tuple(k - by for k in knots) for knots, by in zip(displaced.knots, (x0, y0), strict=True))
-            displaced = dataclasses.replace(displaced, knots=(across, down))
         lens = dataclasses.replace(
-            lens, width=x1 - x0, height=y1 - y0, cx_px=lens.cx_px - x0, cy_px=lens.cy_px - y0, displaced=displaced
+            lens, width=x1 - x0, height=y1 - y0, cx_px=lens.cx_px - x0, cy_px=lens.cy_px - y0
         )  # fmt: skip
-    return dataclasses.replace(profile, width=x1 - x0, height=y1 - y0, intrinsics=lens)
+    moved = [field.moved(x0, y0) if field.covariates == ("x", "y") else field for field in profile.fields]
+    return dataclasses.replace(profile, width=x1 - x0, height=y1 - y0, intrinsics=lens).with_fields(moved)
 
 
 def require_finishable(wishes: FinishWishes, name: str, run: Path, *, overwrite: bool) -> None:

@@ -1,11 +1,12 @@
 """Fields: smooth corrections of the model along recorded covariates, for effects that have no name of their own.
 
 A field is given by its values at knots; between them runs the interpolating cubic spline (of lower degree below four
-knots), and beyond the first and last knot the end values hold.  Two covariates make a tensor product.  Four kinds:
+knots), and beyond the first and last knot the end values hold.  Two covariates make a tensor product.  Five kinds:
 
-- ``delay`` (s): a row starts this much later than an even readout has it.
+- ``delay`` (s): a row starts this much later than an even readout has it, or a frame than its stamp (camera clock).
 - ``displacement`` (px): a point is seen this far from where the lens puts it.
 - ``scale`` (1): the focal length is longer by this part.
+- ``gain`` (1): at this place more light, by this part, reaches the sensor.
 - ``rate`` (rad/s, IMU axes): the true rate is larger than the gyroscope's, less bias and over scale.
 """
 
@@ -25,9 +26,10 @@ Array = NDArray[np.float64]
 AXES = ("x", "y", "z")
 RATES, FORCES = tuple(f"rate_{a}" for a in AXES), tuple(f"accel_{a}" for a in AXES)
 KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
-    "delay": ("s", 1, (("row",),)),
+    "delay": ("s", 1, (("row",), ("time",))),
     "displacement": ("px", 2, (("x", "y"),)),
     "scale": ("1", 1, (("time",), ("focus",), ("focal",))),
+    "gain": ("1", 1, (("x", "y"),)),
     "rate": ("rad/s", 3, (("time",), *((name,) for name in (*RATES, *FORCES)))),
 }
 """Unit, number of components and possible covariates of each kind."""
@@ -100,6 +102,16 @@ class Field:
         for _ in range(_FIXED_POINT_STEPS):
             found = points_px - self.at(found[..., 0], found[..., 1])
         return found
+
+    def moved(self, across_px: float, down_px: float) -> Field:
+        """A field over the picture, of a picture that begins this much further right and down."""
+        x, y = (tuple(k - by for k in knots) for knots, by in zip(self.knots, (across_px, down_px), strict=True))
+        return replace(self, knots=(x, y))
+
+    @property
+    def is_single(self) -> bool:
+        """Whether a profile holds one such field at most."""
+        return self.kind == "displacement" or (self.kind, self.covariates) == ("delay", ("row",))
 
     def with_values(self, values: Array, std: Array | None = None) -> Field:
         """The field with other values (knots, components)."""

@@ -126,9 +126,11 @@ class CameraProfile:
         """The profile with these fields and no others. Raises SettingsError for two of a kind of which one is held."""
         held: dict[str, list[ModelField]] = {"delay": [], "displacement": [], "": []}
         for entry in fields:
-            held.get(entry.kind, held[""]).append(entry)
+            held[entry.kind if entry.is_single else ""].append(entry)
         if max(len(held["delay"]), len(held["displacement"])) > 1:
-            raise SettingsError("extensions.field: one delay and one displacement at most", hint="add their values up")
+            raise SettingsError(
+                "extensions.field: one delay over the row and one displacement at most", hint="add their values up"
+            )
         uneven, displaced = (next(iter(held[kind]), None) for kind in ("delay", "displacement"))
         lens = self.intrinsics
         if lens is None and displaced is not None:
@@ -148,9 +150,21 @@ class CameraProfile:
     def imu_time_s(self, camera_time_s: Any) -> Any:
         """IMU clock of a camera time, both in seconds from stamp_0: t_cam (1 + clock_skew) + time_offset_s.
 
-        An unknown offset counts as 0.
+        Fields of delay over time are added.  An unknown offset counts as 0.
         """
-        return camera_time_s * (1.0 + self.clock_skew) + (self.time_offset_s or 0.0)
+        even_s = camera_time_s * (1.0 + self.clock_skew) + (self.time_offset_s or 0.0)
+        return even_s + self._late_s(camera_time_s)
+
+    def camera_time_s(self, imu_time_s: Any) -> Any:
+        """Camera clock of an IMU time: the inverse of :meth:`imu_time_s`."""
+        found = even_s = (imu_time_s - (self.time_offset_s or 0.0)) / (1.0 + self.clock_skew)
+        for _ in range(3 if any(f.kind == "delay" for f in self.extensions.field) else 0):
+            found = even_s - self._late_s(found) / (1.0 + self.clock_skew)
+        return found
+
+    def _late_s(self, camera_time_s: Any) -> Any:
+        late = [f.at_time(camera_time_s)[..., 0] for f in self.extensions.field if f.kind == "delay"]
+        return sum(late) if late else 0.0
 
     def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:
         """The profile with fields changed and the change's origin noted."""
@@ -318,7 +332,7 @@ class _Defocus(_Strict):
 
 class _Field(_Strict):
     version: Literal[1] = 1
-    kind: Literal["delay", "displacement", "scale", "rate"]
+    kind: Literal["delay", "displacement", "scale", "rate", "gain"]
     covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
     knots: Annotated[list[Annotated[list[Number], Field(max_length=200)]], Field(min_length=1, max_length=2)]
     values: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)]

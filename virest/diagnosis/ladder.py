@@ -22,6 +22,7 @@ from virest.diagnosis.ambiguities import (
     one_exposure,
 )
 from virest.diagnosis.edge_overshoot import judge_sharpening
+from virest.diagnosis.field.brightness import light_field, with_light_field
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
@@ -239,10 +240,13 @@ class DiagnosisSession:
         looks = (self.light, self.blur, self.curve, self.edges)
         findings = [*self.findings, *(finding for look in looks for finding in look.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
-        left = remaining_structure(self.geometric, self.light)
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
+        extended, light = self.curve.profile, self.light
+        if light.observations is not None and (found := light_field(light.observations, extended)) is not None:
+            extended, fields = with_light_field(extended, found), [*fields, found.finding]
+            light = replace(light, profile=with_light_field(light.profile, found))
+        left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
-        extended = self.curve.profile
         stated = [entry for field in fields for entry in field.fields]
         with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in extended.fields]
         extended = extended.with_fields([held.rounded() for held in with_std])

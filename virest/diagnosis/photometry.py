@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.image_formation.light import flicker, vignetting_at_radius
+from virest.image_formation.light import LEAST_LIGHT, flicker, light_maps, vignetting_at_radius
 from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
 
 Array = NDArray[np.float64]
@@ -134,6 +134,9 @@ def log_light_factor(observations: PhotometricObservations, profile: CameraProfi
     total = observations.log_product.copy()
     if ext.vignetting_corner_loss:
         total += np.log(vignetting_at_radius(profile, observations.radius))
+    for field in light_maps(profile):
+        gain = field.at(observations.x_px, observations.y_px)[..., 0]
+        total += np.log(np.maximum(1.0 + gain, LEAST_LIGHT))
     if ext.flicker_amplitude:
         middle_s = observations.row_time_s(profile, ROW_MIDDLE)
         exposure_s = profile.shutter.true_exposure_s(observations.exposure_s)

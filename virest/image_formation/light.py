@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.image_formation.row_clock import ROW_MIDDLE
 from virest.image_formation.row_motion import RowMotion
@@ -51,12 +52,13 @@ class FrameLight:
 def frame_light(motion: RowMotion, anchor: float, straighten: bool) -> FrameLight | None:
     """The factors of one frame, whose rows are seen at their anchor; None where the profile knows of none."""
     extensions = motion.profile.extensions
-    if not extensions.flicker_amplitude and not extensions.vignetting_corner_loss:
+    shaded = bool(extensions.vignetting_corner_loss or light_maps(motion.profile))
+    if not extensions.flicker_amplitude and not shaded:
         return None
     width, height = motion.profile.width, motion.profile.height
     here = vignetting(motion.profile, np.arange(width)[None, :], np.arange(height)[:, None]).astype(np.float32)
     there = here
-    if straighten and extensions.vignetting_corner_loss:
+    if straighten and shaded:
         placed = grid_filled(motion, lambda points: straightened_points(motion, points, anchor))
         there = vignetting(motion.profile, placed[..., 0], placed[..., 1])
     rows = np.maximum(row_light(motion, _along_readout(motion.profile)), LEAST_LIGHT).astype(np.float32)
@@ -87,10 +89,19 @@ def row_light(motion: RowMotion, points_px: Array) -> Array:
 
 
 def vignetting(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:
-    """Part of the light that is left at pixels (x, y); float32 stays float32."""
+    """Part of the light that is left at pixels (x, y), with the profile's fields of gain; float32 stays float32."""
     x, y = np.subtract(x_px, 0.5 * (profile.width - 1)), np.subtract(y_px, 0.5 * (profile.height - 1))
     corner_squared = 0.25 * (profile.width**2 + profile.height**2)
-    return _left(profile.extensions.vignetting_corner_loss / corner_squared, x * x + y * y)
+    left = _left(profile.extensions.vignetting_corner_loss / corner_squared, x * x + y * y)
+    for field in light_maps(profile):
+        gain = np.maximum(1.0 + field.at(x_px, y_px)[..., 0], LEAST_LIGHT)
+        left = left * gain.astype(np.asarray(left).dtype)
+    return left
+
+
+def light_maps(profile: CameraProfile) -> list[Field]:
+    """The fields of gain over the picture."""
+    return [field for field in profile.extensions.field if field.kind == "gain"]
 
 
 def vignetting_at_radius(profile: CameraProfile, radius: Array) -> Array:

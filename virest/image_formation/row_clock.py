@@ -69,4 +69,4 @@ class RowClock:
 
     def camera_time_s(self, imu_time_s: Any) -> Any:
         """Camera clock of an IMU time: the inverse of :meth:`CameraProfile.imu_time_s`."""
-        return (imu_time_s - (self.profile.time_offset_s or 0.0)) / (1.0 + self.profile.clock_skew)
+        return self.profile.camera_time_s(imu_time_s)

@@ -49,7 +49,9 @@ def field_figure(
     """A field, and the residuals with and without it; before, after: as `residual_figure` takes them."""
     figure = canvas(11.0, 4.6)
     left, right = figure.subplots(1, 2)
-    if finding.covariates == ("x", "y"):
+    if finding.kind == "gain":
+        _draw_map(figure, left, finding.fields[0])
+    elif finding.covariates == ("x", "y"):
         _draw_arrows(figure, left, finding.fields[0])
     else:
         _draw_values(left, finding.fields)
@@ -100,6 +102,22 @@ def _draw_arrows(figure: Any, axes: Any, field: Field) -> None:
     if field.std:
         typical = float(np.sqrt(np.mean(np.square(field.std)) * 2))
         axes.set_title(f"vector map; standard deviation {typical:.2g} px", fontsize=10)
+
+
+def _draw_map(figure: Any, axes: Any, field: Field) -> None:
+    """Change of the light over the picture, %."""
+    fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
+    values = 100 * field.at(*np.meshgrid(*fine))[..., 0]
+    most = float(np.abs(values).max())
+    shown = axes.pcolormesh(*fine, values, cmap="RdBu_r", vmin=-most, vmax=most, shading="auto", rasterized=True)
+    figure.colorbar(shown, ax=axes, label="light, %", shrink=0.8)
+    axes.invert_yaxis()
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, px")
+    axes.set_ylabel("y, px")
+    if field.std:
+        typical = 100 * float(np.sqrt(np.mean(np.square(field.std))))
+        axes.set_title(f"map; standard deviation {typical:.2g} %", fontsize=10)
 
 
 def _draw_residuals(axes: Any, along: str, sets: Mapping[str, Mapping[str, Any] | None]) -> None:

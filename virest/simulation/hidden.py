@@ -24,10 +24,14 @@ class Hidden:
 
     row_delay_s: Callable[[Array], Array] | None = None
     """Of the fraction of the readout (rows,): how much later than evenly each row starts."""
+    clock_s: Callable[[float], float] | None = None
+    """Of a stamp: how much later than the clocks say the frame is taken."""
     focal_scale: Callable[[Array], Array] | None = None
     """Of time: factor on the focal length."""
     gyro: Callable[[Array, Array, Array], Array] | None = None
     """Of time (n,), reading (n, 3) and specific force (n, 3): what is logged instead of the reading."""
+    light: Callable[[Array, Array], Array] | None = None
+    """Of x and y as parts of the width and height: factor on the light."""
     focus_dioptres: Callable[[Array], Array] | None = None
     """Of a frame's time: the focus distance that is logged."""
 
@@ -41,6 +45,15 @@ def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array) -> Arra
     if profile.shutter.uneven is not None:
         late = late + profile.shutter.uneven.at(fraction)[:, 0]
     return late if hidden.row_delay_s is None else late + hidden.row_delay_s(fraction)
+
+
+def shaded(hidden: Hidden, light: Any) -> Any:
+    """Light (h, w, 3) as it falls on the sensor."""
+    if hidden.light is None:
+        return light
+    height, width = light.shape[:2]
+    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    return light * hidden.light(x, y)[..., None].astype(np.float32)
 
 
 def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any) -> Any:

@@ -24,6 +24,10 @@ def sensor_light(light: Image, profile: CameraProfile, slot_gain: float, *, defo
         light = cv2.GaussianBlur(light, (0, 0), ext.defocus_sigma_px, borderType=cv2.BORDER_REFLECT)
     if ext.vignetting_corner_loss:
         light = light * _vignetting(profile.width, profile.height, ext.vignetting_corner_loss)
+    for field in ext.field:
+        if field.kind == "gain":
+            x, y = np.arange(profile.width)[None, :], np.arange(profile.height)[:, None]
+            light = light * (1 + field.at(x, y)).astype(np.float32)
     return light if slot_gain == 1.0 else light * np.float32(slot_gain)
 
 

@@ -22,7 +22,7 @@ from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
-from virest.simulation.hidden import NOTHING, Hidden, gyro_reading
+from virest.simulation.hidden import NOTHING, Hidden, gyro_reading, shaded
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
@@ -126,7 +126,8 @@ class Session:
         """Start of the first row's exposure, IMU clock from stamp_0."""
         stamps = self.capture_s
         stamp_s = _stamp_s(capture, self.settings.fps) if stamps is None else float(stamps[capture])
-        return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture))
+        late_s = 0.0 if self.hidden.clock_s is None else self.hidden.clock_s(stamp_s)
+        return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture)) + late_s
 
     def middle_s(self, capture: int) -> float:
         """Start of the first row + half the readout + half the exposure."""
@@ -236,7 +237,7 @@ def render_picture(session: Session, slot: int, phone: PhonePictures | None = No
         session.first_row_start_s(capture),
         session.true_exposure_s(capture),
     )
-    light = sensor_light(light, session.true, _gain(session, slot), defocus=True)
+    light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=True))
     rng = np.random.default_rng([session.settings.seed, 3, capture])
     levels = noisy_levels(_grey(session, light), session.settings.noise_levels, rng)
     return round_levels(levels if phone is None else 255.0 * phone.develop(levels / 255.0))
@@ -250,7 +251,7 @@ def render_truth(session: Session, slot: int, *, middle: bool = False) -> Pictur
     capture = int(session.shows[slot])
     time_s = session.middle_s(capture) if middle else session.first_row_start_s(capture)
     light = instant(session.scene, session.motion, session.view, time_s)
-    light = sensor_light(light, session.true, _gain(session, slot), defocus=False)
+    light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=False))
     return eight_bit(tone_curve(_grey(session, light), session.settings.isp.tone), 0.0, None)
 
 
@@ -348,7 +349,8 @@ def _stamp_s(index: int, fps: float) -> float:
 
 def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: float) -> float:
     start_cam = stamp_s - STAMP_PLACE[true.shutter.timestamp] * true_exposure_s
-    return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0)
+    late_s = sum(float(f.at_time(start_cam)[0]) for f in true.extensions.field if f.kind == "delay")
+    return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0) + late_s
 
 
 def shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np.int64]:

@@ -29,6 +29,7 @@ from virest.app.bench.compare import NOISE, compare_text, read_report
 from virest.app.bench.cost import cost_section
 from virest.app.bench.curves import curves_section
 from virest.app.bench.diagnosis import diagnosis_section
+from virest.app.bench.fields import fields_section
 from virest.app.bench.fits import fits_section
 from virest.app.bench.growth import growth_section
 from virest.app.bench.honesty import honesty_section
@@ -56,6 +57,7 @@ SECTIONS: dict[str, Section] = {
     "cost": cost_section,
     "curves": curves_section,
     "diagnosis": diagnosis_section,
+    "field": fields_section,
     "calibration": calibration_section,
     "soak": soak_section,
     "broken": broken_section,

@@ -23,7 +23,10 @@ from virest.inference.track_fit import Term
 
 Array = NDArray[np.float64]
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
+MOST_KNOTS = 40
 TIME_STEP_S, TIME_KNOTS = 0.4, (4, 12)
+STEP_EDGE_S, FRAMES_PER_STEP, MOST_STEPS = 1e-3, 2, 100
+"""Width of a sudden change, and how densely in time one is looked for."""
 FORCE_REACH_M_S2 = 20.0
 """Two g: what a phone in a hand stays below."""
 LEAST_FOCUS_CHANGE = 0.05
@@ -43,6 +46,10 @@ class FieldForm:
     """With the value nought everywhere."""
     basis: Array
     """(values of all fields, numbers): values at the knots per free number; columns are orthonormal."""
+    step_s: float | None = None
+    """Time of a sudden change; None: the form is smooth."""
+    known: frozenset[str] = frozenset()
+    """Causes that say part of what the form could."""
 
     @property
     def kind(self) -> str:
@@ -51,7 +58,13 @@ class FieldForm:
 
     @property
     def name(self) -> str:
-        """What it is called: kind and covariates."""
+        """What it is called: kind and covariates, and where it changes suddenly."""
+        sudden = "" if self.step_s is None else f", a step at {self.step_s:.2f} s"
+        return self.family + sudden
+
+    @property
+    def family(self) -> str:
+        """Kind and covariates."""
         return f"{self.kind}{OVER}{', '.join(self.covariates)}"
 
     @property
@@ -103,6 +116,18 @@ class FieldForm:
         return next((known for known in profile.fields if _adds_to(field, known)), field)
 
     @property
+    def finer(self) -> FieldForm | None:
+        """The same with about twice the knots; None where there is no such form."""
+        field = self.fields[0]
+        count = 2 * len(field.knots[0]) - 1
+        if self.covariates == ("row",) and count <= MOST_KNOTS:
+            return _row_form(count)
+        if self.covariates == (TIME,) and self.step_s is None and count <= MOST_KNOTS:
+            knots = np.linspace(field.knots[0][0], field.knots[0][-1], count)
+            return _drift_form(self.kind, knots, field.stamp_0_ns, self.known)
+        return None
+
+    @property
     def term(self) -> Term:
         """The form as a term of the fit of tracked points."""
         count = self.basis.shape[1]
@@ -112,8 +137,8 @@ class FieldForm:
 
 def _adds_to(field: Field, known: Field) -> bool:
     """Whether two fields are one, or only one of their kind may be held."""
-    single = field.kind in ("delay", "displacement")
-    return known.kind == field.kind and (single or (known.covariates, known.knots) == (field.covariates, field.knots))
+    alike = (known.kind, known.covariates) == (field.kind, field.covariates)
+    return alike and (field.is_single or known.knots == field.knots)
 
 
 def _at_knots(before: Field, field: Field) -> Array:
@@ -122,9 +147,18 @@ def _at_knots(before: Field, field: Field) -> Array:
     return before.at(*(axis.ravel() for axis in grid))
 
 
-def possible_forms(capture: Capture, profile: CameraProfile, span_s: tuple[float, float]) -> list[FieldForm]:
-    """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock."""
-    forms = [_place_form(profile), _drift_form("scale", span_s, capture), _drift_form("rate", span_s, capture)]
+def possible_forms(
+    capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
+) -> list[FieldForm]:
+    """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock.
+
+    known: causes that are in the model and say what the forms need not.
+    """
+    count = int(np.clip(round((span_s[1] - span_s[0]) / TIME_STEP_S) + 1, *TIME_KNOTS))
+    knots = np.linspace(*span_s, count)
+    drifts = [_drift_form(kind, knots, capture.stamp_0_ns, known) for kind in ("scale", "rate", "delay")]
+    forms = [_place_form(profile), *drifts]
+    forms += step_forms(capture, coarse_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms.append(_row_form())
     if (focus := _focus_form(capture)) is not None:
@@ -143,9 +177,8 @@ def _zero(
     return Field(kind, covariates, rows, ((0.0,) * KINDS[kind][1],) * count, (), stamp_0_ns, log)  # type: ignore[arg-type]
 
 
-def _row_form() -> FieldForm:
-    knots = np.linspace(0, 1, ROW_KNOTS)
-    return FieldForm((_zero("delay", ("row",), [knots]),), np.eye(ROW_KNOTS)[:, 1:-1])
+def _row_form(count: int = ROW_KNOTS) -> FieldForm:
+    return FieldForm((_zero("delay", ("row",), [np.linspace(0, 1, count)]),), np.eye(count)[:, 1:-1])
 
 
 def _place_form(profile: CameraProfile) -> FieldForm:
@@ -172,14 +205,32 @@ def _place_form(profile: CameraProfile) -> FieldForm:
     return FieldForm((field,), null_space(rows / np.linalg.norm(rows, axis=1, keepdims=True)))
 
 
-def _drift_form(kind: str, span_s: tuple[float, float], capture: Capture) -> FieldForm:
-    """Over time: a focal length from where it begins, rates about their mean (bias)."""
-    count = int(np.clip(round((span_s[1] - span_s[0]) / TIME_STEP_S) + 1, *TIME_KNOTS))
-    knots = np.linspace(span_s[0], span_s[1], count)
-    field = _zero(kind, (TIME,), [knots], capture.stamp_0_ns)
+def _drift_form(kind: str, knots: Array, stamp_0_ns: int | None, known: frozenset[str]) -> FieldForm:
+    """Over time: a focal length from where it begins, rates about their mean (bias), a delay.
+
+    Where an offset or a skew of the clocks is in the model the delay has no mean or slope.
+    """
+    count, field = len(knots), _zero(kind, (TIME,), [knots], stamp_0_ns)
     if kind == "scale":
         return FieldForm((field,), np.eye(count)[:, 1:])
+    if kind == "delay":
+        line = {"time_offset": np.ones(count), "clock_skew": np.linspace(-1, 1, count)}
+        held = [row for name, row in line.items() if name in known]
+        return FieldForm((field,), null_space(np.stack(held)) if held else np.eye(count), known=known)
     return FieldForm((field,), np.kron(null_space(np.ones((1, count))), np.eye(3)))
+
+
+def step_forms(capture: Capture, at_s: Array) -> list[FieldForm]:
+    """A focal length that is another from one instant on, for each of some instants (n,)."""
+    edges = [np.array([t - STEP_EDGE_S / 2, t + STEP_EDGE_S / 2]) for t in at_s]
+    fields = [_zero("scale", (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
+    return [FieldForm((f,), np.array([[0.0], [1.0]]), float(t)) for f, t in zip(fields, at_s, strict=True)]
+
+
+def coarse_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
+    """Instants at which a sudden change is looked for."""
+    frames = sum(span_s[0] <= frame.time_s <= span_s[1] for frame in capture.frames)
+    return np.linspace(*span_s, min(frames // FRAMES_PER_STEP, MOST_STEPS) + 2)[1:-1]
 
 
 def _focus_form(capture: Capture) -> FieldForm | None:

@@ -22,8 +22,8 @@ class FittedField:
     """Forms that this capture cannot tell from it."""
     p_value: float
     """For the whole set of forms."""
-    stability: float
-    """Part of the draws of blocks in which it, or a rival, is the best."""
+    stability: float | None
+    """Part of the draws of blocks in which it, or a rival, is the best; None where it was not chosen among forms."""
     before_px: float
     """Held-out rms."""
     after_px: float

@@ -14,10 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.records import Capture
-from virest.diagnosis.field.design import point_residuals
-from virest.diagnosis.field.forms import OVER, FieldForm, possible_forms
+from virest.diagnosis.field.design import PointResiduals, point_residuals
+from virest.diagnosis.field.forms import (
+    FRAMES_PER_STEP,
+    OVER,
+    FieldForm,
+    possible_forms,
+)
 from virest.diagnosis.field.records import FittedField
-from virest.diagnosis.field.screening import MIN_T, Selection, score_forms, select, t_ratio
+from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, Scored, Selection, score_forms, select, t_ratio
+from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
     FINAL_POINTS,
@@ -33,14 +39,16 @@ from virest.inference.track_fit import Term, TrackFit
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Index = NDArray[np.intp]
 MAX_FIELDS = 3
 SEARCH_POINTS, JUDGE_POINTS = 6000, 4000
 PAIRS_IN_BLOCK = 3
 """Neighbouring pairs share a frame, and so its tracking errors: blocks of three share them at their ends only."""
 MIN_SIZE_PX = 0.025
-"""Structure below 0.02 px may be tracking's own bias."""
+"""Structure below 0.02 px may be tracking's own bias; a smaller one only enters in place of a named cause."""
 MIN_BLOCKS = 8
+LASTING_PART = 0.5
+"""Least part of the loss about a sudden change that goes by what the frames before and after say of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,30 +68,26 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     model, fitted, accepted = replace(found.model, terms=terms), found.fit, list(found.accepted)
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
-        chosen = _asked_for(evidence, capture, model, fitted)
-        if chosen is None:
+        forms = _asked_for(evidence, capture, model, fitted)
+        tried = ((asked, _entered(evidence, model, asked, fitted)) for asked in forms)
+        chosen, entered = next((pair for pair in tried if pair[1] is not None), (None, None))
+        if chosen is None or entered is None:
             break
-        form, selection = chosen
-        entered = _entered(evidence, model, form, fitted)
-        if entered is None:
+        model_after, accepted_after = _without_stand_ins(evidence, found, entered.model, accepted)
+        small = chosen.selection is not None and chosen.selection.size * evidence.typical_px < MIN_SIZE_PX
+        if small and len(accepted_after) == len(accepted):
             break
-        after_model, before, after = entered
-        model, accepted = _without_stand_ins(evidence, found, after_model, accepted)
+        before = entered.before
+        if len(accepted_after) < len(accepted):
+            before = _held_out(evidence, _without_form(model_after, entered.form), fitted)
+        model, accepted = model_after, accepted_after
         fitted = evidence.fit(model, model.terms, evidence.table(model, FINAL_POINTS))
         model = replace(model, profile=fitted.profile, scene=fitted.scene)
         typical = evidence.typical_px
-        fields.append(
-            FittedField(
-                form,
-                selection.rivals,
-                selection.best.p_value,
-                selection.stability,
-                before.rms * typical,
-                after.rms * typical,
-                fitted,
-            )
-        )
-        log.debug("field: %s, p %.2g, beside %s", form.name, selection.best.p_value, selection.rivals)
+        stability = chosen.selection.stability if chosen.selection else None
+        before_px, after_px = before.rms * typical, entered.after.rms * typical
+        fields.append(FittedField(entered.form, chosen.rivals, chosen.p_value, stability, before_px, after_px, fitted))
+        log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
     if not fields:
         return found
     table = evidence.table(model, FINAL_POINTS)
@@ -99,25 +103,42 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     )
 
 
-def _asked_for(
-    evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit
-) -> tuple[FieldForm, Selection] | None:
-    """The form that the residuals of a model ask for, and how sure that is."""
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A form that residuals ask for: all of them together, or those between two frames."""
+
+    form: FieldForm
+    selection: Selection | None = None
+    sudden: SuddenChange | None = None
+
+    @property
+    def p_value(self) -> float:
+        """For the whole set of forms, or for all pairs."""
+        return self.selection.best.p_value if self.selection else self.sudden.p_value if self.sudden else 1.0
+
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """Forms that explain the residuals as well."""
+        return self.selection.rivals if self.selection else ()
+
+
+def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> list[_Asked]:
+    """The forms that the residuals of a model ask for, the one between two frames first, and how sure that is."""
     table = evidence.table(model, SEARCH_POINTS)
     fitted = fit_model(evidence.imu, model, model.terms, table)
     in_model = {term.name for term in model.terms}
     seconds = fitted.seconds
-    forms = possible_forms(capture, fitted.profile, (float(seconds.min()), float(seconds.max())))
-    forms = [form for form in forms if form.name not in in_model]
+    forms = possible_forms(capture, fitted.profile, (float(seconds.min()), float(seconds.max())), frozenset(in_model))
+    forms = [form for form in forms if form.family not in in_model]
     seen = point_residuals(evidence.imu, fitted, table)
     block = table.pair // PAIRS_IN_BLOCK
     if len(np.unique(block)) < MIN_BLOCKS:
-        return None
+        return []
     tangent = seen.tangent()
     if model.terms:
         tangent = np.concatenate([tangent, seen.effect(model.terms)], axis=-1)
-    designs = [(form.name, seen.effect((form.term,)), form.over_time) for form in forms]
-    scored = score_forms(seen.left, seen.weight, tangent, designs, block, table.pair)
+    blind_s = FRAMES_PER_STEP * evidence.period_s
+    scored = _scored(seen, tangent, forms, block, blind_s)
     for entry in scored:
         log.debug(
             "%s: p %.2g, gain %.4g (t %.1f), parts t %s",
@@ -128,32 +149,115 @@ def _asked_for(
             None if entry.parts_gain is None else round(t_ratio(entry.parts_gain), 1),
         )
     selection = select(scored, float(seen.weight.sum()))
-    if selection is None or selection.size * evidence.typical_px < MIN_SIZE_PX:
-        return None
-    return next(form for form in forms if form.name == selection.best.name), selection
+    asked: list[_Asked] = []
+    if (sudden := sudden_change(seen)) is not None and not any(", a step" in name for name in in_model):
+        form = best_instant(seen, capture, sudden.at_s, sudden.scale, evidence.period_s)
+        asked.append(_Asked(form, sudden=sudden))
+    if selection is None:
+        return asked
+    form = next(form for form in forms if form.name == selection.best.name)
+    if form.step_s is not None:
+        scale = lasting_change(seen, tangent, _effect(seen, form, blind_s))
+        form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
+    return [*asked, _Asked(form, selection)]
 
 
-def _entered(
-    evidence: Evidence, model: Model, form: FieldForm, fitted: TrackFit
-) -> tuple[Model, HeldOut, HeldOut] | None:
-    """The model with a form in it, and both on blocks that they were not fitted to; None where these do not gain."""
+def _scored(
+    seen: PointResiduals, tangent: Array, forms: Sequence[FieldForm], block: Index, blind_s: float
+) -> list[Scored]:
+    """Scores of forms, best gain first; of the forms of one field the best alone.
+
+    blind_s: how near to a sudden change points are not asked.  Between two frames it moves them by many times their
+    noise, so that an instant that is a frame off would be ruled out by the points that tell it best.
+    """
+    sudden = [form for form in forms if form.step_s is not None]
+    best: dict[str, Scored] = {}
+    for group in ([form for form in forms if form.step_s is None], sudden):
+        designs = [(form.name, _effect(seen, form, blind_s), form.over_time) for form in group]
+        family = {form.name: form.family for form in group}
+        for entry in score_forms(seen.left, seen.weight, tangent, designs, block, seen.table.pair):
+            known = best.get(family[entry.name])
+            if known is None or entry.gain.sum() > known.gain.sum():
+                best[family[entry.name]] = entry
+    return sorted(best.values(), key=lambda entry: -float(entry.gain.sum()))
+
+
+def _effect(seen: PointResiduals, form: FieldForm, blind_s: float) -> Array:
+    effect = seen.effect((form.term,))
+    if form.step_s is not None and blind_s:
+        profile, table = seen.fit.profile, seen.table
+        lasting_s = profile.shutter.readout_time_s + table.second_exposure_s
+        begin_s, end_s = (np.asarray(profile.imu_time_s(t)) for t in (table.first_stamp_s, table.second_stamp_s))
+        near = (begin_s - blind_s < form.step_s) & (form.step_s < end_s + lasting_s + blind_s)
+        effect[near] = 0.0
+    return effect
+
+
+@dataclass(frozen=True, slots=True)
+class _Entered:
+    """A model with a form in it, and what held-out blocks say without and with it."""
+
+    model: Model
+    form: FieldForm
+    before: HeldOut
+    after: HeldOut
+
+
+def _entered(evidence: Evidence, model: Model, asked: _Asked, fitted: TrackFit) -> _Entered | None:
+    """The model with a form in it, with as many knots as pay; None where held-out blocks do not gain."""
+    form, wanted = asked.form, MIN_LOCAL_T if asked.form.over_time else MIN_T
     extended = replace(model, terms=(*model.terms, form.term))
     before, after = (_held_out(evidence, m, fitted) for m in (model, extended))
     gain = before.block_loss - after.block_loss
     log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
-    if gain.mean() < MIN_GAIN * before.block_loss.mean() or t_ratio(gain) < MIN_T:
+    holds = t_ratio(gain) > wanted
+    if asked.sudden is not None:
+        # most of the gain lies in one block; that of the others tells the change, and it must hold there
+        there = asked.sudden.pair // PAIRS_IN_BLOCK
+        holds = bool(gain[there] > LASTING_PART * before.block_loss[there])
+    if gain.mean() < MIN_GAIN * before.block_loss.mean() or not holds:
         return None
-    return extended, before, after
+    return _refined(evidence, model, _Entered(extended, form, before, after), fitted)
 
 
-def _held_out(evidence: Evidence, model: Model, scaled: TrackFit) -> HeldOut:
-    """Fit on every other block of a few pairs, judge on those between, and the other way round."""
+def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackFit) -> _Entered:
+    """The same with twice the knots, as often as held-out points gain.
+
+    A form over time is judged on other points of the frames that it was fitted to: fine knots lie as close as blocks.
+    """
+    by_point = entered.form.over_time
+    last = _held_out(evidence, entered.model, fitted, by_point) if by_point else entered.after
+    while (finer := entered.form.finer) is not None:
+        extended = replace(model, terms=(*model.terms, finer.term))
+        after = _held_out(evidence, extended, fitted, by_point)
+        gain = last.block_loss - after.block_loss
+        log.debug("%d knots: %.4f to %.4f, t %.1f", len(finer.basis), last.rms, after.rms, t_ratio(gain))
+        if gain.mean() < MIN_GAIN * last.block_loss.mean() or t_ratio(gain) < MIN_T:
+            break
+        entered, last = _Entered(extended, finer, entered.before, after), after
+    return entered
+
+
+def _without_form(model: Model, form: FieldForm) -> Model:
+    """The model without a form, whose values go back to nought."""
+    fields = form.filled(np.zeros(form.basis.shape[1]))
+    kept = [f for f in model.profile.fields if not any(f.is_in_place_of(own) for own in fields)]
+    terms = tuple(term for term in model.terms if term.name != form.name)
+    return replace(model, profile=model.profile.with_fields(kept), terms=terms)
+
+
+def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool = False) -> HeldOut:
+    """Fit on every other block of a few pairs, judge on those between, and the other way round.
+
+    by_point: on every other point of all pairs instead.
+    """
     table = evidence.table(model, JUDGE_POINTS)
     block = table.pair // PAIRS_IN_BLOCK
+    fold = (np.arange(len(table)) if by_point else block) % 2
     left = np.zeros(len(table))
-    for fold in (0, 1):
-        part = fit_model(evidence.imu, model, model.terms, table.chosen(block % 2 == fold))
-        left[block % 2 != fold] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[block % 2 != fold]
+    for number in (0, 1):
+        part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number))
+        left[fold != number] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[fold != number]
     counts = np.maximum(np.bincount(block), 1)
     return HeldOut(np.bincount(block, loss(left, 1.0)) / counts, capped_rms(left))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from virest.camera.field import FORCES, Field
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.field.forms import FORCE_REACH_M_S2
+from virest.diagnosis.field.forms import FORCE_REACH_M_S2, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
 from virest.diagnosis.field.stretches import CLIPPED, axis_names
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
@@ -22,6 +22,10 @@ ALIKE = 0.95
 """Part of a field's variance that a shape must explain to name it."""
 STEP_SPAN, STEP_PART = 0.25, 0.8
 """A step: this part of the change within this part of the range."""
+TURNED_PART = 0.1
+"""Of the change: a curve that levels off turns back by no more than this."""
+JUMP_WIDTH = 0.1
+"""In half the range: a spline of forty knots makes no sharper jump."""
 SHAPE_PART = 0.9
 """The same for a displacement over the picture."""
 OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
@@ -44,6 +48,11 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "points are {lateness} by up to {size} {where} of the readout, {shape} of the row: lines are not read evenly",
         "the sensor reads its lines in blocks or pauses between them, or the picture was cropped and scaled by lines",
         "film a lamp that flickers at a known rate, without other light: its bands show each line's time",
+    ),
+    ("delay", ("time",)): Pattern(
+        "frames are {lateness} by up to {size} {where} of the capture, {shape} of time: the stamps' clock wanders",
+        "stamps that are taken in software, a queue that fills, or a clock that is corrected while it runs",
+        "film a display that counts milliseconds, and compare the steps of the stamps with the steps shown",
     ),
     ("displacement", ("x", "y")): Pattern(
         "shifts of up to {size} depend on the position in the picture, {shape}, the same in all frames: {lens}",
@@ -165,9 +174,16 @@ def shape_of(field: Field) -> str:
     """What the values do along one covariate, or over the picture."""
     if field.covariates == ("x", "y"):
         return _shape_over_picture(field)
+    if is_sudden(field):
+        return "a step"
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     values = field.at(along)
     return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates == ("time",))
+
+
+def is_sudden(field: Field) -> bool:
+    """Whether a field over time changes at one instant."""
+    return field.covariates == ("time",) and field.knots[0][-1] - field.knots[0][0] < 2 * STEP_EDGE_S
 
 
 def curve_shape(curve: Array, over_time: bool = False) -> str:
@@ -177,11 +193,13 @@ def curve_shape(curve: Array, over_time: bool = False) -> str:
         return "nothing"
     if _unexplained(curve, [u]) < 1 - ALIKE:
         return "a straight line"
-    if _is_step(curve):
+    if not over_time and _is_step(curve):
         return "a step"
+    if not over_time and _is_sawtooth(curve, u):
+        return "even blocks with a jump between them"
     if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
-        monotone = np.all(np.diff(curve) >= 0) or np.all(np.diff(curve) <= 0)
-        return "levelling off" if monotone and over_time else "a parabola"
+        rises, falls = (float(np.clip(way * np.diff(curve), 0, None).sum()) for way in (1, -1))
+        return "levelling off" if over_time and min(rises, falls) < TURNED_PART * np.ptp(curve) else "a parabola"
     slope = np.abs(np.diff(curve))
     if over_time and slope[: SAMPLES // 4].sum() > 2 * slope[-SAMPLES // 4 :].sum():
         return "levelling off"
@@ -201,6 +219,12 @@ def _unexplained(curve: Array, columns: list[Array]) -> float:
     design = np.stack([np.ones_like(curve), *columns], axis=-1)
     left = curve - design @ np.linalg.lstsq(design, curve, rcond=None)[0]
     return float(np.var(left) / max(float(np.var(curve)), 1e-300))
+
+
+def _is_sawtooth(curve: Array, u: Array) -> bool:
+    """Whether the curve is one straight slope but for a jump."""
+    jumps = (np.clip((u - at) / JUMP_WIDTH, 0, 1) for at in u[SAMPLES // 10 : -SAMPLES // 10])
+    return min(_unexplained(curve, [u, jump]) for jump in jumps) < 1 - ALIKE
 
 
 def _is_step(curve: Array) -> bool:

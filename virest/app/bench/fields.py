@@ -1,0 +1,344 @@
+"""Hide an effect that no catalogue names, diagnose, and try what was found on another capture of the same phone.
+
+The diagnosis reads the capture's folder only.  Sizes of both signs, weak and strong, come from the case's seed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.app.bench.tables import table
+from virest.app.bench.workload import Scale
+from virest.app.diagnose import Source, open_source
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.diagnosis.findings import CONSISTENT, Diagnosis
+from virest.diagnosis.geometric_evidence import make_evidence
+from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.ladder import diagnose_capture
+from virest.inference.observed_tracks import observe_tracks
+from virest.inference.tracking import track_pairs
+from virest.simulation.effects import EffectContext, hide_effects
+from virest.simulation.hidden import NOTHING, Hidden
+from virest.simulation.recording import RecordingOptions, write_recording
+from virest.simulation.session import SessionSettings, nominal_camera, plan_session
+
+Array = NDArray[np.float64]
+Row = dict[str, Any]
+Draw = Callable[[np.random.Generator, float], "Strangeness"]
+SIZE, SMALL, FPS = (640, 480), (480, 360), 30.0
+"""Of captures with an unknown effect, and of those without."""
+FRAMES, FRAMES_OF_OTHER = 96, 50
+FIRST_SEED, FIRST_NULL = 7100, 8100
+SEEDS = {"quick": 1, "usual": 2, "full": 6}
+NULLS = {"quick": 4, "usual": 16, "full": 50}
+SCENES = ("leaves", "text", "board", "bright", "photographs")
+SOLVED = 0.8
+"""Part of the excess residual that a right field takes away."""
+
+
+@dataclass(frozen=True, slots=True)
+class Strangeness:
+    """What is strange about a phone, and what a diagnosis should say of it."""
+
+    hidden: Hidden = NOTHING
+    tangential: tuple[float, float] = (0.0, 0.0)
+    """p1 and p2 of the lens."""
+    effects: tuple[str, ...] = ()
+    """Effects of the catalogue, with their values."""
+    expected: tuple[frozenset[tuple[str, str]], ...] = ()
+    """Per field: kinds and covariates that are right."""
+    lasting: bool = True
+    """Whether another capture of the phone has it too."""
+
+
+def _either(*pairs: tuple[str, str]) -> frozenset[tuple[str, str]]:
+    return frozenset(pairs)
+
+
+# ── what is hidden ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _sign(rng: np.random.Generator) -> float:
+    return float(rng.choice((-1.0, 1.0)))
+
+
+def _uneven(rng: np.random.Generator, size: float) -> Strangeness:
+    """Rows late by a parabola, a wave, or in two blocks with a pause between them."""
+    late_s, kind = _sign(rng) * size * 1.1e-3 * rng.uniform(0.8, 1.25), int(rng.integers(3))
+    pause = float(rng.uniform(0.3, 0.7))
+
+    def delay_s(fraction: Array) -> Array:
+        wave = np.sin(2 * np.pi * fraction)
+        block = np.clip((fraction - pause) / 0.04, 0, 1) - fraction
+        return np.asarray(late_s * (4 * fraction * (1 - fraction), wave, 1.6 * block)[kind])
+
+    return Strangeness(Hidden(row_delay_s=delay_s), expected=(_either(("delay", "row")),))
+
+
+def _tangential(rng: np.random.Generator, size: float) -> Strangeness:
+    turn = rng.uniform(0, 2 * np.pi)
+    p = 0.006 * size * rng.uniform(0.8, 1.25)
+    lens = (float(p * np.cos(turn)), float(p * np.sin(turn)))
+    return Strangeness(tangential=lens, expected=(_either(("displacement", "x, y")),))
+
+
+def _clipping(rng: np.random.Generator, size: float) -> Strangeness:
+    part = float(np.clip(0.72 - 0.1 * size + rng.uniform(-0.04, 0.04), 0.3, 0.9))
+
+    def clipped(_time: Array, reading: Array, _force: Array) -> Array:
+        limit = part * np.abs(reading).max()
+        return np.clip(reading, -limit, limit)
+
+    return Strangeness(Hidden(gyro=clipped), expected=(_either(("inertial_rows", "rate")),), lasting=False)
+
+
+def _gap(rng: np.random.Generator, size: float) -> Strangeness:
+    from_s, lasting_s = rng.uniform(0.6, 1.9), rng.uniform(0.07, 0.1) * (1 + size)
+
+    def filled(time_s: Array, reading: Array, _force: Array) -> Array:
+        inside = np.flatnonzero((time_s >= from_s) & (time_s <= from_s + lasting_s))
+        reading = reading.copy()
+        reading[inside] = np.linspace(reading[inside[0]], reading[inside[-1]], len(inside))
+        return reading
+
+    return Strangeness(Hidden(gyro=filled), expected=(_either(("inertial_rows", "time")),), lasting=False)
+
+
+def _breathing(rng: np.random.Generator, size: float) -> Strangeness:
+    """The focus goes to and fro, and the focal length with it."""
+    per_dioptre = _sign(rng) * 0.006 * size * rng.uniform(0.8, 1.25)
+    far, near = rng.uniform(0.2, 0.8), rng.uniform(2.0, 3.5)
+    there_s, back_s = rng.uniform(0.6, 1.1), rng.uniform(1.9, 2.5)
+
+    def dioptres(time_s: Array) -> Array:
+        rise = 1 / (1 + np.exp(-(time_s - there_s) / 0.12)) - 1 / (1 + np.exp(-(time_s - back_s) / 0.12))
+        return np.asarray(far + (near - far) * rise)
+
+    hidden = Hidden(focal_scale=lambda t: 1 + per_dioptre * (dioptres(t) - far), focus_dioptres=dioptres)
+    return Strangeness(hidden, expected=(_either(("scale", "focus")),))
+
+
+def _thermal(rng: np.random.Generator, size: float) -> Strangeness:
+    part, settling_s = _sign(rng) * 0.010 * size * rng.uniform(0.8, 1.25), rng.uniform(0.4, 0.8)
+    hidden = Hidden(focal_scale=lambda t: 1 + part * (1 - np.exp(-np.maximum(t, 0) / settling_s)))
+    return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
+
+
+def _g_sensitivity(rng: np.random.Generator, size: float) -> Strangeness:
+    per_force = 0.003 * size * rng.normal(size=(3, 3))
+    hidden = Hidden(gyro=lambda _t, reading, force: reading + force @ per_force.T)
+    return Strangeness(hidden, expected=(_either(("rate", "acceleration")),))
+
+
+def _lens_switch(rng: np.random.Generator, size: float) -> Strangeness:
+    part, at_s = _sign(rng) * 0.012 * size * rng.uniform(0.8, 1.25), rng.uniform(1.0, 2.2)
+    hidden = Hidden(focal_scale=lambda t: np.where(np.asarray(t) < at_s, 1.0, 1 + part))
+    return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
+
+
+def _wandering(rng: np.random.Generator, size: float) -> Strangeness:
+    """Stamps whose clock wanders to and fro."""
+    late_s, hz, phase = 1.5e-3 * size * rng.uniform(0.8, 1.25), rng.uniform(0.35, 0.7), rng.uniform(0, 2 * np.pi)
+    hidden = Hidden(clock_s=lambda stamp_s: late_s * np.sin(2 * np.pi * hz * stamp_s + phase))
+    return Strangeness(hidden, expected=(_either(("delay", "time")),), lasting=False)
+
+
+def _shading(rng: np.random.Generator, size: float) -> Strangeness:
+    """A vignette off centre, or something before one side of the lens."""
+    part, turn, kind = 0.05 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
+    way = np.cos(turn), np.sin(turn)
+
+    def light(x: Array, y: Array) -> Array:
+        along = 2 * ((x - 0.5) * way[0] + (y - 0.5) * way[1])
+        return np.asarray(1 - part * (along + 1) / 2 if kind else 1 - 1.5 * part * np.clip(along, 0, None) ** 2)
+
+    return Strangeness(Hidden(light=light), expected=(_either(("gain", "x, y")),), lasting=False)
+
+
+def _two(rng: np.random.Generator, size: float) -> Strangeness:
+    uneven, lens = _uneven(rng, size), _tangential(rng, size)
+    return replace(uneven, tangential=lens.tangential, expected=(*uneven.expected, *lens.expected))
+
+
+def _one_named(rng: np.random.Generator, size: float) -> Strangeness:
+    effects = (
+        f"time_offset={_sign(rng) * rng.uniform(0.004, 0.009):.6f}",
+        f"focal_length={1 + _sign(rng) * rng.uniform(0.03, 0.06):.4f}",
+        f"radial_distortion={_sign(rng) * rng.uniform(0.03, 0.07):.4f}",
+    )
+    return replace(_uneven(rng, size), effects=(str(rng.choice(effects)),))
+
+
+def _nothing(_rng: np.random.Generator, _size: float) -> Strangeness:
+    return Strangeness()
+
+
+def _named_only(rng: np.random.Generator, _size: float) -> Strangeness:
+    names = ("time_offset", "readout_time", "gyro_bias", "focal_length", "focal_drift", "radial_distortion",
+             "principal_point", "stabilisation", "vignetting", "defocus")  # fmt: skip
+    return Strangeness(effects=tuple(str(name) for name in rng.choice(names, 2, replace=False)))
+
+
+EFFECTS: dict[str, Draw] = {
+    "uneven": _uneven,
+    "tangential": _tangential,
+    "clipping": _clipping,
+    "gap": _gap,
+    "breathing": _breathing,
+    "thermal": _thermal,
+    "g_sensitivity": _g_sensitivity,
+    "lens_switch": _lens_switch,
+    "wandering": _wandering,
+    "shading": _shading,
+    "two": _two,
+    "one_named": _one_named,
+}
+NULL, NAMED_ONLY = "nothing", "named_only"
+CASES = {**EFFECTS, NULL: _nothing, NAMED_ONLY: _named_only}
+
+
+# ── captures ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tuple[Strangeness, list[str]]:
+    """Write a capture, unless it is there, and return what is strange about it and the named effects.
+
+    other: a second capture of the same phone, with another motion, scene and light.
+    """
+    strange = CASES[name](np.random.default_rng([seed, 11]), 1.0 if seed % 2 else 2.6)
+    rng = np.random.default_rng([seed, 12 + other])
+    frames = FRAMES_OF_OTHER if other else FRAMES
+    distortion = ("radtan", (-0.02, 0.0, 0.0, 0.0, 0.0)) if seed % 3 == 0 else ("none", ())
+    size = SIZE if name in EFFECTS else SMALL
+    acceleration = name == "g_sensitivity"
+    nominal = nominal_camera(
+        *size, focal_px=float(np.random.default_rng([seed, 14]).uniform(0.67, 0.97) * size[0]),
+        readout_time_s=float(np.random.default_rng([seed, 15]).uniform(0.014, 0.026)),
+        response=ResponseCurve("srgb"), distortion=distortion, depth_m=2.0 if acceleration else np.inf,
+    )  # fmt: skip
+    context = EffectContext(frames, FPS, np.random.default_rng([seed, 16]))
+    true, applied = hide_effects(nominal, strange.effects, context)
+    settings = SessionSettings(
+        scene=str(rng.choice(SCENES)),
+        frames=frames,
+        fps=FPS,
+        exposure_s=(float(rng.uniform(0.004, 0.012)),),
+        rate_rad_s=float(rng.uniform(0.6, 1.5)),
+        noise_levels=float(rng.uniform(1.0, 3.0)),
+        gyro_noise_rad_s=float(rng.uniform(0.0008, 0.0025)),
+        imu_rate_hz=float(rng.choice((100, 200, 400))),
+        seed=10 * seed + other,
+    )
+    named = [effect.name for effect in applied]
+    if not (folder / "movie.mp4").exists():
+        session = plan_session(nominal, off_centre(true, strange.tangential), settings, hidden=strange.hidden)
+        options = RecordingOptions(bits_per_px=float(rng.uniform(0.12, 0.4)), truth_frames=False)
+        write_recording(session, folder, applied=applied, options=options)
+    return strange, named
+
+
+def off_centre(profile: CameraProfile, tangential: tuple[float, float]) -> CameraProfile:
+    """The profile with p1 and p2 in its lens."""
+    lens = profile.intrinsics
+    assert lens is not None
+    if not any(tangential):
+        return profile
+    k1, k2, _, _, k3 = lens.coefficients or (0.0,) * 5
+    return replace(profile, intrinsics=replace(lens, model="radtan", coefficients=(k1, k2, *tangential, k3)))
+
+
+def points_off_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[float], float]:
+    """Rms by which points of a capture lie off where each profile puts them, and the tracking noise."""
+    capture = source.capture
+    indices = [frame.index for frame in capture.frames if frame.skip_reason is None]
+    pairs = track_pairs(source.gray(indices))
+    observed = observe_tracks(capture, pairs, source.profile).covered(capture.imu, source.profile)
+    evidence = make_evidence(capture.imu, observed)
+    ends = [climb(evidence, profile, (), (), max_rungs=0) for profile in profiles]
+    return [end.final_rms_px for end in ends], ends[-1].noise_px
+
+
+# ── one case ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def judge_case(work: Path, name: str, seed: int) -> Row:
+    """Simulate, diagnose, compare; try the extended profile on another capture of the same phone."""
+    folder = work / f"{name}_{seed}"
+    strange, named = write_case(folder, name, seed)
+    source = open_source(folder)
+    begun = time.process_time()
+    found = diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
+    seconds = time.process_time() - begun
+    gone = None
+    if strange.lasting and strange.expected:
+        folder = work / f"{name}_{seed}_other"
+        write_case(folder, name, seed, other=True)
+        (before, after), noise = points_off_px(open_source(folder), [source.profile, found.extended_profile])
+        gone = 1 - (after**2 - noise**2) / max(before**2 - noise**2, 1e-9)
+    causes = [cause.name for cause in found.causes]
+    fields = [(field.kind, ", ".join(field.covariates), field.shape) for field in found.fields]
+    return {
+        "hidden": name, "seed": seed, "size": "weak" if seed % 2 else "strong", "verdict": found.verdict,
+        "named": named, "causes": causes, "fields": fields,
+        "right": is_right(strange, named, found),
+        "rms_px": found.nominal.geometry_rms_px, "noise_px": found.nominal.geometry_noise_px,
+        "gain": [field.held_out.gain for field in found.fields],
+        "gone_elsewhere": gone, "cpu_s": round(seconds, 1),
+        "sentences": [field.sentence for field in found.fields],
+    }  # fmt: skip
+
+
+def is_right(strange: Strangeness, named: list[str], found: Diagnosis) -> bool:
+    """Whether each field is of an expected kind and covariate, and each cause is one that is hidden, or its rival."""
+    fields = [(field.kind, ", ".join(field.covariates)) for field in found.fields]
+    if len(fields) != len(strange.expected) or any(set(fields).isdisjoint(pairs) for pairs in strange.expected):
+        return False
+    known = [{cause.name, *(rival.name for rival in cause.rivals)} for cause in found.causes]
+    if not named and not fields:
+        return found.verdict == CONSISTENT
+    return all(names & set(named) for names in known) and len(known) <= len(named)
+
+
+def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
+    """Each effect with some seeds, as many captures with named effects only, and nulls."""
+    cases = [(name, FIRST_SEED + 10 * k + i) for k in range(SEEDS[scale.name]) for i, name in enumerate(EFFECTS)]
+    cases += [(NAMED_ONLY, FIRST_SEED + 500 + k) for k in range(SEEDS[scale.name])]
+    cases += [(NULL, FIRST_NULL + k) for k in range(NULLS[scale.name])]
+    rows = [judge_case(work, *case) for case in cases]
+    hidden = [row for row in rows if row["hidden"] in EFFECTS]
+    elsewhere = [row["gone_elsewhere"] for row in hidden if row["gone_elsewhere"] is not None]
+    summary = {
+        "captures": len(hidden),
+        "right": sum(row["right"] for row in hidden),
+        "solved_elsewhere": sum(gone >= SOLVED for gone in elsewhere),
+        "of_elsewhere": len(elsewhere),
+        "false_alarms": sum(bool(row["fields"]) for row in rows if row["hidden"] not in EFFECTS),
+        "nulls": len(rows) - len(hidden),
+    }
+    header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "rms / noise px", "CPU s"]
+    text = table(header, [shown(row) for row in rows])
+    text += (
+        f"\n{summary['right']} of {summary['captures']} right; {summary['solved_elsewhere']} of "
+        f"{summary['of_elsewhere']} solved on another capture; {summary['false_alarms']} false alarms in "
+        f"{summary['nulls']} captures without an unknown effect"
+    )
+    return {"summary": summary, "rows": rows}, f"Effects that no catalogue names, {FRAMES} frames\n{text}"
+
+
+def shown(row: Row) -> list[str]:
+    """A row of the table."""
+    fields = "; ".join(f"{kind} over {over}: {shape}" for kind, over, shape in row["fields"])
+    elsewhere = "" if row["gone_elsewhere"] is None else f"{row['gone_elsewhere']:.2f}"
+    return [
+        row["hidden"] + ("" if row["right"] else " WRONG"), str(row["seed"]), row["size"], row["verdict"],
+        ", ".join(row["causes"]), fields, " ".join(f"{gain:.2f}" for gain in row["gain"]), elsewhere,
+        f"{row['rms_px']:.3f} / {row['noise_px']:.3f}", f"{row['cpu_s']:.0f}",
+    ]  # fmt: skip

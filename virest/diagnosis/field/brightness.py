@@ -1,0 +1,206 @@
+"""A field of brightness: light that differs over the picture as no centred vignetting has it, the same in all frames.
+
+What is left of the patches' grey is regressed on a smooth map of the log light, beside what curve, vignetting and a
+gain for each frame can do.  Each patch's own light is a nuisance, so only patches that cross the picture tell; where
+all move alike, an even slope is a gain of each frame, and stays nought.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+
+from virest.camera.field import Field, cardinal_weights
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.diagnosis.field.screening import MAX_P, MIN_T, score_forms, t_ratio
+from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
+from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+KNOTS = 4
+FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
+MOST_OBSERVATIONS = 15_000
+MIN_SIZE = 0.1
+"""Grey levels (rms): on nine captures without such a field textured patches and the encoder left up to 0.03."""
+CAUCHY, CAP = 2.5, 5.0
+"""Noises at which a residual has half its weight, and beyond which it counts as that many."""
+RIDGE = 1e-3
+CURVE_STEP = 0.02
+ALIKE = 0.9
+"""Part of the map's variance that a shape must explain to name it."""
+REASONS = (
+    "the lens shades off its centre, something stands before it or dirt lies on it, or the phone corrects its shading "
+    "as the profile does not"
+)
+NEXT = "film an evenly lit wall, then the same with the phone upside down: what turns along is the phone's"
+
+
+@dataclass(frozen=True, slots=True)
+class LightField:
+    """A map of the light, and how sure it is."""
+
+    field: Field
+    p_value: float
+    held_out: HeldOutGain
+
+    @property
+    def finding(self) -> FieldFinding:
+        """In words."""
+        size, std = _size(self.field)
+        shape = map_shape(self.field)
+        rms = f"patches {self.held_out.before:.3g} → {self.held_out.after:.3g} grey levels, held out"
+        sentence = f"the light differs by up to {100 * size:.3g} % over the picture, {shape}, the same in all frames"
+        confounded = ("gain over row",) if shape == BAND else ()
+        return FieldFinding(
+            ("x", "y"), "gain", shape, f"{sentence} ({rms})", size, "1", std, self.held_out, self.p_value, confounded,
+            None, REASONS, NEXT, (self.field,),
+        )  # fmt: skip
+
+
+SLOPE, BAND, MAP = "growing to one side", "changing with the row alone", "a smooth map"
+
+
+def light_field(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
+    """The map that the patches ask for beside the profile's light; None where they ask for none."""
+    seen = _thinned(observations)
+    block = np.unique(seen.frame // FRAMES_IN_BLOCK, return_inverse=True)[1]
+    if len(seen) < 500 or block.max() + 1 < LEAST_BLOCKS:
+        return None
+    order = np.argsort(block, kind="stable")
+    at = predict(seen, profile)
+    zero, basis = _form(profile)
+    design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
+    left = at.residual / seen.noise
+    scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+    weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2) / scale**2
+    tangent = _tangent(seen, profile, at) / seen.noise[:, None]
+    (scored, *_) = score_forms(
+        left[order, None], weight[order], tangent[order, None], [("gain", design[order, None], False)], block[order]
+    ) or (None,)
+    if scored is None or scored.parts_gain is None or scored.p_value > MAX_P:
+        return None
+    size = float(np.sqrt(max(scored.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))
+    if min(t_ratio(scored.gain), t_ratio(scored.parts_gain)) < MIN_T or size < MIN_SIZE:
+        return None
+    if not profile.extensions.vignetting_corner_loss:
+        # what a centred vignetting would say is no one else's then
+        basis, tangent = null_space(_middle(zero, profile)[None]), tangent[:, 1:]
+        design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
+    columns = np.concatenate([design, tangent], axis=1)
+    numbers, covariance = _solved(columns, left, weight, block, design.shape[1])
+    values = basis @ numbers
+    std = np.sqrt(np.maximum(np.einsum("vk,kl,vl->v", basis, covariance, basis), 0.0))
+    factor = np.exp(values)
+    field = zero.with_values((factor - 1)[:, None], (factor * std)[:, None])
+    return LightField(field, scored.p_value, _held_out(columns, design.shape[1], left, weight, block, seen))
+
+
+def with_light_field(profile: CameraProfile, found: LightField) -> CameraProfile:
+    """The profile with the map in it."""
+    return profile.with_fields([*profile.fields, found.field])
+
+
+def _thinned(observations: PhotometricObservations) -> PhotometricObservations:
+    thin = -(-len(observations) // MOST_OBSERVATIONS)
+    seen = observations if thin < 2 else observations.subset(observations.place % thin == 0)
+    return seen.subset(np.bincount(seen.patch)[seen.patch] >= 2)
+
+
+def _form(profile: CameraProfile) -> tuple[Field, Array]:
+    """A map of nought, and its free numbers: nought in the middle (each patch's own light), no vignetting in it."""
+    knots = tuple(tuple(np.linspace(0.0, side - 1, KNOTS).tolist()) for side in (profile.width, profile.height))
+    x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
+    radius2 = (x - 0.5 * (profile.width - 1)) ** 2 + (y - 0.5 * (profile.height - 1)) ** 2
+    field = Field("gain", ("x", "y"), knots, ((0.0,),) * KNOTS**2)
+    return field, null_space(np.stack([_middle(field, profile), radius2 / np.linalg.norm(radius2)]))
+
+
+def _middle(field: Field, profile: CameraProfile) -> Array:
+    """(knots,) weights of the value in the picture's middle."""
+    middle = (0.5 * (profile.width - 1), 0.5 * (profile.height - 1))
+    return np.outer(*(cardinal_weights(k, m) for k, m in zip(field.knots, middle, strict=True))).ravel()
+
+
+def _weights(field: Field, seen: PhotometricObservations) -> Array:
+    """(n, knots) of the map's values in each observation."""
+    across, down = (cardinal_weights(k, c) for k, c in zip(field.knots, (seen.x_px, seen.y_px), strict=True))
+    return np.asarray(across[:, :, None] * down[:, None, :]).reshape(len(seen), -1)
+
+
+def _tangent(seen: PhotometricObservations, profile: CameraProfile, at: Prediction) -> Array:
+    """What vignetting, a gain for each frame and the curve can do (n, m), grey levels."""
+    frames = (seen.frame[:, None] == seen.frames[None, :]).astype(float)
+    factors = -at.respond(np.concatenate([(seen.radius**2)[:, None], frames], axis=1))
+    curve = profile.response or ResponseCurve("srgb")
+    changed = (
+        replace(curve, extra_gamma=curve.extra_gamma * (1 + CURVE_STEP)),
+        replace(curve, black_level=curve.black_level + CURVE_STEP),
+    )
+    bent = [at.residual - predict(seen, replace(profile, response=other)).residual for other in changed]
+    return np.concatenate([factors, np.stack(bent, axis=-1) / CURVE_STEP], axis=1)
+
+
+def _solved(columns: Array, left: Array, weight: Array, block: Index, count: int) -> tuple[Array, Array]:
+    """The first ``count`` numbers of a ridge regression, and their covariance with blocks as what errs together."""
+    weighted = columns * weight[:, None]
+    normal = weighted.T @ columns
+    inverse = np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9)))
+    numbers = inverse @ (weighted.T @ left)
+    pull = weighted * (left - columns @ numbers)[:, None]
+    sums = np.stack([np.bincount(block, column) for column in pull.T], axis=-1)
+    blocks = len(sums)
+    covariance = inverse @ (sums.T @ sums) @ inverse * blocks / max(blocks - 1, 1)
+    return numbers[:count], covariance[:count, :count]
+
+
+def _held_out(
+    columns: Array, count: int, left: Array, weight: Array, block: Index, seen: PhotometricObservations
+) -> HeldOutGain:
+    """Fitted on every other block, judged on those between, both ways; the nuisances fitted to all in both."""
+    others = columns[:, count:]
+    before, after = np.zeros(len(left)), np.zeros(len(left))
+    for fold in (0, 1):
+        fitted, judged = block % 2 == fold, block % 2 != fold
+        numbers = _solved(columns[fitted], left[fitted], weight[fitted], block[fitted], count)[0]
+        for rest, target in ((left, before), (left - columns[:, :count] @ numbers, after)):
+            target[judged] = _without(others[judged], rest[judged], weight[judged], block[judged])
+    typical = float(np.sqrt(np.mean(seen.noise**2)))
+    return HeldOutGain(PHOTOMETRY, typical * _capped_rms(before), typical * _capped_rms(after), typical)
+
+
+def _without(columns: Array, left: Array, weight: Array, block: Index) -> Array:
+    """What a regression on nuisances leaves."""
+    return left - columns @ _solved(columns, left, weight, block, columns.shape[1])[0]
+
+
+def _capped_rms(left: Array) -> float:
+    return float(np.sqrt(np.mean(np.clip(left, -CAP, CAP) ** 2)))
+
+
+def _size(field: Field) -> tuple[float, float]:
+    """Largest value of the map, and the deviation there."""
+    values = np.abs(np.array(field.values)[:, 0])
+    place = int(np.argmax(values))
+    return float(values[place]), float(field.std[place][0])
+
+
+def map_shape(field: Field) -> str:
+    """What a map of numbers does over the picture."""
+    x, y = np.meshgrid(*(np.linspace(k[0], k[-1], 21) for k in field.knots), indexing="ij")
+    values = field.at(x, y)[..., 0]
+    values = values - values.mean()
+    total = float((values**2).sum())
+    if not total:
+        return "nothing"
+    plane = np.stack([np.ones(x.size), x.ravel() / np.ptp(x), y.ravel() / np.ptp(y)], axis=-1)
+    left = values.ravel() - plane @ np.linalg.lstsq(plane, values.ravel(), rcond=None)[0]
+    if float((left**2).sum()) < (1 - ALIKE) * total:
+        return SLOPE
+    rows = values - values.mean(axis=0, keepdims=True)
+    return BAND if float((rows**2).sum()) < (1 - ALIKE) * total else MAP
