@@ -27,7 +27,7 @@ KNOTS = 4
 FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
 MOST_OBSERVATIONS = 15_000
 MIN_SIZE = 0.1
-"""Grey levels (rms): on nine captures without such a field textured patches and the encoder left up to 0.03."""
+"""Grey levels (rms): on seven captures without such a field textured patches and the encoder left up to 0.03."""
 CAUCHY, CAP = 2.5, 5.0
 """Noises at which a residual has half its weight, and beyond which it counts as that many."""
 RIDGE = 1e-3
