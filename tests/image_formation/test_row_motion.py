@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
 from virest.capture.imu import ImuSamples
-from virest.image_formation.row_motion import FrameTranslation, row_motion
+from virest.image_formation.row_motion import FrameTranslation, FurtherTurn, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.relief_surface import Relief
 
@@ -161,3 +161,18 @@ def test_the_table_follows_a_shaking_hand() -> None:
     at = motion.start_s + np.random.default_rng(0).uniform(0, 0.036, 200)
     expected = np.swapaxes(trajectory.orientation(at), -1, -2) @ trajectory.orientation(motion.reference_s)
     np.testing.assert_allclose(motion.pose(at)[0], expected, atol=1e-6)
+
+
+def test_a_further_turn_is_integrated_about_the_camera_s_own_axes():
+    """A rate that changes from pair to pair, on top of a fast turn, gives the camera that turns by both."""
+    rate, time_s = np.array([0.8, -1.5, 2.0]), np.linspace(-0.1, 0.3, 801)
+    further = FurtherTurn(np.array([0.0, 0.04]), np.array([[0.3, 0.0, 0.0], [0.0, -0.2, 0.0]]))
+    lacking = np.stack([np.interp(time_s, further.time_s, along) for along in further.rate_rad_s.T], -1)
+    profile, motions = replace(phone(), gyro_scale=(1.0, 1.0, 1.0)), []
+    for camera in (np.tile(rate, (len(time_s), 1)), rate - lacking):
+        gyro = camera @ profile.rotation_cam_imu
+        trajectory = integrate_gyro(ImuSamples(time_s, gyro, np.full_like(gyro, np.nan)), profile)
+        motions.append(row_motion(trajectory, profile, 0.01, 0.01))
+    predicted, true = motions
+    assert np.abs(true.rotation_vector - predicted.rotation_vector).max() > 1e-3
+    np.testing.assert_allclose(predicted.turned(further).rotation_vector, true.rotation_vector, atol=5e-6)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.kernels import KernelField, field_along, instants, splined_nodes
-from virest.image_formation.row_motion import RowMotion, covering_both, with_row_clock_of
+from virest.image_formation.row_motion import FurtherTurn, RowMotion, covering_both, with_row_clock_of
 from virest.image_formation.warp import PIXELS_WITHIN_PX, grid_filled, seen_by_rows
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
@@ -51,12 +51,15 @@ class NeighbourView:
         """Middles of both frames' exposures, IMU clock."""
         return self.frame.middle_s, self.neighbour.middle_s
 
-    def map_px(self, moved: Callable[[Array], Array] = lambda points_px: points_px) -> NDArray[np.float32]:
+    def map_px(
+        self, moved: Callable[[Array], Array] = lambda points_px: points_px, times: int = 1
+    ) -> NDArray[np.float32]:
         """:meth:`places_px` of every pixel, (height, width, 2), as cv2.remap takes it.
 
-        moved: where pixels (..., 2) are looked for instead, a smooth map.
+        moved: where pixels (..., 2) are looked for instead, a smooth map.  times: of pictures that are smaller.
         """
-        return grid_filled(self.frame, lambda points_px: self.places_px(moved(points_px)))
+        found = grid_filled(self.frame, lambda points_px: self.places_px(moved(points_px)), times=times)
+        return found if times == 1 else (found + np.float32(0.5)) / np.float32(times) - np.float32(0.5)
 
     def field(self) -> Callable[[Array], KernelField]:
         """Kernels of the neighbour's picture once it is brought to the frame's pixels, at any centres (n, 2)."""
@@ -78,15 +81,15 @@ def neighbour_view(
     trajectory: Trajectory,
     lens: MovingLens,
     anchor: float = 0.5,
-    turn: tuple[Array, Array] | None = None,
+    further: FurtherTurn | None = None,
 ) -> NeighbourView:
     """Look from one frame at another; lens: of the whole trajectory.
 
-    turn: rate and slope, as :meth:`RowMotion.turned` takes them, that the trajectory lacks over both frames.
+    further: what the trajectory lacks, over both frames.
     """
     both = covering_both(frame, neighbour, trajectory, lens)
-    if turn is not None:
-        both = both.turned(*turn)
+    if further is not None:
+        both = both.turned(further)
     return NeighbourView(both, with_row_clock_of(both, neighbour), anchor)
 
 

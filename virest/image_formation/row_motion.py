@@ -65,6 +65,29 @@ class FrameTranslation:
 
 
 @dataclass(frozen=True, slots=True)
+class FurtherTurn:
+    """What the camera sees turns by a further rate, x' = exp(rate · t) x over a short t, beside what is predicted.
+
+    Linear between instants, constant before and after them.
+    """
+
+    time_s: Array
+    """(n,) rising, IMU clock."""
+    rate_rad_s: Array
+    """(n, 3) about the camera's axes at those instants."""
+
+    def since(self, time_s: Array, rotation: Array) -> Array:
+        """Rotation vectors (m, 3), in the axes that ``rotation`` starts from, turned since the first of the instants.
+
+        time_s: (m,) evenly spaced.  rotation: (m, 3, 3) of the predicted motion, to the camera's axes at each.
+        """
+        rate = np.stack([np.interp(time_s, self.time_s, along) for along in self.rate_rad_s.T], -1)
+        in_start_axes = np.squeeze(np.swapaxes(rotation, -1, -2) @ rate[..., None], -1)
+        steps = 0.5 * (in_start_axes[1:] + in_start_axes[:-1]) * np.diff(time_s)[:, None]
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+@dataclass(frozen=True, slots=True)
 class RowMotion:
     """The camera's pose over one frame, against its pose at the reference time.
 
@@ -156,17 +179,15 @@ class RowMotion:
             nearness = at_reference / np.maximum(ahead, _LEAST_DISTANCE)
         return nearness
 
-    def turned(self, rate_rad_s: Array, slope_rad_s2: Array) -> RowMotion:
-        """The motion with a further turn of the camera: x' = exp(rate τ + ½ slope τ²) x, τ from the reference time.
-
-        rate_rad_s, slope_rad_s2: (3,), camera axes.  Travel stays as it is.
-        """
-        since_s = (self.time_s - self.reference_s)[:, None]
-        further = rotation_from_vector(since_s * (rate_rad_s + 0.5 * since_s * slope_rad_s2))
-        turned = further @ rotation_from_vector(self.rotation_vector)
+    def turned(self, further: FurtherTurn) -> RowMotion:
+        """The motion with a further turn of the camera, none at the reference time; travel stays as it is."""
+        rotation = rotation_from_vector(self.rotation_vector)
+        since = further.since(self.time_s, rotation)
+        at_reference = np.array([np.interp(self.reference_s, self.time_s, along) for along in since.T])
+        turned = rotation @ rotation_from_vector(since - at_reference)
         shift = self.translation_m
         if shift is not None:
-            shift = np.squeeze(further @ shift[..., None], -1)
+            shift = np.squeeze(turned @ np.swapaxes(rotation, -1, -2) @ shift[..., None], -1)
         return replace(self, rotation_vector=vector_from_rotation(turned), translation_m=shift)
 
     @property

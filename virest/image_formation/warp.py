@@ -110,8 +110,12 @@ def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_de
     return grid_filled(motion, recorded, spacing_px)
 
 
-def grid_filled(motion: RowMotion, mapping: Callable[[Array], Array], spacing_px: int = 16) -> NDArray[np.float32]:
+def grid_filled(
+    motion: RowMotion, mapping: Callable[[Array], Array], spacing_px: int = 16, times: int = 1
+) -> NDArray[np.float32]:
     """A smooth map of pixels, (height, width, 2): worked out at the knots of cubic splines, which give it on a grid.
+
+    times: at the middles of squares of this many pixels, a divisor of ``spacing_px``; (height // times, ...) of them.
 
     Straight lines between the grid's nodes are the quickest way to all pixels, splines the one from fewest knots.
     Before relief a map bends at depth edges, where splines would swing: every node is worked out.
@@ -121,9 +125,10 @@ def grid_filled(motion: RowMotion, mapping: Callable[[Array], Array], spacing_px
     (x, across), (y, down) = ((_all_nodes if bent else _knots)(length, spacing_px) for length in (width, height))
     at_knots = mapping(np.stack(np.meshgrid(x, y), -1))
     values = (across @ np.tensordot(down, at_knots, 1)).astype(np.float32)
-    size = (values.shape[1] * spacing_px, values.shape[0] * spacing_px)
+    cell = spacing_px // times
+    size = (values.shape[1] * cell, values.shape[0] * cell)
     filled = cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
-    return filled[spacing_px : spacing_px + height, spacing_px : spacing_px + width]
+    return filled[cell : cell + height // times, cell : cell + width // times]
 
 
 def _nodes(length: int, spacing: int) -> Array:

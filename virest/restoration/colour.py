@@ -81,10 +81,16 @@ def _sharp_differences(
     def left_over(luma: Image, differences: list[Image]) -> list[Image]:
         return [cv2.subtract(d, cv2.multiply(s, luma)) for d, s in zip(differences, slopes, strict=True)]
 
+    own = left_over(luma, differences)
     join_neighbours(
-        blurred, deconvolution, lambda neighbour: left_over(*_neighbour_differences(neighbour, scale)), scale
+        blurred,
+        deconvolution,
+        own,
+        lambda neighbour: left_over(*_neighbour_differences(neighbour, scale)),
+        ratios[0],
+        scale,
     )
-    for number, (left, slope) in enumerate(zip(left_over(luma, differences), slopes, strict=True)):
+    for number, (left, slope) in enumerate(zip(own, slopes, strict=True)):
         filtered = deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(left, number), *ratios))
         yield cv2.add(filtered, cv2.multiply(slope, sharp))
 

@@ -57,5 +57,7 @@ PRESETS: dict[str, RestorationSettings] = {
     "balanced": RestorationSettings(
         "balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3, most_joined=2
     ),
-    "best": RestorationSettings("best", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3),
+    "best": RestorationSettings(
+        "best", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3, most_joined=3
+    ),
 }

@@ -9,7 +9,7 @@ import numpy as np
 
 from virest.image_formation.blur import Image
 from virest.restoration import tiles
-from virest.restoration.blurred import BlurredPicture
+from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
 from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.on_tiles import on_spectrum, packed, packed_frequency
@@ -108,30 +108,37 @@ def noise_to_signal(
 def join_neighbours(
     blurred: BlurredPicture,
     deconvolution: tiles.TileDeconvolution,
+    own: Sequence[Image],
     channels: Callable[[NeighbourPicture], Sequence[Image]],
+    ratio: Image,
     scale: float = 1.0,
 ) -> None:
-    """Add the neighbours to the data term of all tiles; channels: of a neighbour, at the deconvolution's scale.
+    """Add the neighbours to the data term of all tiles.
 
-    Beside clipped light neighbours would hold what is taken out of the frame: such tiles do without them.
+    own: channels of the frame, at the deconvolution's scale.  channels: of a neighbour.  ratio: N / S of a tile.
     """
     if not blurred.neighbours:
         return
     centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
-    alone: list[int] = []
-    if blurred.holes is not None:
-        height, width = deconvolution.grid.height, deconvolution.grid.width
-        holes = cv2.resize(blurred.holes, (width, height), interpolation=cv2.INTER_AREA)
-        alone = deconvolution.touched(holes)
-    shared = np.zeros(len(deconvolution.kernels))
+    size, alone, lamps = own[0].shape[::-1], deconvolution.alone(own, ratio), _lit_by_lamps(blurred)
     for one in blurred.neighbours:
-        weights = one.weight_at(centres_px, scale * deconvolution.grid.side / 2)
-        weights[alone] = 0.0
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
         kept = _kept_sharpness(one.shift_std_px / scale, deconvolution.size)
-        deconvolution.join(channels(one), kernels, weights, kept)
-        shared += one.shared_noise * weights
-    deconvolution.share_noise(shared)
+        trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
+        if lamps is not None:
+            trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
+        deconvolution.join(channels(one), kernels, kept, trust, alone)
+
+
+def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
+    """1.0 where light that is clipped in the frame may reach in any neighbour, (height, width); None: nowhere.
+
+    It was taken out of the frame's tiles, and the neighbour still has it.
+    """
+    if blurred.holes is None:
+        return None
+    side = 2 * int(np.ceil(blurred.longest_px + CODEC_REACH_PX)) + 1
+    return cv2.dilate(blurred.holes, np.ones((side, side), np.uint8))
 
 
 def _kept_sharpness(shift_std_px: float, size: int) -> Image:

@@ -75,11 +75,13 @@ def _projected_luma(
 ) -> Image:
     """Spectra of Kᵀ g, (tiles, size, size), with those of the neighbours; tiles with clipped light are tamed."""
     luma, holes = luma_of(blurred.light), blurred.holes
-    join_neighbours(blurred, deconvolution, lambda neighbour: [neighbour.light])
     if holes is not None:
         numbers = deconvolution.touched(holes)
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
         deconvolution.remove_highlights(numbers, kernels, luma, measured_part(holes), float(luma.max()))
+    if blurred.neighbours:
+        ratio = noise_to_signal(deconvolution, settings, blurred.statistics)[0]
+        join_neighbours(blurred, deconvolution, [luma], lambda neighbour: [neighbour.light], ratio)
     return deconvolution.back_projected(luma)
 
 

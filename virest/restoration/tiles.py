@@ -27,8 +27,25 @@ SETTLING_ITERATIONS, SETTLING_RELAXATION = 4, 1.7
 """About as good as seven plain steps of Richardson-Lucy's."""
 LAMP_DOUBT = 0.02
 """Highlight level, in units of the recorded range, at which the blend is half Richardson–Lucy."""
+LEAST_TRUSTED = 0.3
+"""Part of a tile that must be trusted for it to be joined: less is not worth its transforms."""
 Filter = Callable[[Image], Image]
 """Turns a kernel's power spectrum |K|² (packed, real parts doubled) into the real factor that follows conj(K)."""
+
+
+class SharpTiles:
+    """Spectra of sharp tiles, each made once, when it is asked for."""
+
+    def __init__(self, make: Callable[[int, int], Image]) -> None:
+        """make: by the channel's number and the tile's."""
+        self._make = make
+        self._made: dict[tuple[int, int], Image] = {}
+
+    def spectrum(self, channel: int, number: int) -> Image:
+        """Of one tile, (size, size), packed."""
+        if (channel, number) not in self._made:
+            self._made[channel, number] = self._make(channel, number)
+        return self._made[channel, number]
 
 
 class TileDeconvolution:
@@ -72,11 +89,12 @@ class TileDeconvolution:
         _power_at_ends(self.kernels, self.powers)
         if variance is not None:
             self.powers += variance(self.size)
-        self._once: Image | np.float32 = np.float32(1)
         self._joined: list[Image] = []
         """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra of each channel."""
         self._without_highlights: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
+        self._rest: dict[int, Image] = {}
+        """Spectra of what those steps found beside the lamps."""
         self._highlights: dict[int, tuple[Image, Image]] = {}
         """How much of the steps' own light to take in those tiles, and that light, (side, side) each."""
 
@@ -103,43 +121,59 @@ class TileDeconvolution:
         _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
         if self._joined:
             projected += self._joined[number_joined]
-            projected *= self._once
         return projected
 
-    def join(self, channels: Sequence[Image], kernels: Image, weights: NDArray[np.float64], sharpness: Image) -> None:
-        """Take a further picture of the same scene into account, channels (height, width) with a weight for each tile.
+    def join(
+        self, channels: Sequence[Image], kernels: Image, sharpness: Image, trust: Image, alone: SharpTiles
+    ) -> None:
+        """Take a further picture of the same scene into account, channels (height, width).
 
         kernels: (tiles, k, k).  sharpness: what its uncertain place leaves of it on average, a packed real factor;
-        the power |K|² stays, as in any expected data term.
+        the power |K|² stays, as in any expected data term.  trust: (height, width) 0 to 1; where it is little there
+        stands in place of the picture what ``alone`` would be in it, which says nothing new.
         """
         if not self._joined:
             self._joined = [np.zeros_like(self.kernels) for _ in channels]
-        used = np.flatnonzero(weights)
-        padded, corners = [self.padded(channel) for channel in channels], list(self.grid.corners())
+        padded, trusted = [self.padded(channel) for channel in channels], self.padded(trust)
+        corners, patch = list(self.grid.corners()), self.patch
+        parts = [trusted[top : top + patch, left : left + patch] for top, left in corners]
+        least = [cv2.minMaxLoc(part)[0] for part in parts]
+        used = [k for k, part in enumerate(parts) if least[k] == 1 or cv2.mean(part)[0] > LEAST_TRUSTED]
         one, back = np.empty((2, self.size, self.size), np.float32)
-        for number, kernel in zip(used.tolist(), _kernel_spectra(kernels[used], self.size), strict=True):
-            for plane, joined in zip(padded, self._joined, strict=True):
-                spectrum, weight = (
-                    transforms.forward(self.periodic(plane, *corners[number]), self._spectrum),
-                    weights[number],
-                )
+        for number, kernel in zip(used, _kernel_spectra(kernels[used], self.size), strict=True):
+            share = self.periodic(trusted, *corners[number]).copy() if least[number] < 1 else None
+            for channel, (plane, joined) in enumerate(zip(padded, self._joined, strict=True)):
+                tile = self.periodic(plane, *corners[number])
+                if share is not None:
+                    tile = tile.copy()
+                    known = alone.spectrum(channel, number)
+                    predicted = transforms.inverse(cv2.mulSpectrums(known, kernel, 0, conjB=True))
+                    tile = cv2.add(predicted, cv2.multiply(share, cv2.subtract(tile, predicted)))
+                spectrum = transforms.forward(tile, self._spectrum)
                 np.multiply(_inner_numbers(spectrum), _inner_numbers(kernel), out=_inner_numbers(back))
                 _ends(back)[:] = _ends_product(np.array(_ends(spectrum)), np.array(_ends(kernel)))
-                cv2.scaleAdd(cv2.multiply(back, sharpness, back), weight, joined[number], joined[number])
+                cv2.accumulateProduct(back, sharpness, joined[number])
             _power_inside(kernel, one)
             _power_at_ends(kernel[None], one[None])
-            cv2.scaleAdd(one, weight, self.powers[number], self.powers[number])
+            self.powers[number] += one
 
-    def share_noise(self, shared: NDArray[np.float64]) -> None:
-        """Count that part of the noise once that further pictures have in common with the first.
+    def alone(self, channels: Sequence[Image], ratio: Image) -> SharpTiles:
+        """The tiles of the picture by itself, made sharp by the linear filter with N / S ``ratio``, as asked for.
 
-        shared: (tiles,) sum over the further pictures of their weight times that part.  Of n equal pictures whose noise
-        is wholly shared the sum tells no more than one, so their sums are divided by n.
+        Beside lamps, once they were removed, as they were found.
         """
-        if not self._joined:
-            return
-        self._once = (1.0 / (1.0 + shared)).astype(np.float32)[:, None, None]
-        self.powers *= self._once
+        padded, corners = [self.padded(channel) for channel in channels], list(self.grid.corners())
+
+        def sharp(channel: int, number: int) -> Image:
+            if number in self._rest:
+                return self._rest[number]
+            spectrum = transforms.forward(self.periodic(padded[channel], *corners[number]))
+            kernel, power = self.kernels[number], np.empty_like(ratio)
+            _power_inside(kernel, power)
+            _power_at_ends(kernel[None], power[None])
+            return cv2.divide(cv2.mulSpectrums(spectrum, kernel, 0), cv2.add(power, ratio))
+
+        return SharpTiles(sharp)
 
     def touched(self, mask: Image) -> list[int]:
         """Numbers of the tiles that see anything of a mask (height, width)."""
@@ -170,6 +204,7 @@ class TileDeconvolution:
             recorded = self.periodic(light, top, left)
             found = _sharpened(recorded, kernel, measured)
             rest = cv2.min(found, top_light)
+            self._rest[number] = transforms.forward(rest)
             lamp = cv2.subtract(found, rest)
             blurred_rest, blurred_lamp = (_through(part, self.kernels[number], True) for part in (rest, lamp))
             left_over = recorded - blurred_lamp - blurred_rest

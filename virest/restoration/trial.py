@@ -17,7 +17,7 @@ from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import blurred_picture
 from virest.restoration.frame import blurred_part, deblur_method, too_little_to_gain, trusted_share
 from virest.restoration.neighbours.refinement import RefinedMotion
-from virest.restoration.neighbours.registration import reduction
+from virest.restoration.neighbours.registration import reduced
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.tile_power import FEW_TILES
@@ -52,8 +52,4 @@ def tried(
     sharp, recorded = tile_hyper_laplacian(replace(blurred, spread=spread), settings, THIN_MARGIN), blurred.light[0]
     part = trusted_share(model) * blurred_part(motion, settings.min_blur_px, settings.tile_px)
     restored = recorded + part * (np.clip(sharp, *curve.light_range) - recorded)
-    times = reduction(height, width)
-    size = width // times, height // times
-    return cv2.resize(recorded, size, interpolation=cv2.INTER_AREA), cv2.resize(
-        restored, size, interpolation=cv2.INTER_AREA
-    )
+    return reduced(recorded), reduced(restored)

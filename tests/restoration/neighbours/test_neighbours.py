@@ -139,6 +139,37 @@ def test_a_neighbour_that_shows_something_else_is_left_out(simulated):
     assert psnr_db(beside.picture, truth, alone.valid_px) > psnr_db(alone.picture, truth, alone.valid_px) - 0.1
 
 
+@pytest.mark.parametrize("number", [3, 4], ids=["last before", "first after"])
+def test_a_scene_cut_takes_nothing_away(simulated, number):
+    """The frames beside a cut are as good as from their own side of it, or as each alone."""
+    capture = simulated()
+    plan = replace(capture.plan(PRESETS["balanced"]), confirmed=None)
+    frames = list(capture.recorded())
+    cut = [(f, p if (k < 4) == (number < 4) else p[::-1, ::-1].copy()) for k, (f, p) in enumerate(frames)]
+    wanted = {frames[number][0].index}
+    alone = next(restore_frames([frames[number]], capture.capture.imu, plan))
+    own = next(restore_frames(frames[:4] if number < 4 else frames[4:], capture.capture.imu, plan, wanted))
+    beside = next(restore_frames(cut, capture.capture.imu, plan, wanted))
+    truth = capture.truth(frames[number][0].index)
+    db = [psnr_db(restored.picture, truth, alone.valid_px) for restored in (beside, own, alone)]
+    assert db[0] > max(db[1:]) - 0.1
+
+
+@pytest.mark.scenario
+def test_things_that_move_are_not_made_worse(simulated):
+    """Their blur is not the camera's: they stay as recorded, and what stands still gains by neighbours."""
+    capture = simulated(moving_px_s=240.0)
+    plan = replace(capture.plan(PRESETS["balanced"]), confirmed=None)
+    joint = _gains(capture, plan)
+    single = _gains(capture, replace(plan, settings=replace(plan.settings, neighbours=0)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("virest.restoration.frame.still_part", lambda _: None)
+        all_taken = _gains(capture, plan)
+    assert joint.min() > -0.1
+    assert np.all(joint > single - 0.1)
+    assert joint.mean() > max(single.mean() + 0.3, all_taken.mean())
+
+
 def test_a_frame_does_not_depend_on_how_the_movie_is_cut(simulated):
     """The bytes of a frame are the same from the whole movie and from its neighbours alone."""
     capture = simulated()

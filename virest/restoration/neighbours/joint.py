@@ -27,9 +27,18 @@ from virest.restoration.statistics.tile_power import passed_power
 Array = NDArray[np.float64]
 OWN_ERROR = 0.01
 """Part of the signal that differs in any two frames: the tone curve acts on each one's own blur."""
-LEAST_WEIGHT = 0.25
-"""A tile whose neighbour weighs less does without: it differs by four times what noise explains.  Right neighbours were
+MOST_DIFFERENT = 4.0
+"""A neighbour that differs in half of all places by so many times what noise explains is not used.  Right ones were
 seen to differ by 0.05 to 0.9 times that (3 at 0.08 bits a pixel), pictures of other places by 5 to 1500."""
+LEAST_TRUST = 0.25
+"""Where a neighbour weighs less it is not used."""
+ORDINARY = 16.0
+"""Difference around a place, over noise's, that is nothing else: edges of a chessboard reach it (at 8 its frames lose
+up to 1 dB); things that move differ by 10 to 400 times and lose nothing by 16."""
+LEAST_ALIKE = 0.5
+"""Part of a picture that a neighbour must show in its place to tell what moves."""
+AROUND = 17
+"""Side of what lies around a place, in reduced pixels."""
 LEAST_SHIFTS = 6
 """An affine field of shifts has six unknowns; as many tiles again must bear it out."""
 LOOKED_AT = 6
@@ -51,35 +60,33 @@ class NeighbourPicture:
     """(height / 2, width / 2, 3), rounded up: its light in colour, as bright as the frame's."""
     field: Callable[[Array], KernelField]
     """Its kernels at centres in the frame."""
-    places_px: Array
-    """(n, 2) where the weights hold."""
-    weights: Array
-    """(n,) of its squared difference, over the frame's own."""
+    centres_px: Array
+    """(n, 2) of the tiles in which it was compared."""
+    trust: Image
+    """Noise of the frame over that of the neighbour, 0 to 1, of a picture that is smaller than the frame."""
+    seen: NDArray[np.bool_]
+    """Of the same size: where it has a picture."""
     shift_std_px: float
     """How well it is known where it lies, each axis."""
-    shared_noise: float
-    """Part of the frame's noise that it has too, 0 to 1: a coder repeats the frame before, a denoiser averages."""
 
     @property
     def longest_px(self) -> float:
         """Longest of its blur paths where its weights hold."""
-        return float(self.field(self.places_px).length_px.max())
+        return float(self.field(self.centres_px).length_px.max())
+
+    @property
+    def weight(self) -> float:
+        """Mean over the picture."""
+        return float(self.trust.mean())
 
     def passed(self, frequency: Array) -> Array:
         """(RINGS,) mean |K|² over some of the places, times the mean weight and what its uncertain place leaves of it.
 
         frequency: (RINGS,) cycles per pixel.
         """
-        some = np.linspace(0, len(self.places_px) - 1, min(len(self.places_px), LOOKED_AT)).round().astype(int)
+        some = np.linspace(0, len(self.centres_px) - 1, min(len(self.centres_px), LOOKED_AT)).round().astype(int)
         sharpness = np.exp(-((2 * np.pi * self.shift_std_px * frequency) ** 2))
-        return np.asarray(self.weights.mean() * sharpness * rings_passed(self.field(self.places_px[some])))
-
-    def weight_at(self, centres_px: Array, half_side_px: float) -> Array:
-        """(m,) least weight near each centre: within half a tile's side, and at the nearest place."""
-        distance = np.abs(centres_px[:, None] - self.places_px).max(axis=-1)
-        near = distance <= np.maximum(half_side_px, distance.min(axis=1, keepdims=True) + 1e-9)
-        weight = np.where(near, self.weights, np.inf).min(axis=1)
-        return np.where(weight < LEAST_WEIGHT, 0.0, weight)
+        return np.asarray(self.weight * sharpness * rings_passed(self.field(self.centres_px[some])))
 
 
 def neighbour_picture(
@@ -95,8 +102,7 @@ def neighbour_picture(
 
     None where it does not fit.
 
-    field: of its kernels, from the view.  independent_error: what the frame's noise would make them differ by if the
-    neighbour had none of it.
+    field: of its kernels, from the view.  independent_error: what noise of their own makes them differ by.
 
     What is left between the two after the predicted motion is a smooth field, affine over the picture.
     """
@@ -104,25 +110,52 @@ def neighbour_picture(
     if np.count_nonzero(used) < 2 * LEAST_SHIFTS:
         return None
     affine, std_px = _affine(agreement.centres_px[used], agreement.shift_px[used], agreement.precision[used])
-    height, width = light.shape
     source = view.map_px(lambda points_px: points_px - _at(affine, points_px))
     brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    noise = float(np.median(agreement.error[used]))
-    expected = independent_error + OWN_ERROR * agreement.signal
-    weights = np.where(used, expected / np.maximum(agreement.error, expected), 0.0)
-    places = view.places_px(agreement.centres_px)
-    inside = ((places > 0) & (places < (width - 1, height - 1))).all(axis=1)
+    trust = _trust(agreement, _at(affine, agreement.centres_px), independent_error)
+    height, width = light.shape
+    places = source[agreement.times // 2 :: agreement.times, agreement.times // 2 :: agreement.times]
+    inside = cv2.inRange(places, (0, 0), (width - 1, height - 1)) > 0
+    seen = inside[: trust.shape[0], : trust.shape[1]] & ~agreement.clipped
     return NeighbourPicture(
         number,
         brought / np.float32(agreement.gain),
         brought_half / np.float32(agreement.gain),
         field,
         agreement.centres_px,
-        np.where(inside, weights, 0.0),
+        trust * seen,
+        seen,
         std_px,
-        float(np.clip(1 - noise / independent_error, 0.0, 1.0)),
     )
+
+
+def _trust(agreement: TileAgreement, shift_px: Array, independent_error: float) -> Image:
+    """Noise of a frame over that of its neighbour, by how they differ around each place of the reduced picture.
+
+    Of the difference's power, noise of both making E, half is the frame's.  Rings take overtones of edges for noise,
+    which is no more than what half of all places differ by; it scatters, and E is ORDINARY times as much.
+    """
+    left, both = (cv2.sqrBoxFilter(one, cv2.CV_32F, (AROUND, AROUND)) for one in agreement.differences(shift_px))
+    if np.median(left / (OWN_ERROR * both + np.float32(independent_error))) > MOST_DIFFERENT:
+        return np.zeros_like(left)
+    noise = min(independent_error, float(np.median(left)))
+    differs = left / (np.float32(ORDINARY) * (OWN_ERROR * both + np.float32(noise)))
+    trust = np.float32(0.5) / cv2.max(differs - np.float32(0.5), 0.5)
+    return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
+
+
+def still_part(found: Sequence[NeighbourPicture]) -> Image | None:
+    """How sure it is that the frame shows there what stands still, 0 to 1, by the neighbour that agrees best.
+
+    What no neighbour shows in its place moves, and its blur is not the camera's.  Where none has a picture nothing
+    speaks against it.  Those that show something else nearly everywhere tell nothing; None: no other.
+    """
+    telling = [one for one in found if one.trust[one.seen].mean() > LEAST_ALIKE]
+    if not telling:
+        return None
+    best = np.maximum.reduce([one.trust for one in telling])
+    return np.where(np.logical_or.reduce([one.seen for one in telling]), best, np.float32(1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,46 +165,19 @@ class JoinedNeighbours:
     pictures: tuple[NeighbourPicture, ...]
     passed: Array
     """(RINGS,) sum of their |K|², weighted."""
-    shared: float
-    """Sum of their weights times the part of the noise that they have in common with the frame."""
 
 
-def worth_joining(found: Sequence[NeighbourPicture], luma: PictureStatistics) -> JoinedNeighbours:
-    """Choose neighbours one by one, each time the one that leaves least wrong by the ideal linear filter.
+def joined_neighbours(found: Sequence[NeighbourPicture], luma: PictureStatistics) -> JoinedNeighbours:
+    """What some neighbours bring together; luma: measured on the frame."""
+    return JoinedNeighbours(tuple(found), np.sum([np.zeros(RINGS), *(one.passed(luma.frequency) for one in found)], 0))
 
-    Those that lose the same frequencies and repeat the frame's noise bring nothing but the error of their place.
-    luma: measured on the frame.
+
+def most_telling(passed: Sequence[Array], taken: Array, luma: PictureStatistics) -> int:
+    """Number of the further picture that leaves least wrong, by the ideal linear filter and the rings' spectra.
+
+    passed: (RINGS,) weighted |K|² of each.  taken: (RINGS,) sum of those taken already.  luma: measured on the frame.
     """
-    found_passed = [one.passed(luma.frequency) for one in found]
-    found_shared = [float(one.weights.mean()) * one.shared_noise for one in found]
-    taken = most_telling(found_passed, found_shared, luma, len(found))
-    passed = np.sum([np.zeros(RINGS), *(found_passed[k] for k in taken)], axis=0)
-    return JoinedNeighbours(tuple(found[k] for k in taken), passed, sum(found_shared[k] for k in taken))
-
-
-def most_telling(passed: Sequence[Array], shared: Sequence[float], luma: PictureStatistics, most: int) -> list[int]:
-    """Numbers, in order, of at most ``most`` further pictures: one by one that which leaves least wrong.
-
-    By the ideal linear filter and the rings' spectra; the choice ends where the next one would leave more.
-
-    passed: (RINGS,) weighted |K|² of each.  shared: its weight times the part of the frame's noise that it repeats.
-    luma: measured on the frame.
-    """
-    taken: list[int] = []
-    sum_passed, sum_shared = np.zeros(RINGS), 0.0
-    error = luma.ideal_error(sum_passed, sum_shared) if luma.measured else 0.0
-    while len(taken) < min(most, len(passed)):
-        errors = {
-            k: luma.ideal_error(sum_passed + passed[k], sum_shared + shared[k])
-            for k in range(len(passed))
-            if k not in taken
-        }
-        best = min(errors, key=errors.__getitem__)
-        if errors[best] >= error:
-            break
-        taken.append(best)
-        error, sum_passed, sum_shared = errors[best], sum_passed + passed[best], sum_shared + shared[best]
-    return sorted(taken)
+    return int(np.argmin([luma.ideal_error(taken + one) for one in passed]))
 
 
 def rings_passed(kernels: KernelField) -> Array:

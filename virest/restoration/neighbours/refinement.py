@@ -2,7 +2,7 @@
 
 An offset, a stabiliser's rest, a gyroscope's low pass, a focal length: whatever is wrong with the profile, the picture
 moves otherwise than predicted, and the shift between two frames measures by how much, on average from the one to the
-other.  Between the middles of both intervals the missing rate is taken as linear in time.  How large it usually is, and
+other.  Between the middles of intervals the missing rate is taken as linear in time.  How large it usually is, and
 how far it is from linear, is measured once a capture.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.neighbour import turn_jacobian_px
-from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.row_motion import FurtherTurn, RowMotion
 from virest.inference.chance import chi2_median, chi2_tail
 from virest.restoration.neighbours.registration import PairTurn
 
@@ -43,26 +43,34 @@ class MissingTurn:
     """One standard deviation, each axis, of the speeds of parts of the picture about the common turn."""
     pairs: int
 
-    def refined(self, motion: RowMotion, before: PairTurn | None, after: PairTurn | None) -> RefinedMotion:
-        """The motion of a frame with the missing turn, by the pairs that end and begin with it, as far as there are."""
+    def refined(
+        self, motion: RowMotion, before: Sequence[PairTurn | None], after: Sequence[PairTurn | None]
+    ) -> RefinedMotion:
+        """The motion of a frame with the missing turn, by the pairs of frames before and after it, nearest first.
+
+        Those next to it tell its own motion; those beyond, as far as they follow without a gap, that of its neighbours.
+        """
         prior = self.rate_rad_s**2 * np.eye(3)
-        known = [_shrunk(turn, prior) for turn in (before, after) if turn is not None and self._likely(turn)]
-        middle_s = motion.middle_s
-        if not known:
+        chains = [self._unbroken(turns) for turns in (before, after)]
+        if not any(chains):
             return RefinedMotion(motion, prior, self.scatter_px_s)
+        known = [_shrunk(turn, prior) for turn in (*reversed(chains[0]), *chains[1])]
         times_s, rates, covariances = (np.array(parts) for parts in zip(*known, strict=True))
-        if len(known) == 2:
-            slope = (rates[1] - rates[0]) / (times_s[1] - times_s[0])
-            part = (middle_s - times_s[0]) / (times_s[1] - times_s[0])
-            rate = rates[0] + slope * (middle_s - times_s[0])
-            covariance = (1 - part) ** 2 * covariances[0] + part**2 * covariances[1]
+        if all(chains):
+            first, last = len(chains[0]) - 1, len(chains[0])
+            part = (motion.middle_s - times_s[first]) / (times_s[last] - times_s[first])
+            covariance = (1 - part) ** 2 * covariances[first] + part**2 * covariances[last]
             bend = self.bend_rad_s
         else:
-            slope, rate, covariance = np.zeros(3), rates[0], covariances[0]
-            bend = self.bend_rad_s / HALF_SPACING
-        scatter = float(np.mean([t.scatter_px_s for t in (before, after) if t is not None]))
-        turn = rate + slope * (motion.reference_s - middle_s), slope
-        return RefinedMotion(motion.turned(*turn), covariance + bend**2 * np.eye(3), scatter, turn)
+            covariance, bend = covariances[-1 if chains[0] else 0], self.bend_rad_s / HALF_SPACING
+        scatter = float(np.mean([chain[0].scatter_px_s for chain in chains if chain]))
+        further = FurtherTurn(times_s, rates)
+        return RefinedMotion(motion.turned(further), covariance + bend**2 * np.eye(3), scatter, further)
+
+    def _unbroken(self, turns: Sequence[PairTurn | None]) -> list[PairTurn]:
+        """The turns up to the first that is missing or shows something else."""
+        known = [turn if turn is not None and self._likely(turn) else None for turn in turns]
+        return [turn for turn in known[: known.index(None) if None in known else None] if turn is not None]
 
     def _likely(self, turn: PairTurn) -> bool:
         spread = turn.covariance + self.rate_rad_s**2 * np.eye(3)
@@ -78,8 +86,8 @@ class RefinedMotion:
     """(3, 3) of the turn rate, (rad/s)²."""
     scatter_px_s: float
     """One standard deviation, each axis, of parts of the picture about it."""
-    turn: tuple[Array, Array] | None = None
-    """Rate and slope that were added to the predicted motion, (3,) each; None: it stays as predicted."""
+    further: FurtherTurn | None = None
+    """What was added to the predicted motion; None: it stays as predicted."""
 
     def path_covariance_px2(self) -> Array:
         """(2, 2) covariance of the blur path's end over its start, at the picture's middle, x then y."""

@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from virest.camera.profile import CameraProfile
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField, smooth_field
 from virest.image_formation.neighbour import NeighbourView, turn_jacobian_px
@@ -25,6 +27,10 @@ TILE = 64
 """Side of a compared tile, in pixels of the reduced pictures."""
 SHORT_SIDE = 400
 """Pictures are halved until their shorter side is less: shifts are then known to a tenth of a recorded pixel."""
+AROUND = TILE // 4
+"""What a tile is blurred together with on each side: half of the longest path that is compared."""
+WIDE = TILE + 2 * AROUND
+INNER = slice(AROUND, AROUND + TILE)
 MOST_TILES = 16
 LEAST_TILES = 4
 """A turn has three unknowns and a tile's shift tells two; fewer tiles leave nothing to check it by."""
@@ -72,10 +78,14 @@ def reduction(height: int, width: int) -> int:
 
 def reduced_light(luma: NDArray[np.uint8], light: NDArray[np.float32]) -> Image:
     """A frame's luma (height, width), reduced, in linear light by a table (256,)."""
-    height, width = luma.shape
-    times = reduction(height, width)
-    small = cv2.resize(luma, (width // times, height // times), interpolation=cv2.INTER_AREA)
-    return cv2.LUT(small, light)
+    return cv2.LUT(reduced(luma), light)
+
+
+def reduced(picture: NDArray[Any]) -> NDArray[Any]:
+    """A picture (height, width) of the size at which pictures are compared; rows and columns too many are cut off."""
+    times = reduction(*picture.shape)
+    height, width = (length // times for length in picture.shape)
+    return cv2.resize(picture[: times * height, : times * width], (width, height), interpolation=cv2.INTER_AREA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,16 +94,16 @@ class FrameTiles:
 
     tops_lefts: NDArray[np.intp]
     """(n, 2) in the reduced picture."""
-    times: float
+    times: int
     """How many times smaller that is."""
+    light: Image
+    """The whole of it."""
     means: Array
     """(n,) of the light."""
-    brightest: Array
-    """(n,) of the light."""
     spectra: NDArray[np.complex64]
-    """(n, TILE, TILE / 2 + 1) of the light over its mean."""
+    """(n, WIDE, WIDE / 2 + 1) of the light with what lies around."""
     kernels: NDArray[np.complex64]
-    """(n, TILE, TILE / 2 + 1) transposes of the kernels."""
+    """(n, WIDE, WIDE / 2 + 1) transposes of the kernels."""
 
     @property
     def centres_px(self) -> Array:
@@ -102,19 +112,20 @@ class FrameTiles:
 
 
 def frame_tiles(
-    light: Image, height: int, field: Callable[[Array], KernelField], everywhere: bool = False
+    light: Image, profile: CameraProfile, field: Callable[[Array], KernelField], everywhere: bool = False
 ) -> FrameTiles | None:
     """Tiles of a frame's light, from :func:`reduced_light`; None where a path does not fit into a tile.
 
-    height: of the recorded picture.  everywhere: tiles all over the picture instead of a few.
+    everywhere: tiles all over the picture instead of a few.
     """
-    times = height / light.shape[0]
+    times = reduction(profile.height, profile.width)
     tops_lefts = _tiles(light.shape[0], light.shape[1], light.size if everywhere else MOST_TILES)
     kernels = _kernel_spectra(field, tops_lefts, times)
     if kernels is None:
         return None
     tiles = _cut(light, tops_lefts)
-    return FrameTiles(tops_lefts, times, tiles.mean(axis=(1, 2)), tiles.max(axis=(1, 2)), _spectra(tiles), kernels)
+    wide = _wide_spectra(light, tops_lefts)
+    return FrameTiles(tops_lefts, times, light, tiles.mean(axis=(1, 2)), wide, kernels)
 
 
 def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | None:
@@ -122,16 +133,17 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
 
     first, second: from :func:`reduced_light`, of the view's frame and its neighbour.
     """
-    tiles = frame_tiles(first, view.frame.profile.height, smooth_field(view.frame, view.anchor))
+    tiles = frame_tiles(first, view.frame.profile, smooth_field(view.frame, view.anchor))
     if tiles is None:
         return None
     tops_lefts, times = tiles.tops_lefts, tiles.times
     there = _kernel_spectra(view.field(), tops_lefts, times)
     if there is None:
         return None
-    a, apart = tiles.spectra * there, np.zeros(2)
+    a, apart = _spectra(_blurred(tiles.spectra * there)), np.zeros(2)
     for _ in range(2):
-        b = _spectra(_seen(view, second, tops_lefts, apart, times)) * tiles.kernels
+        b = _wide_spectra(_brought(view, second, times, apart), tops_lefts)
+        b = _spectra(_blurred(b * tiles.kernels))
         common = _common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
             break
@@ -144,33 +156,58 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
 class TileAgreement:
     """How a neighbour's tiles agree with a frame's, each blurred as the other was and shifted onto it."""
 
+    tops_lefts: NDArray[np.intp]
+    """(n, 2) in the reduced picture."""
     centres_px: Array
     """(n, 2) in the frame."""
     shift_px: Array
     """(n, 2): the neighbour shows at a predicted place what the frame has so far on."""
     precision: Array
     """(n,) of the shifts, relative; 0: the tile shows something else."""
-    error: Array
-    """(n,) mean square difference, in light over its mean."""
+    here: NDArray[np.complex64]
+    """(n, WIDE, WIDE / 2 + 1) spectra of the frame's tiles, blurred, in light over its mean."""
+    there: Image
+    """(n, TILE, TILE) the neighbour's, blurred, in light over its mean."""
     signal: Array
     """(n,) mean square of what both show."""
     gain: float
     """The neighbour's light over the frame's."""
     light: float
     """The frame's light, median of the tiles."""
+    clipped: NDArray[np.bool_]
+    """Of the reduced picture: where light that was too bright to be measured may reach, in either frame."""
+    blur_px: int
+    """How far both kernels reach together, reduced pixels."""
     passed: Array
-    """(TILE, TILE / 2 + 1) mean of both kernels' |K|²: independent noise N makes the error Σ passed N."""
-    times: float
+    """(WIDE, WIDE / 2 + 1) mean of both kernels' |K|²: independent noise N makes the error Σ passed N."""
+    times: int
     """How many times smaller the compared pictures are."""
 
+    def differences(self, shift_px: Array) -> tuple[Image, Image]:
+        """What the frame, so far (n, 2) on, has less than the neighbour, and what both have, in light over its mean.
+
+        Of the reduced picture, (height, width) each.  Nearer to its edges than the blur reaches, where what lies beyond
+        decides, stands what is next to that.
+        """
+        here = fft.irfft2(_shifted(self.here, shift_px / self.times), (WIDE, WIDE))[:, INNER, INNER]
+        height, width = self.tops_lefts.max(axis=0) + TILE
+        left, both = np.zeros((2, height, width), np.float32)
+        for (top, start), one, other in zip(self.tops_lefts.tolist(), here, self.there, strict=True):
+            left[top : top + TILE, start : start + TILE] = other - one
+            both[top : top + TILE, start : start + TILE] = other - 1
+        inner = slice(self.blur_px, height - self.blur_px), slice(self.blur_px, width - self.blur_px)
+        edge = (self.blur_px,) * 4
+        left, both = (cv2.copyMakeBorder(one[inner], *edge, cv2.BORDER_REFLECT) for one in (left, both))
+        return left, both
+
     def expected_error(self, frequency: Array, noise: Array, slope: float) -> float:
-        """The mean square difference that independent noise makes.
+        """The mean square difference that independent noise makes, in light over its mean.
 
         noise: (rings,) power in grey levels at frequencies in cycles per recorded pixel.  slope: grey levels per light.
         """
-        recorded = _radii() / self.times
+        recorded = _radii(WIDE) / self.times
         power = np.interp(recorded, frequency, noise) / (self.times * slope * max(self.light, 1e-6)) ** 2
-        return float(np.mean(self.passed * power) * (_window() ** 2).sum())
+        return float(np.mean(self.passed * power))
 
 
 def tile_agreement(
@@ -183,20 +220,33 @@ def tile_agreement(
     kernels = _kernel_spectra(field, tiles.tops_lefts, tiles.times)
     if kernels is None:
         return None
-    there = _seen(view, second, tiles.tops_lefts, np.zeros(2), tiles.times)
-    a, b = tiles.spectra * kernels, _spectra(there) * tiles.kernels
+    there = _brought(view, second, tiles.times)
+    wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles), TILE // 4)
+    lamps = (cv2.max(tiles.light, there) > CLIPPED_LIGHT).astype(np.uint8)
+    here, there_blurred = _blurred(wide), _blurred(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
+    a, b = _spectra(here), _spectra(there_blurred)
     shift, precision = _tile_shifts(a, b, np.zeros(2))
+    means = [np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
     return TileAgreement(
+        tiles.tops_lefts,
         tiles.centres_px,
         shift * tiles.times,
         precision,
-        _power(_shifted(a, shift) - b).mean(axis=(1, 2)),
-        _power(b).mean(axis=(1, 2)),
-        float(np.median(there.mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
+        wide / means[0],
+        there_blurred / means[1],
+        (there_blurred / means[1]).var(axis=(1, 2)),
+        float(np.median(_cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
+        cv2.dilate(lamps, np.ones((4 * blur_px + 1, 4 * blur_px + 1), np.uint8)) > 0,
+        blur_px,
         np.asarray(_power(tiles.kernels).mean(axis=0) + _power(kernels).mean(axis=0)),
         tiles.times,
     )
+
+
+def _reach_px(field: Callable[[Array], KernelField], tiles: FrameTiles) -> int:
+    """Half of the longest path of a neighbour's kernels, reduced pixels, rounded up."""
+    return int(np.ceil(0.5 * field(tiles.centres_px).length_px.max() / tiles.times))
 
 
 def judged_change(
@@ -209,17 +259,17 @@ def judged_change(
     |G|².  What only shifts a tile is no error of the blur: both pictures are shifted alike.  All are reduced; None
     where a path does not fit into a tile or the frames show different things.
     """
-    times = view.frame.profile.height / recorded.shape[0]
+    times = reduction(view.frame.profile.height, view.frame.profile.width)
     tops_lefts = _tiles(*recorded.shape)
     kernels = _kernel_spectra(view.field(), tops_lefts, times)
     if kernels is None:
         return None
-    there = _seen(view, second, tops_lefts, np.zeros(2), times)
-    b, tiles = _spectra(there), [_cut(picture, tops_lefts) for picture in (recorded, restored)]
-    onto = [_spectra(tile) * kernels for tile in tiles]
+    there = _cut(_brought(view, second, times), tops_lefts)
+    b = _spectra(there)
+    onto = [_spectra(_blurred(_wide_spectra(picture, tops_lefts) * kernels)) for picture in (recorded, restored)]
     shift, precision = _tile_shifts(onto[0] + onto[1], b, np.zeros(2))
     onto = [_shifted(a, shift) for a in onto]
-    used = (precision > 0) & (np.maximum(tiles[0], there).max(axis=(1, 2)) < CLIPPED_LIGHT)
+    used = (precision > 0) & (np.maximum(_cut(recorded, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT)
     if np.count_nonzero(used) < LEAST_TILES:
         return None
     spectra = b, b - onto[0], b - onto[1], onto[1] - onto[0]
@@ -228,9 +278,10 @@ def judged_change(
 
 
 def _shifted(spectra: NDArray[np.complex64], shift: Array) -> NDArray[np.complex64]:
-    """Spectra (n, TILE, TILE / 2 + 1) of tiles that lie so far (n, 2) on."""
+    """Spectra (n, side, side / 2 + 1) of tiles that lie so far (n, 2) on."""
     along, down = (
-        np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64) for d, f in zip(shift.T, _axes(), strict=True)
+        np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64)
+        for d, f in zip(shift.T, _axes(spectra.shape[1]), strict=True)
     )
     return np.asarray(spectra * along[:, None, :] * down[:, :, None])
 
@@ -252,15 +303,15 @@ def _tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
     return np.asarray(corners[chosen])
 
 
-def _full_px(tops_lefts: NDArray[np.intp], times: float, at: float) -> Array:
+def _full_px(tops_lefts: NDArray[np.intp], times: int, at: float) -> Array:
     """(n, 2) pixels x, y of the recorded picture at a place ``at`` rows and columns into each reduced tile."""
     return np.asarray((tops_lefts[:, ::-1] + at + 0.5) * times - 0.5)
 
 
 def _kernel_spectra(
-    field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: float
+    field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int
 ) -> NDArray[np.complex64] | None:
-    """Transposes of the kernels at tiles' centres, (n, TILE, TILE / 2 + 1).
+    """Transposes of the kernels at tiles' centres, (n, WIDE, WIDE / 2 + 1).
 
     None where a path does not fit into half a tile.
     """
@@ -268,29 +319,33 @@ def _kernel_spectra(
     radius = kernels.radius_px
     if 2 * radius + 1 > TILE // 2:
         return None
-    padded = np.zeros((len(tops_lefts), TILE, TILE), np.float32)
+    padded = np.zeros((len(tops_lefts), WIDE, WIDE), np.float32)
     padded[:, : 2 * radius + 1, : 2 * radius + 1] = kernels.arrays()
     return np.asarray(np.conj(fft.rfft2(np.roll(padded, (-radius, -radius), (1, 2)))))
 
 
-def _cut(picture: Image, tops_lefts: NDArray[np.intp]) -> Image:
-    return np.stack([picture[top : top + TILE, left : left + TILE] for top, left in tops_lefts.tolist()])
+def _cut(picture: Image, tops_lefts: NDArray[np.intp], side: int = TILE) -> Image:
+    return np.stack([picture[top : top + side, left : left + side] for top, left in tops_lefts.tolist()])
 
 
-def _seen(view: NeighbourView, second: Image, tops_lefts: NDArray[np.intp], apart: Array, times: float) -> Image:
-    """The neighbour's tiles (n, TILE, TILE) where the prediction puts the frame's, less a common shift.
+def _wide_spectra(picture: Image, tops_lefts: NDArray[np.intp]) -> NDArray[np.complex64]:
+    """Spectra (n, WIDE, WIDE / 2 + 1) of tiles with what lies around them; the picture is mirrored at its edges."""
+    padded = cv2.copyMakeBorder(picture, AROUND, AROUND, AROUND, AROUND, cv2.BORDER_REFLECT_101)
+    return np.asarray(fft.rfft2(_cut(padded, tops_lefts, WIDE)))
 
-    Over a tile the predicted map is a homography to a few hundredths of a pixel: 64 rows take 2 ms.
+
+def _blurred(wide: NDArray[np.complex64]) -> Image:
+    """Tiles (n, TILE, TILE) of spectra (n, WIDE, WIDE / 2 + 1)."""
+    return np.asarray(fft.irfft2(wide, (WIDE, WIDE))[:, INNER, INNER])
+
+
+def _brought(view: NeighbourView, second: Image, times: int, apart: Array | None = None) -> Image:
+    """The neighbour's reduced picture where the prediction puts the frame's, less a common shift (2,), reduced pixels.
+
+    Row by row: over the rows of a tile, 5 ms, a hand's shake bends the map by up to half a pixel.
     """
-    square = np.array([[0, 0], [TILE - 1, 0], [TILE - 1, TILE - 1], [0, TILE - 1]], float)
-    corners = tops_lefts[:, None, ::-1] + square
-    places = (view.places_px((corners - apart + 0.5) * times - 0.5) + 0.5) / times - 0.5
-    tiles = np.empty((len(tops_lefts), TILE, TILE), np.float32)
-    for tile, there in zip(tiles, places.astype(np.float32), strict=True):
-        homography = cv2.getPerspectiveTransform(square.astype(np.float32), there)
-        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        cv2.warpPerspective(second, homography, (TILE, TILE), tile, flags, cv2.BORDER_REPLICATE)
-    return tiles
+    source = view.map_px(times=times) if apart is None else view.map_px(lambda p: p - times * apart, times)
+    return cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _spectra(tiles: Image) -> NDArray[np.complex64]:
@@ -306,15 +361,15 @@ def _window() -> Image:
     return np.outer(hann, hann).astype(np.float32)
 
 
-def _axes() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Frequencies along and down of half a spectrum (TILE, TILE / 2 + 1), cycles per pixel."""
-    return np.fft.rfftfreq(TILE).astype(np.float32), np.fft.fftfreq(TILE).astype(np.float32)
+def _axes(side: int = TILE) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Frequencies along and down of half a spectrum (side, side / 2 + 1), cycles per pixel."""
+    return np.fft.rfftfreq(side).astype(np.float32), np.fft.fftfreq(side).astype(np.float32)
 
 
-@lru_cache(maxsize=1)
-def _radii() -> Array:
-    """Distance from zero over half a spectrum, cycles per pixel."""
-    return np.hypot(*np.meshgrid(np.fft.rfftfreq(TILE), np.fft.fftfreq(TILE)))
+@lru_cache(maxsize=2)
+def _radii(side: int = TILE) -> Array:
+    """Distance from zero over half a spectrum (side, side / 2 + 1), cycles per pixel."""
+    return np.hypot(*np.meshgrid(np.fft.rfftfreq(side), np.fft.fftfreq(side)))
 
 
 @lru_cache(maxsize=1)
@@ -367,7 +422,7 @@ def _left(phase: NDArray[np.float32], shift: Array, waves: NDArray[np.float32]) 
 
 
 def _turn(
-    view: NeighbourView, tops_lefts: NDArray[np.intp], times: float, shift: Array, precision: Array
+    view: NeighbourView, tops_lefts: NDArray[np.intp], times: int, shift: Array, precision: Array
 ) -> PairTurn | None:
     """Fit one turn rate to the tiles' shifts, by Huber's weights."""
     used = precision > 0

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -27,8 +28,16 @@ from virest.restoration.neighbours.joint import (
     rings_passed,
 )
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
-from virest.restoration.neighbours.registration import PairTurn, frame_tiles, pair_turn, reduced_light, tile_agreement
+from virest.restoration.neighbours.registration import (
+    FrameTiles,
+    PairTurn,
+    frame_tiles,
+    pair_turn,
+    reduced_light,
+    tile_agreement,
+)
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
+from virest.restoration.statistics.rings import RINGS
 
 TYPICAL_WEIGHTS = (1.0, 0.95, 0.85)
 """What neighbours one, two, and three or more frames away weighed in the mean before any was chosen: on four simulated
@@ -96,8 +105,8 @@ class FrameNeighbours:
         self._forget_before(here.frame.index - max(len(before), 1))
         if self._missing is None:
             return None
-        turns = [self.turn(before[-1], here) if before else None, self.turn(here, after[0]) if after else None]
-        return self._missing.refined(here.motion, *turns)
+        turns = [self.turn(first, second) for first, second in pairwise((*before, here, *after))]
+        return self._missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :])
 
     def pictures(
         self,
@@ -110,28 +119,40 @@ class FrameNeighbours:
     ) -> tuple[NeighbourPicture, ...]:
         """At most ``most`` of a frame's neighbours, those with the most telling blur, brought to its pixels.
 
+        In the place of one that shows something else the next is taken.
+
         luma: what was measured on the frame's.  field: of its kernels.
         """
         assert here.motion is not None
-        height, curve = here.motion.profile.height, here.motion.profile.response or ResponseCurve("srgb")
-        tiles = frame_tiles(self.light(here), height, field, everywhere=True)
-        turn, found = None if refined is None else refined.turn, []
-        usable = [other for other in around if other.usable and other.frame.index != here.frame.index]
-        if len(usable) > most:
-            usable = self._most_telling(usable, here, luma, most)
-        for other in usable if tiles is not None else ():
-            assert other.motion is not None
-            view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, turn=turn)
-            along = view.field()
-            assert tiles is not None
-            agreement = tile_agreement(view, tiles, along, self.light(other))
-            if agreement is None:
-                continue
-            level = 255 * float(curve.encode(np.array(agreement.light)))
-            slope = float(np.interp(level, np.arange(256), curve.slope_table()))
-            error = agreement.expected_error(luma.frequency, luma.noise, slope)
-            found.append(neighbour_picture(view, along, other.frame.index, *self._full_of(other), agreement, error))
-        return tuple(one for one in found if one is not None and one.weights.any())
+        tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
+        left = [other for other in around if other.usable and other.frame.index != here.frame.index]
+        found: list[NeighbourPicture] = []
+        taken = np.zeros(RINGS)
+        while tiles is not None and left and len(found) < most:
+            passed = [self._passed_of(other, here) for other in left]
+            number = most_telling(passed, taken, luma)
+            one = self._picture(here, left.pop(number), refined, tiles, luma)
+            if one is not None and one.weight > 0:
+                found.append(one)
+                taken = taken + passed[number]
+        return tuple(sorted(found, key=lambda one: one.number))
+
+    def _picture(
+        self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
+    ) -> NeighbourPicture | None:
+        """A neighbour brought to the frame's pixels; None where it shows something else."""
+        assert here.motion is not None
+        assert other.motion is not None
+        curve, further = here.motion.profile.response or ResponseCurve("srgb"), refined.further if refined else None
+        view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, further=further)
+        along = view.field()
+        agreement = tile_agreement(view, tiles, along, self.light(other))
+        if agreement is None:
+            return None
+        level = 255 * float(curve.encode(np.array(agreement.light)))
+        slope = float(np.interp(level, np.arange(256), curve.slope_table()))
+        error = agreement.expected_error(luma.frequency, luma.noise, slope)
+        return neighbour_picture(view, along, other.frame.index, *self._full_of(other), agreement, error)
 
     def knowing(self, missing: MissingTurn | None) -> FrameNeighbours:
         """The same, and what was found already, with what the capture lacks."""
@@ -158,24 +179,16 @@ class FrameNeighbours:
             self._light[sight.frame.index] = light_of(sight)
         return self._light[sight.frame.index]
 
-    def _most_telling(self, usable: Sequence[Sight], here: Sight, luma: PictureStatistics, most: int) -> list[Sight]:
-        """The best few by their blur; where turns are corrected, which holds between direct neighbours, only those."""
-        apart = [abs(other.frame.index - here.frame.index) for other in usable]
-        if self._missing is not None:
-            return [other for other, frames in zip(usable, apart, strict=True) if frames == 1]
-        weights = [TYPICAL_WEIGHTS[min(frames, len(TYPICAL_WEIGHTS)) - 1] for frames in apart]
-        passed = [weight * self._passed_of(other) for weight, other in zip(weights, usable, strict=True)]
-        return [usable[k] for k in most_telling(passed, [0.0] * len(usable), luma, most)]
-
-    def _passed_of(self, sight: Sight) -> NDArray[np.float64]:
-        """(RINGS,) mean |K|² over a frame's picture."""
+    def _passed_of(self, sight: Sight, here: Sight) -> NDArray[np.float64]:
+        """(RINGS,) mean |K|² over a frame's picture, with the weight that is usual so far from another frame."""
         assert sight.motion is not None
         if sight.frame.index not in self._passed:
             width, height = sight.motion.profile.width, sight.motion.profile.height
             x, y = (np.linspace(0.1, 0.9, count) * (size - 1) for count, size in ((3, width), (2, height)))
             centres_px = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
             self._passed[sight.frame.index] = rings_passed(kernel_field(sight.motion, centres_px))
-        return self._passed[sight.frame.index]
+        apart = abs(sight.frame.index - here.frame.index)
+        return TYPICAL_WEIGHTS[min(apart, len(TYPICAL_WEIGHTS)) - 1] * self._passed[sight.frame.index]
 
     def _full_of(self, sight: Sight) -> tuple[Image, Image]:
         if sight.frame.index not in self._full:

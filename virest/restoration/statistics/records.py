@@ -145,14 +145,13 @@ class PictureStatistics:
     @property
     def expected_gain_db(self) -> float:
         """:meth:`joint_gain_db` of the picture by itself."""
-        return self.joint_gain_db(np.zeros(RINGS), 0.0)
+        return self.joint_gain_db(np.zeros(RINGS))
 
-    def joint_gain_db(self, further: Array, shared: float) -> float:
+    def joint_gain_db(self, further: Array) -> float:
         """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured.
 
         Left as it is, a picture misses (1 − K) F, |1 − K|² = 1 − 2 Re K + |K|²; where a path reverses a frequency
-        that is more than all of it.  further: (RINGS,) weighted |K|² of further pictures restored with it.  shared: sum
-        of their weights times the part of the noise that they have in common with it.
+        that is more than all of it.  further: (RINGS,) weighted |K|² of further pictures restored with it.
         """
         if not self.measured:
             return 0.0
@@ -160,17 +159,17 @@ class PictureStatistics:
             return self.places.expected_gain_db(self.signal, self.noise)
         real = np.sqrt(self.passed) if self.real is None else self.real
         left = np.sum(self.frequency * ((1 - 2 * real + self.passed) * self.signal + self.noise))
-        return max(float(10 * np.log10(left / np.sum(self.frequency * self._wrong(further, shared)))), 0.0)
+        return max(float(10 * np.log10(left / np.sum(self.frequency * self._wrong(further)))), 0.0)
 
-    def ideal_error(self, further: Array, shared: float) -> float:
+    def ideal_error(self, further: Array) -> float:
         """Mean square, in grey levels, that the ideal linear filter leaves; arguments as of :meth:`joint_gain_db`."""
         area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0])
-        return float(area @ self._wrong(further, shared))
+        return float(area @ self._wrong(further))
 
-    def _wrong(self, further: Array, shared: float) -> Array:
+    def _wrong(self, further: Array) -> Array:
         """(RINGS,) power of what the ideal linear filter leaves."""
         count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
-        signal, noise, passed = self.signal[:, None], (1 + shared) * self.noise[:, None], passed + further[:, None]
+        signal, noise, passed = self.signal[:, None], self.noise[:, None], passed + further[:, None]
         wrong = count * signal * noise / (passed * signal + noise)
         return np.asarray(wrong.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
