@@ -113,7 +113,7 @@ def neighbour_picture(
     source = view.map_px(lambda points_px: points_px - _at(affine, points_px))
     brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    trust = _trust(agreement, _at(affine, agreement.centres_px), independent_error)
+    trust = _trust(agreement, _at(affine, agreement.centres_px), std_px, independent_error)
     height, width = light.shape
     places = source[agreement.times // 2 :: agreement.times, agreement.times // 2 :: agreement.times]
     inside = cv2.inRange(places, (0, 0), (width - 1, height - 1)) > 0
@@ -130,18 +130,26 @@ def neighbour_picture(
     )
 
 
-def _trust(agreement: TileAgreement, shift_px: Array, independent_error: float) -> Image:
+def _trust(agreement: TileAgreement, shift_px: Array, std_px: float, independent_error: float) -> Image:
     """Noise of a frame over that of its neighbour, by how they differ around each place of the reduced picture.
 
     Of the difference's power, noise of both making E, half is the frame's.  Rings take overtones of edges for noise,
-    which is no more than what half of all places differ by; it scatters, and E is ORDINARY times as much.
+    which is no more than what half of all places differ by; it scatters, and E is ORDINARY times as much.  What a tile
+    differs by only because its own shift is not the field's is another matter: it bends the picture near relief, and
+    none of it is ordinary.  Of a tile's own shift counts what the scatter of all tiles, std_px on each axis, does not
+    explain (James & Stein 1961).
     """
     left, both = (cv2.sqrBoxFilter(one, cv2.CV_32F, (AROUND, AROUND)) for one in agreement.differences(shift_px))
     if np.median(left / (OWN_ERROR * both + np.float32(independent_error))) > MOST_DIFFERENT:
         return np.zeros_like(left)
     noise = min(independent_error, float(np.median(left)))
-    differs = left / (np.float32(ORDINARY) * (OWN_ERROR * both + np.float32(noise)))
-    trust = np.float32(0.5) / cv2.max(differs - np.float32(0.5), 0.5)
+    expected = OWN_ERROR * both + np.float32(noise)
+    trust = np.float32(0.5) / cv2.max(left / (np.float32(ORDINARY) * expected) - np.float32(0.5), 0.5)
+    off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
+    sure = np.maximum(1 - 2 * std_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
+    own_px = shift_px + sure[:, None] * off_px
+    misplaced = left - cv2.sqrBoxFilter(agreement.differences(own_px)[0], cv2.CV_32F, (AROUND, AROUND))
+    trust *= expected / (expected + 2 * cv2.max(misplaced, 0.0))
     return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
 
 
