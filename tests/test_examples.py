@@ -48,7 +48,7 @@ def test_the_first_session_of_the_quick_start_runs(workplace: Path) -> None:
     """A reader who types the commands in order gets a preview, a run and a report."""
     session = next(f for f in fences(DOCS / "quickstart.md") if f.language == "console")
     for line in typed_lines(session):
-        words = line.split()[1:]
+        words = line.split(" | ")[0].split()[1:]
         assert run([*words, "--jobs", "1"] if words[0] == "process" else words) == 0, line
     assert (workplace / "preview.png").stat().st_size > 10_000
     assert (workplace / "virest-out" / "text" / "report.html").is_file()
