@@ -24,7 +24,8 @@ from virest.diagnosis.geometric_evidence import (
     loss,
     make_evidence,
 )
-from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_of, rotation_between, total_change
+from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_of
+from virest.effects.changes import rotation_between
 from virest.inference import profile_terms as terms_of
 from virest.motion.scene_motion import DirectedMotion, InertialMotion
 
@@ -128,6 +129,76 @@ def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: fl
         assert finding.held_out.after < 0.8 * finding.held_out.before
         # what a smooth flow leaves, not what the fit does
         assert finding.held_out.noise == verdict.noise_px != verdict.final_rms_px
+
+
+@pytest.fixture
+def like_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among the causes most like a low pass and pixels that are not square; with all others too in the stories."""
+    alike = ("time_offset", "readout_time", "gyro_scale", "focal_length", "stabilisation")
+    own = (EFFECT[name] for name in (*alike, "gyro_lowpass", "pixel_aspect"))
+    monkeypatch.setattr(candidates, "GEOMETRIC_EFFECTS", tuple(own))
+
+
+@pytest.mark.parametrize("cutoff_hz", [9.0, 18.0])
+def test_a_gyroscope_behind_a_low_pass_is_named(cutoff_hz: float, like_them: None) -> None:
+    """Late, and too small where it turns fast: no offset of the clocks, which is tried beside it."""
+    setup = replace(HAND, seed=85, frames=61, gyro_lowpass_hz=cutoff_hz)
+    truth = recorded(setup).profile
+    verdict, found = climbed(setup, replace(truth, extensions=replace(truth.extensions, gyro_lowpass_hz=0.0)))
+    assert [finding.name for finding in found] == ["gyro_lowpass"]
+    assert "time_offset" in verdict.rungs[0].tried
+    assert_explained(verdict, HAND.noise_px)
+    told = found[0].parameters["gyro_lowpass_hz"]
+    assert (told.nominal, told.estimate) == (0.0, pytest.approx(cutoff_hz, rel=0.05))
+    assert abs(told.estimate - cutoff_hz) < 4 * told.std
+
+
+@pytest.mark.parametrize("hidden", ["time_offset", "gyro_lowpass"])
+def test_a_low_pass_far_above_the_hands_shake_is_an_offset_or_its_rival(hidden: str, like_them: None) -> None:
+    """At 4 Hz and less a cutoff of 90 Hz is a delay of 2.5 ms to 1e-4 of itself: the plainer cause is said."""
+    cutoff_hz, late_s = 90.0, np.sqrt(2) / (2 * np.pi * 90.0)
+    setup = replace(HAND, seed=86, gyro_lowpass_hz=cutoff_hz if hidden == "gyro_lowpass" else 0.0)
+    truth = recorded(setup).profile
+    offset_s = setup.time_offset_s if hidden == "gyro_lowpass" else setup.time_offset_s - late_s
+    plain = replace(truth.extensions, gyro_lowpass_hz=0.0)
+    _, found = climbed(setup, replace(truth, time_offset_s=offset_s, extensions=plain))
+    assert [finding.name for finding in found] == ["time_offset"]
+    assert "gyro_lowpass" in {rival.name for rival in found[0].rivals}
+    told = found[0].parameters["time_offset_s"]
+    assert abs(told.estimate - offset_s - late_s) < 4 * told.std
+
+
+def test_a_late_clock_is_no_low_pass(like_them: None) -> None:
+    """12 ms late, as behind a cutoff of 19 Hz: fast turns are as large as slow ones."""
+    truth = recorded(HAND).profile
+    _, found = climbed(HAND, replace(truth, time_offset_s=HAND.time_offset_s - 0.012))
+    assert [finding.name for finding in found] == ["time_offset"]
+    assert "gyro_lowpass" not in {rival.name for rival in found[0].rivals}
+
+
+@pytest.mark.parametrize("aspect", [1.05, 0.985])
+def test_pixels_that_are_not_square_are_named(aspect: float, like_them: None) -> None:
+    """fy alone is off; neither the focal length nor the gyroscope's scale takes its place."""
+    setup = replace(HAND, seed=87, pixel_aspect=aspect)
+    truth = recorded(setup).profile
+    assert truth.intrinsics is not None
+    square = replace(truth.intrinsics, fy_px=truth.intrinsics.fx_px)
+    verdict, found = climbed(setup, replace(truth, intrinsics=square))
+    assert [finding.name for finding in found] == ["pixel_aspect"]
+    assert found[0].rivals == ()
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+    assert_holds(found[0].parameters["pixel_aspect"], 1.0, aspect)
+
+
+def test_under_turns_about_one_axis_pixels_that_are_not_square_are_not_passed_over(like_them: None) -> None:
+    """Pictures that move up and down show fy, and fx by little: named, or said as the focal length's rival."""
+    setup = replace(HAND, seed=88, about=(0.0, 0.0, 1.0), pixel_aspect=1.04)
+    truth = recorded(setup).profile
+    assert truth.intrinsics is not None
+    square = replace(truth.intrinsics, fy_px=truth.intrinsics.fx_px)
+    _, found = climbed(setup, replace(truth, intrinsics=square))
+    assert len(found) == 1
+    assert "pixel_aspect" in {found[0].name, *(rival.name for rival in found[0].rivals)}
 
 
 def wall_m(recording: Recording) -> float:
@@ -241,7 +312,7 @@ def test_the_total_change_is_what_a_term_changed(effect: object) -> None:
     assert entry.term is not None
     profile = recorded(HAND).profile
     step = np.array([0.004, -0.007, 0.011, -0.002])[: len(entry.term)]
-    found = total_change(entry, profile, entry.term.change(profile, step))
+    found = entry.total_change(profile, entry.term.change(profile, step))
     # a stabiliser's cutoff has no nought to count from, and its lean is no part of the cause
     known = slice(0, 1) if entry.name == "stabilisation" else slice(None)
     np.testing.assert_allclose(found[known], step[known], atol=1e-9)

@@ -51,6 +51,8 @@ class Setup:
     width: int = 480
     height: int = 640
     focal_px: float = 520.0
+    pixel_aspect: float = 1.0
+    """fy over fx."""
     centre_px: tuple[float, float] = (233.0, 326.0)
     k1: float = 0.0
     focal_drift_per_s: float = 0.0
@@ -60,6 +62,8 @@ class Setup:
     clock_skew: float = 0.0
     gyro_bias_rad_s: Triple = (0.004, -0.006, 0.003)
     gyro_scale: float = 1.0
+    gyro_lowpass_hz: float = 0.0
+    """Cutoff of a second-order Butterworth low pass on the rates; 0: none."""
     r_cam_imu: tuple[Triple, ...] = tuple(map(tuple, R_CAM_IMU.tolist()))  # type: ignore[assignment]
     arm_m: Triple = (0.0, 0.0, 0.0)
     accel_bias_m_s2: Triple = (0.05, -0.08, 0.03)
@@ -152,20 +156,30 @@ class Recording:
         """Gyroscope and accelerometer at 210 Hz, from a second before the first stamp to one after the last."""
         setup, to_imu = self.setup, np.array(self.setup.r_cam_imu)
         time_s = np.arange(-1.0, self.stamp_s[-1] + 1.0, 1 / 210) + setup.time_offset_s
-        gyro = setup.gyro_scale * self.rate(time_s) @ to_imu + np.array(setup.gyro_bias_rad_s)
+        gyro = setup.gyro_scale * self._passed_rate(time_s) @ to_imu + np.array(setup.gyro_bias_rad_s)
         gyro = gyro + np.random.default_rng(setup.seed + 90).normal(0, 1, gyro.shape) * setup.gyro_noise_rad_s
         force = self.specific_force(time_s - setup.accel_delay_s) @ to_imu + np.array(setup.accel_bias_m_s2)
         return ImuSamples(time_s, gyro, force if setup.accelerometer else np.full_like(force, np.nan))
+
+    def _passed_rate(self, time_s: Array) -> Array:
+        """Rates (n, 3) behind the gyroscope's low pass, in steps of 0.1 ms by the trapezoidal rule."""
+        cutoff_hz, step_s = self.setup.gyro_lowpass_hz, 1e-4
+        if not cutoff_hz:
+            return self.rate(time_s)
+        fine_s = np.arange(time_s[0] - 3 / cutoff_hz, time_s[-1] + step_s, step_s)
+        slow = np.pi * cutoff_hz * step_s  # s becomes 2 (1 - 1/z) / (step (1 + 1/z)) in H = 1 / (1 + √2 s/ω + s²/ω²)
+        back = [1 + np.sqrt(2) * slow + slow**2, 2 * slow**2 - 2, 1 - np.sqrt(2) * slow + slow**2]
+        passed = lfilter(slow**2 * np.array([1, 2, 1]), back, self.rate(fine_s), axis=0)
+        return np.stack([np.interp(time_s, fine_s, column) for column in passed.T], axis=1)
 
     @cached_property
     def profile(self) -> CameraProfile:
         """All that is true of the phone."""
         s = self.setup
-        lens = Intrinsics(s.width, s.height, s.focal_px, s.focal_px, *s.centre_px)
+        focal_px = s.focal_px, s.focal_px * s.pixel_aspect
+        lens = Intrinsics(s.width, s.height, *focal_px, *s.centre_px)
         if s.k1:
-            lens = Intrinsics(
-                s.width, s.height, s.focal_px, s.focal_px, *s.centre_px, "radtan", (s.k1, 0.0, 0.0, 0.0, 0.0)
-            )
+            lens = Intrinsics(s.width, s.height, *focal_px, *s.centre_px, "radtan", (s.k1, 0.0, 0.0, 0.0, 0.0))
         return CameraProfile(
             s.width,
             s.height,
@@ -178,7 +192,7 @@ class Recording:
             gyro_bias_rad_s=s.gyro_bias_rad_s,
             gyro_scale=(s.gyro_scale,) * 3,
             depth_m=np.inf,
-            extensions=Extensions(s.focal_drift_per_s, *s.stabilised),
+            extensions=Extensions(s.focal_drift_per_s, *s.stabilised, gyro_lowpass_hz=s.gyro_lowpass_hz),
         )
 
     @cached_property
@@ -188,7 +202,7 @@ class Recording:
         first = np.repeat(np.arange(s.frames - 1), s.points)
         guess_px = self._rng.uniform((10, 10), size - 10, (len(first), 2))
         time_s = self.seen_s(guess_px, first)
-        plane_ray = (guess_px - s.centre_px) / s.focal_px
+        plane_ray = (guess_px - s.centre_px) / (s.focal_px, s.focal_px * s.pixel_aspect)
         way = self.orientation(time_s).apply(np.concatenate([plane_ray, np.ones((len(first), 1))], axis=1))
         start = self.position(time_s)
         inverse = self._inverse_depth(way, start)
@@ -292,7 +306,7 @@ class Recording:
             plane = plane + np.stack([np.interp(time_s, self._shift[0], way) for way in self._shift[1].T], axis=-1)
         bent = plane * (1 + s.k1 * (plane**2).sum(axis=1, keepdims=True))
         focal_px = s.focal_px * (1 + s.focal_drift_per_s * time_s[:, None])
-        return bent * focal_px + s.centre_px
+        return bent * focal_px * (1.0, s.pixel_aspect) + s.centre_px
 
 
 @lru_cache(maxsize=16)

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
-from virest.motion.integration import gyro_polynomials, integrate_gyro
+from virest.motion.integration import integrate_gyro
+from virest.motion.measured_rate import measured_rate
 from virest.motion.trajectory import rotation_from_vector
 
 MOTION = Motion(
@@ -59,7 +60,7 @@ def test_rate_is_the_analytic_one() -> None:
 def test_steps_are_multiplied_up_in_order(samples: int) -> None:
     """The turns at the samples are those of one step after another, for odd and even numbers of them."""
     imu = recorded(np.arange(samples) * 0.02)
-    found = integrate_gyro(imu, PROFILE, gyro_polynomials(imu))
+    found = integrate_gyro(imu, PROFILE, measured_rate(imu))
     a, b, c, d = np.swapaxes(found.rate_polynomials, 1, 2) * np.array([1 / 4, 1 / 3, 1 / 2, 1.0])[:, None, None]
     step = 0.02
     turn = np.eye(3)

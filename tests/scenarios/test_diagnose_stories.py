@@ -57,6 +57,23 @@ def test_two_hidden_effects_are_both_named(work: Path) -> None:
         assert max(errors) < LARGEST_SIGMA
 
 
+def test_a_filtered_gyroscope_and_pixels_that_are_not_square_are_both_named(work: Path) -> None:
+    """Neither a time offset nor another focal length takes their place; the extended profile has them."""
+    hidden = {"gyro_lowpass": {"gyro_lowpass_hz": 14.0}, "pixel_aspect": {"pixel_aspect": 0.97}}
+    effects = [f"{name}={next(iter(values.values()))}" for name, values in hidden.items()]
+    found = diagnose_folder(_capture(work, "filtered_gyroscope", effects, 424))
+    assert _names(found) == hidden.keys()
+    assert found.verdict == EXPLAINED
+    for cause in found.causes:
+        errors = errors_in_std(found, cause.name, hidden[cause.name])
+        assert errors, "no deviation stated"
+        assert max(errors) < LARGEST_SIGMA
+    extended = found.extended_profile
+    assert extended.extensions.gyro_lowpass_hz == pytest.approx(14.0, rel=0.02)
+    assert extended.intrinsics is not None
+    assert extended.intrinsics.fy_px / extended.intrinsics.fx_px == pytest.approx(0.97, abs=0.005)
+
+
 def test_a_fault_without_a_name_is_said_to_be_unexplained(work: Path) -> None:
     """A gyroscope that clips is in no catalogue."""
     folder = _capture(work, "clipping_gyroscope", [], 423)

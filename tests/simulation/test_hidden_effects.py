@@ -10,6 +10,8 @@ from capture_files import SMALL, read_imu, read_movie
 from virest.camera.profile import profile_mapping, read_profile
 from virest.errors import SettingsError
 from virest.simulation.effects import EffectContext, effect_names, hide_effects
+from virest.simulation.hand_motion import random_hand_motion
+from virest.simulation.phone_gyro import before_low_pass, low_passed_rate
 from virest.simulation.session import nominal_camera
 
 CHANGES = {
@@ -21,8 +23,10 @@ CHANGES = {
     "exposure_time": "shutter.exposure_scale",
     "gyro_bias": "imu.gyro_bias_rad_s",
     "gyro_scale": "imu.gyro_scale",
+    "gyro_lowpass": "extensions.gyro_lowpass_hz",
     "imu_rotation": "imu.T_cam_imu",
     "focal_length": "intrinsics.fx_px intrinsics.fy_px",
+    "pixel_aspect": "intrinsics.fy_px",
     "focal_drift": "extensions.focal_drift",
     "radial_distortion": "intrinsics.distortion",
     "principal_point": "intrinsics.cx_px intrinsics.cy_px",
@@ -204,3 +208,37 @@ def test_sharpening_is_hidden_in_the_phones_processing(simulate):
     assert values["amount"] == 1.3
     assert 1.0 <= values["radius_px"] <= 1.8
     assert truth["isp"] == {"sharpen": 1.3, "sharpen_radius_px": values["radius_px"]}
+
+
+def test_a_low_pass_makes_rates_late_and_fast_ones_small():
+    """At a tenth of the cutoff a delay of √2 / (2π f); at the cutoff 3 dB less and a quarter period late; by hand."""
+    time_s = np.arange(400) / 200
+
+    def passed(frequency_hz):
+        def rate(t):
+            return np.stack([np.sin(2 * np.pi * frequency_hz * t)] * 3, axis=1)
+
+        return low_passed_rate(rate, time_s, [20.0])[:, 0]
+
+    late_s = np.sqrt(2) / (2 * np.pi * 20)
+    assert passed(2.0) == pytest.approx(np.sin(2 * np.pi * 2.0 * (time_s - late_s)), abs=2e-3)
+    assert passed(20.0) == pytest.approx(-np.cos(2 * np.pi * 20.0 * time_s) / np.sqrt(2), abs=3e-3)
+
+
+def test_a_hidden_low_pass_is_in_the_log_and_nowhere_else(simulate):
+    """The same motion and movie; slow rates of the log come later by the filter's delay."""
+    plain, late = (simulate(name, frames=30, effects=e) for name, e in (("none", []), ("late", ["gyro_lowpass=15"])))
+    assert (plain / "movie.mp4").read_bytes() == (late / "movie.mp4").read_bytes()
+    before, after = (read_imu(folder)[1][:, :3] for folder in (plain, late))
+    lags = [np.sum(before[20 : 120 - k] * after[20 + k : 120]) for k in range(8)]
+    assert np.argmax(lags) in (2, 3, 4)  # 15 ms of samples 5 ms apart, and a little less where turns are fast
+
+
+def test_a_motion_is_taken_again_from_behind_a_low_pass(rng):
+    """What a filter of 12 Hz made of a hand's shake, turned back: 50 times nearer to it than as logged."""
+    motion = random_hand_motion(rng, rate_rms_rad_s=1.0, duration_s=2.0, band_hz=(0.5, 8.0))
+    time_s = np.arange(-0.5, 2.5, 0.005)
+    true, logged = motion.rate_rad_s(time_s), low_passed_rate(motion.rate_rad_s, time_s, [12.0])
+    found = before_low_pass(time_s, logged, 12.0)
+    inner = slice(60, -60)
+    assert np.std((found - true)[inner]) < 0.02 * np.std((logged - true)[inner])

@@ -10,7 +10,7 @@ from capture_files import SMALL, read_imu, read_movie
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile, Extensions, read_profile
 from virest.errors import SettingsError
-from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate
+from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
 from virest.simulation.phone_isp import ISPS, PhoneIsp, make_isp
 from virest.simulation.phone_pictures import (
     PhonePictures,
@@ -121,7 +121,7 @@ def test_the_low_pass_loses_half_the_power_at_its_corner_and_no_time_below_it():
         def rate(t):
             return np.stack([np.sin(2 * np.pi * frequency_hz * t)] * 3, axis=1)
 
-        return low_passed_rate(rate, time_s, 30.0)[:, 0], rate(time_s)[:, 0]
+        return low_passed_rate(rate, time_s, [30.0], usual_delay_s(30.0))[:, 0], rate(time_s)[:, 0]
 
     slow, as_it_was = passed(2.0)
     assert slow == pytest.approx(as_it_was, abs=0.005)
@@ -131,8 +131,8 @@ def test_the_low_pass_loses_half_the_power_at_its_corner_and_no_time_below_it():
 
 def test_noise_density_and_jitter_have_their_sizes(rng):
     """0.001 rad/s/√Hz at 200 samples/s is 0.01 rad/s; behind a low pass of 40 Hz it is √(1.11 · 40 / 100) of that."""
-    assert gyro_noise(0.001, 200.0, 0.0, (20000, 3), rng).std() == pytest.approx(0.01, rel=0.02)
-    low = gyro_noise(0.001, 200.0, 40.0, (20000, 3), rng)
+    assert gyro_noise(0.001, 200.0, [], (20000, 3), rng).std() == pytest.approx(0.01, rel=0.02)
+    low = gyro_noise(0.001, 200.0, [40.0], (20000, 3), rng)
     assert low.std() == pytest.approx(0.01 * np.sqrt(1.11 * 40 / 100), rel=0.05)
     stamps = np.arange(20000, dtype=np.int64) * 5_000_000
     jittered = jittered_ns(stamps, 0.0004, rng)

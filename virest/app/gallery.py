@@ -53,8 +53,10 @@ CASES: dict[str, Case] = {
     "exposure_time": Case("1.5", "blur longer than predicted; tracked points hardly change"),
     "gyro_bias": Case("0.03,-0.02,0.025", "a constant shift from frame to frame, whatever the motion"),
     "gyro_scale": Case("1.03", "residuals proportional to the turn rate; roll separates it from the focal length"),
+    "gyro_lowpass": Case("12", "as a time offset, but fast turns are too small: the gyroscope's own low pass"),
     "imu_rotation": Case("0.02,-0.015,0.03", "residuals across the direction of motion"),
     "focal_length": Case("1.03", "residuals proportional to the turn rate in pitch and yaw, not in roll"),
+    "pixel_aspect": Case("1.02", "residuals that grow with the turn rate in pitch, not in yaw or roll"),
     "focal_drift": Case("0.02", "residuals that grow over time: the lens refocuses"),
     "radial_distortion": Case("-0.06", "residuals that grow with the distance from the picture's centre"),
     "principal_point": Case("12,-9", "residuals under roll about the optical axis"),
@@ -111,7 +113,7 @@ def _draw_case(name: str, folder: Path, images: Path) -> dict[str, Any]:
     source = open_source(folder)
     found = diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
     files, _ = draw_figures(source.capture, found)
-    wanted = "residuals" if CATALOGUE[name].shows_in == GEOMETRY else f"_{name}"
+    wanted = "residuals" if CATALOGUE[name].seen_in == GEOMETRY else f"_{name}"
     figure = next((data for path, data in files.items() if path.endswith(f"{wanted}.png")), None)
     if figure is not None:
         write_whole(images / f"{name}.png", compact(figure))
@@ -131,7 +133,7 @@ def _draw_case(name: str, folder: Path, images: Path) -> dict[str, Any]:
 
 def _section(name: str, found: dict[str, Any]) -> str:
     case = CASES[name]
-    evidence = EVIDENCE[CATALOGUE[name].shows_in]
+    evidence = EVIDENCE[CATALOGUE[name].seen_in]
     lines = [f"## {name}", "", f"Hidden: `--effect {name}={case.value}`. Shows in {evidence}:"]
     lines += [f"{case.look_for}.", "", f"Verdict: **{found['verdict']}**", ""]
     for cause in found["causes"]:

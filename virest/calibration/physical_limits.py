@@ -5,6 +5,7 @@ A fit that ends at such a limit, or beyond it, describes no camera; it compensat
 
 from __future__ import annotations
 
+from virest.camera.gyro_filter import LEAST_HZ
 from virest.camera.profile import CameraProfile
 from virest.inference.profile_terms import GYRO_SCALE_OFF
 
@@ -45,6 +46,8 @@ def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> fr
             found.add("focal_length")
     if abs(profile.time_offset_s or 0.0) >= OFFSET_S:
         found.add("time_offset")
+    if profile.extensions.gyro_lowpass_hz and profile.extensions.gyro_lowpass_hz < LEAST_HZ:
+        found.add("gyro_lowpass")
     return frozenset(found)
 
 
@@ -62,6 +65,9 @@ def limit_reasons(profile: CameraProfile, period_s: float, exposure_s: float) ->
             f"in a frame of {1e3 * period_s:.1f} ms"
         ),
         "focal_length": f"{lens.fx_px if lens else 0:.0f} px, where lenses have {least_px:.0f} to {most_px:.0f} px",
+        "gyro_lowpass": (
+            f"{profile.extensions.gyro_lowpass_hz:.3g} Hz, where gyroscopes have filters of {LEAST_HZ:g} Hz and more"
+        ),
         "time_offset": f"{profile.time_offset_s or 0.0:+.2f} s, where one recording has less than {OFFSET_S:g} s",
     }
     found = {name: said[name] for name in impossible(profile, period_s, exposure_s)}

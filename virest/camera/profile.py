@@ -65,6 +65,8 @@ class Extensions:
     flicker_phase_rad: float = 0.0
     gain: tuple[float, ...] = ()
     defocus_sigma_px: float = 0.0
+    gyro_lowpass_hz: float = 0.0
+    """Cutoff of the gyroscope's own low pass (:mod:`virest.camera.gyro_filter`); 0: none."""
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
     """θ about x and y with which the inertial log begins; fitted on the way, and in no file: it is soon forgotten."""
     field: tuple[ModelField, ...] = ()
@@ -350,6 +352,7 @@ class _Extensions(_Strict):
     flicker: _Flicker = _Flicker()
     gain: list[Positive] = []
     defocus: _Defocus = _Defocus()
+    gyro_lowpass_hz: Annotated[Number, Field(ge=0, lt=1e6)] = 0.0
     field: Annotated[list[_Field], Field(max_length=500)] = []
 
 
@@ -556,6 +559,7 @@ def _from_model(model: _Profile) -> CameraProfile:
             flicker_phase_rad=extensions.flicker.phase_rad,
             gain=tuple(extensions.gain),
             defocus_sigma_px=extensions.defocus.sigma_px,
+            gyro_lowpass_hz=extensions.gyro_lowpass_hz,
         ),
         imu_untrusted_s=tuple(map(_pair, model.imu_untrusted_s)),
         imu_untrusted_stamp_0_ns=model.imu_untrusted_stamp_0_ns,
@@ -685,6 +689,8 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         extensions["gain"] = list(ext.gain)
     if ext.defocus_sigma_px:
         extensions["defocus"] = {"sigma_px": ext.defocus_sigma_px}
+    if ext.gyro_lowpass_hz:
+        extensions["gyro_lowpass_hz"] = ext.gyro_lowpass_hz
     if own := [entry for entry in profile.fields if entry.covariates != ("focal",)]:
         extensions["field"] = [_field_block(entry) for entry in own]  # what the capture's log says stays there
     stretches: dict[str, Any] = {}

@@ -125,11 +125,12 @@ def varies(exposure_s: Array) -> bool:
 
 
 def _words(effect: GeometricEffect, model: Model) -> list[Candidate]:
-    assert effect.with_word is not None
-    now = next(iter(effect.read(model.profile).values()))
+    choice, profile = effect.effect.choice, model.profile
+    assert choice is not None
+    now = next(iter(effect.effect.read(profile, profile).values()))
     return [
-        Candidate(effect.name, replace(model, profile=effect.with_word(model.profile, word)), (), effect, word)
-        for word in effect.words
+        Candidate(effect.name, replace(model, profile=choice.choose(profile, word)), (), effect, word)
+        for word in choice.words
         if word != now
     ]
 

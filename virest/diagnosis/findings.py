@@ -8,10 +8,10 @@ from typing import Any
 
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
+from virest.effects import records
 
 CONSISTENT, EXPLAINED, UNEXPLAINED = "consistent", "explained", "unexplained"
-GEOMETRY, PHOTOMETRY, BLUR = "geometry_rms_px", "photometric_rms", "blur_rms_px"
-EDGES = "edge_profile_rms"
+GEOMETRY, PHOTOMETRY, BLUR, EDGES = records.GEOMETRY, records.PHOTOMETRY, records.BLUR, records.EDGES
 """Of the mean profile across edges, as part of the step."""
 JOINED = " + "
 """Between the names of two causes that enter together."""

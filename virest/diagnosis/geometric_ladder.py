@@ -46,6 +46,7 @@ from virest.diagnosis.geometric_evidence import (
     depth_of,
 )
 from virest.diagnosis.left_open import variance_left_open
+from virest.effects.table import EFFECTS
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
 from virest.inference.chance import chi2_tail
@@ -77,21 +78,10 @@ RIVAL_T = 2.0
 """A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
 EVEN_T = 0.25
 """Of two rivals neither is the better one below this many standard errors."""
+PLAINER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length"}
+"""A low pass is a delay but for fast turns, and pixels that are not square another focal length but for one of two
+directions: where points do not tell, the plainer cause is said, with the other as its rival."""
 MAX_RUNGS = 5
-PLAUSIBLE = {
-    "time_offset": 2.0,
-    "clock_skew": 0.03,
-    "readout_time": 0.06,
-    "gyro_bias": 0.5,
-    "gyro_scale": 0.4,
-    "imu_rotation": 1.0,
-    "focal_length": 0.5,
-    "focal_drift": 0.3,
-    "radial_distortion": 0.8,
-    "principal_point": 300.0,
-    "exposure_time": 1.5,
-}
-"""Largest believable changes, in the units of the terms."""
 STABILISER_CUTOFF_HZ = (0.03, 15.0)
 
 
@@ -186,7 +176,7 @@ def _left_open(course: SearchContext, verdict: GeometricVerdict) -> dict[str, Ar
     tried = {entry.name for entry in verdict.accepted}
     further = [candidate for candidate in course.candidates(verdict.model, tried) if candidate.added]
     return variance_left_open(
-        course.evidence, verdict.model, effects, further, total_change, is_plausible, course.each
+        course.evidence, verdict.model, effects, further, GeometricEffect.total_change, is_plausible, course.each
     )  # fmt: skip
 
 
@@ -241,6 +231,7 @@ def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdic
         (first, second),
         key=lambda end: (
             len(end.accepted),
+            sum(PLAINER.get(entry.name) is not None for entry in end.accepted),
             abs(worse) >= EVEN_T and end is not better,
             sorted(e.name for e in end.accepted),
         ),
@@ -391,6 +382,12 @@ def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None
         if entered is None:
             continue
         others = [other for other in judged if other is not best and _rivals(before, best, other, gain)]
+        plainer = [other for other in others if other.candidate.name == PLAINER.get(best.candidate.name)]
+        if plainer:
+            into, p_plainer = _significant(evidence, plainer[0].candidate, model.profile, gain)
+            if into is not None:
+                others = [best, *(other for other in others if other is not plainer[0])]
+                best, after, entered, p_value = plainer[0], plainer[0], into, p_plainer
         rivals = tuple(Rival(other.candidate.name, other.rms * typical) for other in others)
         cause = Accepted(
             best.candidate.name, best.candidate.effect, best.candidate.word,
@@ -511,7 +508,7 @@ def _p_if_plausible(
     evidence: Evidence, fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile
 ) -> float:
     """Probability that an effect's value is nought; 1 where it ends at, or beyond, what a phone can be."""
-    if not is_plausible(evidence, effect, found, total_change(effect, before, found)):
+    if not is_plausible(evidence, effect, found, effect.total_change(before, found)):
         return 1.0
     return p_of(fitted, effect, found, before, evidence.typical_px)
 
@@ -535,14 +532,15 @@ def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfi
         low, high = STABILISER_CUTOFF_HZ
         extensions = found.extensions
         return 0 < extensions.stabilisation_fraction <= 1.1 and low < extensions.stabilisation_cutoff_hz < high
-    return bool(np.all(np.abs(change) < PLAUSIBLE[effect.name]))
+    assert effect.effect.steps is not None
+    return bool(np.all(np.abs(change) < effect.effect.steps.believable))
 
 
 def p_of(
     fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile, noise_px: float
 ) -> float:
     """Probability of so large a change by chance: a chi-square of the change, deviations with tracking's own bias."""
-    change = total_change(effect, before, found)
+    change = effect.total_change(before, found)
     floor = bias_std(fitted, effect.name, noise_px)
     part = fitted.slices[effect.name]
     covariance = fitted.covariance[part, part] + np.diag(floor**2)
@@ -643,48 +641,6 @@ def _doubt(
     return _p_if_plausible(evidence, fitted, entry.effect, found, given)
 
 
-def total_change(effect: GeometricEffect, nominal: CameraProfile, found: CameraProfile) -> Array:
-    """Change (k,) of a term's values between two profiles."""
-    lens, before = found.intrinsics, nominal.intrinsics
-    assert lens is not None
-    assert before is not None
-    match effect.name:
-        case "time_offset":
-            return np.array([(found.time_offset_s or 0.0) - (nominal.time_offset_s or 0.0)])
-        case "clock_skew":
-            return np.array([found.clock_skew - nominal.clock_skew])
-        case "readout_time":
-            return np.array([found.shutter.readout_time_s - nominal.shutter.readout_time_s])
-        case "gyro_bias":
-            return np.array(found.gyro_bias_rad_s) - np.array(nominal.gyro_bias_rad_s)
-        case "gyro_scale":
-            return np.array([np.log(found.gyro_scale[0] / nominal.gyro_scale[0])])
-        case "imu_rotation":
-            return rotation_between(nominal, found)
-        case "exposure_time":
-            return np.array([np.log(found.shutter.exposure_scale / nominal.shutter.exposure_scale)])
-        case "focal_length":
-            return np.array([np.log(lens.fx_px / before.fx_px)])
-        case "focal_drift":
-            return np.array([found.extensions.focal_drift_per_s - nominal.extensions.focal_drift_per_s])
-        case "radial_distortion":
-            return np.array([effect.read(found)["k1"] - effect.read(nominal)["k1"]])
-        case "principal_point":
-            return np.array([lens.cx_px - before.cx_px, lens.cy_px - before.cy_px])
-        case _:
-            return np.array(
-                [found.extensions.stabilisation_fraction - nominal.extensions.stabilisation_fraction, 0.0, 0.0, 0.0]
-            )
-
-
-def rotation_between(nominal: CameraProfile, found: CameraProfile) -> Array:
-    """Rotation vector (3,) of R_found R_nominalᵀ."""
-    matrix = found.rotation_cam_imu @ nominal.rotation_cam_imu.T
-    skew = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
-    sine = float(np.linalg.norm(skew))
-    return skew * (np.arcsin(min(sine, 1.0)) / sine if sine > 1e-12 else 1.0)
-
-
 def _without(model: Model, nominal: Model, leaving: Accepted) -> Model:
     """The nominal model with the kept causes' terms, to be fitted anew from where they stand."""
     if leaving.name == "scene_depth":
@@ -693,7 +649,7 @@ def _without(model: Model, nominal: Model, leaving: Accepted) -> Model:
     assert leaving.effect.term is not None
     name = leaving.effect.term.name
     terms = tuple(term for term in model.terms if term.name != name)
-    back = total_change(leaving.effect, nominal.profile, model.profile)
+    back = leaving.effect.total_change(nominal.profile, model.profile)
     profile = leaving.effect.term.change(model.profile, -back)
     return replace(model, profile=profile, terms=terms)
 
@@ -749,29 +705,12 @@ def _changes_at(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramet
     floor = bias_std(verdict.fit, effect.name, verdict.step_noise_px)
     left_open = verdict.left_open.get(effect.name, np.zeros(1))
     stds = np.sqrt(np.diag(verdict.fit.covariance)[part] + floor**2 + left_open)
-    changes = effect.changes(nominal, found, stds)
-    match effect.name:
-        case "imu_rotation":
-            changes = {
-                "rotation_rad": replace(changes["rotation_rad"], estimate=rotation_between(nominal, found).tolist())
-            }
-        case "focal_length":
-            scale = float(np.exp(total_change(effect, nominal, found)[0]))
-            changes = {"focal_scale": ParameterChange(1.0, scale, float(stds[0]) * scale)}
-        case "principal_point":
-            moved = total_change(effect, nominal, found).tolist()
-            changes = {"offset_px": replace(changes["offset_px"], estimate=moved)}
-    return changes
+    return effect.changes(nominal, found, stds)
 
 
 def _sentence(entry: Accepted, changes: dict[str, ParameterChange]) -> str:
     values = {name: shown(change.estimate) for name, change in changes.items()}
-    if entry.name == "scene_depth":
-        return f"the camera travels before a scene {values['depth_m']} m away, so points move by parallax"
-    if entry.name == "frame_lag":
-        return f"the first {values['frames']} frames show pictures up to {values['lag_s']} s later than their stamps"
-    assert entry.effect is not None
-    return entry.effect.sentence.format(**values)
+    return EFFECTS[entry.name].sentence.format(**values)
 
 
 def shown(value: Any) -> str:

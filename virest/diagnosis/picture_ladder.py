@@ -31,6 +31,7 @@ from virest.diagnosis.photometry import PhotometricObservations, normalised_rms,
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
 from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
+from virest.effects.table import EFFECTS
 from virest.inference.chance import normal_deviate, student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
@@ -71,15 +72,7 @@ SOFT_Z = 5.0
 vary."""
 MIN_EXPOSURE_CHANGE = 0.08
 
-SENTENCES = {
-    "response_curve": "the grey levels follow a gamma of {gamma} on top of the profile's curve",
-    "black_level": "no light at all reads {black_level} of full scale",
-    "vignetting": "the corners lose {corner_loss} of the light",
-    "flicker": "the lamps pulse by {amplitude} at {frequency_hz} Hz",
-    "gain_drift": "brightness changes from frame to frame without exposure or ISO saying so",
-    "defocus": "the picture is out of focus by a Gaussian of {sigma_px} px",
-    "exposure_time": "the true exposure is {exposure_scale} times the logged one",
-}
+SENTENCES = {name: effect.sentence for name, effect in EFFECTS.items() if effect.seen_in in (PHOTOMETRY, BLUR)}
 
 
 Mixed = tuple[MixingEstimate, HeldOut]

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from virest.camera.field import Field
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.effects.touches import touched
 from virest.image_formation.row_clock import RowClock
 from virest.motion.displacement import Displacement, force_at_samples, integrate_accelerometer
-from virest.motion.integration import gyro_polynomials, integrate_gyro
+from virest.motion.integration import integrate_gyro
+from virest.motion.measured_rate import MeasuredRate, measured_rate
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.trajectory import Trajectory
@@ -111,8 +112,7 @@ class IntegratedMotion:
 class Measured:
     """What the inertial samples say whatever the profile: the work that is done once."""
 
-    gyro: Array
-    """As :func:`gyro_polynomials` gives it."""
+    gyro: MeasuredRate
     force: tuple[Array, Array] | None
     """As :func:`force_at_samples` gives it."""
 
@@ -174,7 +174,7 @@ def ground(
     imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None
 ) -> IntegratedMotion:
     """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier ground."""
-    measured = measured or Measured(gyro_polynomials(imu), force_at_samples(imu) if translation else None)
+    measured = measured or Measured(measured_rate(imu), force_at_samples(imu) if translation else None)
     trajectory = integrate_gyro(imu, profile, measured.gyro)
     displacement = integrate_accelerometer(imu, profile, trajectory, measured.force) if translation else None
     return IntegratedMotion(profile, trajectory, displacement, moving_lens(trajectory, profile, SHIFT_STEP_S), measured)
@@ -182,33 +182,15 @@ def ground(
 
 def with_profile(known: IntegratedMotion, imu: ImuSamples, profile: CameraProfile) -> IntegratedMotion:
     """Return the ground for another profile; what does not depend on the change is kept."""
-    before, kept = known.profile, known
-    same = ("gyro_bias_rad_s", "gyro_scale", "p_cam_imu_m")
-    if any(getattr(before, name) != getattr(profile, name) for name in same) or _rates(before) != _rates(profile):
+    change = touched(known.profile, profile)
+    if change.rates:
         return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
-    if before.r_cam_imu != profile.r_cam_imu:
-        known = _turned_about(known, profile.rotation_cam_imu @ before.rotation_cam_imu.T)
-    turned_along = known.trajectory is not kept.trajectory
-    if turned_along or before.intrinsics != profile.intrinsics or _moves(before, profile):
-        like = None if turned_along else kept.lens
+    like = None if change.axes else known.lens
+    if change.axes:
+        known = _turned_about(known, profile.rotation_cam_imu @ known.profile.rotation_cam_imu.T)
+    if change.axes or change.lens:
         known = replace(known, lens=moving_lens(known.trajectory, profile, SHIFT_STEP_S, like))
     return replace(known, profile=profile)
-
-
-def _rates(profile: CameraProfile) -> list[Field]:
-    return [field for field in profile.extensions.field if field.kind == "rate"]
-
-
-def _moves(before: CameraProfile, after: CameraProfile) -> bool:
-    """Whether two profiles' lenses move differently."""
-    names = (
-        "focal_drift_per_s",
-        "stabilisation_fraction",
-        "stabilisation_cutoff_hz",
-        "stabilisation_lean_rad",
-        "field",
-    )
-    return any(getattr(before.extensions, name) != getattr(after.extensions, name) for name in names)
 
 
 def _turned_about(known: IntegratedMotion, turn: Array) -> IntegratedMotion:

@@ -40,7 +40,9 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "imu_rotation": (2.5e-4,) * 3,
     "gyro_bias": (1.5e-4,) * 3,
     "gyro_scale": (6e-4,),
+    "gyro_lowpass": (2e-5,),
     "focal_length": (6e-4,),
+    "pixel_aspect": (8e-4,),
     "focal_drift": (3e-4,),
     "radial_distortion": (7e-4,),
     "principal_point": (0.2, 0.2),
@@ -49,7 +51,8 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "exposure_time": (0.015,),
     "scene_depth": (0.004,),
 }
-"""At the typical noise, in the units of the terms of profile_terms; a depth's relative."""
+"""At the typical noise, in the units of the terms of profile_terms; a depth's relative.  By analogy, not measured: a
+low pass's delay as an offset, pixel_aspect as √2 of a focal length, since one of two directions tells it."""
 WANDER_STD = {"gyro_bias": 1.5e-4}
 """What a value does of its own accord however well points are tracked: a phone's gyroscope drifts by this much within
 seconds, and its noise of 3e-4 rad/s/√Hz has that mean over two of them."""

@@ -4,53 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from virest.camera.field import FORCES, RATES
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.errors import ImuError
+from virest.motion.measured_rate import MeasuredRate, measured_rate
 from virest.motion.trajectory import Trajectory, rotation_from_vector, turned_angle
 
 Array = NDArray[np.float64]
-GAP_PERIODS = 5.0
-"""A pause longer than this many median sample periods ends one spline and begins the next."""
 
 
-def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: Array | None = None) -> Trajectory:
+def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRate | None = None) -> Trajectory:
     """Turn angular rate into orientation: R[k+1] = R[k] exp(∫ ω dt) (eqs 7, 8 with the exact exponential).
 
     The rate between samples is a cubic spline through them, so a partial interval (eq 9's Δt_last) is integrated
-    exactly as far as it goes.  measured: what :func:`gyro_polynomials` says, where that is known already.  Raises
-    ImuError if fewer than two samples are given.
+    exactly as far as it goes.  measured: what :func:`measured_rate` says, where that is known already.  A low
+    pass of the profile is undone.  Raises ImuError if fewer than two samples are given.
     """
-    polynomials = _camera_rate(gyro_polynomials(imu) if measured is None else measured, profile)
+    polynomials = _camera_rate(measured or measured_rate(imu), profile)
     if (missing := missing_rate_rad_s(imu, profile)) is not None:
         polynomials[2] += profile.rotation_cam_imu @ (np.diff(missing, axis=0).T / np.diff(imu.time_s))
         polynomials[3] += profile.rotation_cam_imu @ missing[:-1].T
     steps = rotation_from_vector(turned_angle(polynomials, np.diff(imu.time_s)).T)
     return Trajectory(imu.time_s, _running_product(steps), polynomials)
-
-
-def gyro_polynomials(imu: ImuSamples) -> Array:
-    """Measured rate between the samples, IMU axes: cubic pieces (4, 3, n − 1), highest power first.
-
-    Straight lines across gaps and in runs too short for a spline.  No profile changes them.  Raises ImuError if fewer
-    than two samples are given.
-    """
-    if len(imu) < 2:
-        raise ImuError(f"{len(imu)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
-    time_s, rate = imu.time_s, imu.gyro_rad_s
-    step = np.diff(time_s)
-    pieces = np.zeros((4, 3, len(step)))
-    pieces[2] = np.diff(rate.T) / step
-    pieces[3] = rate[:-1].T
-    breaks = np.flatnonzero(step > GAP_PERIODS * np.median(step)) + 1
-    for run in np.split(np.arange(len(time_s)), breaks):
-        if len(run) >= 4:
-            spline = CubicSpline(time_s[run], rate[run], axis=0)
-            pieces[:, :, run[0] : run[-1]] = np.swapaxes(spline.c, 1, 2)
-    return pieces
 
 
 def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
@@ -68,9 +44,9 @@ def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
     return np.asarray(sum(field.at(known[field.covariates[0]]) for field in fields))
 
 
-def _camera_rate(measured: Array, profile: CameraProfile) -> Array:
-    """True rate in camera axes of measured pieces (4, 3, n − 1): R_cam_imu (measured − bias) / scale."""
-    unbiased = measured.copy()
+def _camera_rate(measured: MeasuredRate, profile: CameraProfile) -> Array:
+    """True rate in camera axes, pieces (4, 3, n − 1): R_cam_imu (measured, before its low pass, − bias) / scale."""
+    unbiased = measured.behind_low_pass(profile.extensions.gyro_lowpass_hz).copy()
     unbiased[3] -= np.array(profile.gyro_bias_rad_s)[:, None]
     return np.asarray((profile.rotation_cam_imu / np.array(profile.gyro_scale)) @ unbiased)
 

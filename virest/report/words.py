@@ -10,36 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from virest.effects.table import EFFECTS
+
 DIAGNOSIS_WORDS = {
     "consistent": ("good", "The camera model fits this capture"),
     "explained": ("fair", "The camera model is off, and what is wrong with it was found"),
     "unexplained": ("poor", "The camera model is off, and no known effect explains all of it"),
 }
-CAUSE_WORDS = {
-    "time_offset": "camera and gyroscope clocks stand apart",
-    "clock_skew": "one of the two clocks runs faster",
-    "readout_time": "the rows are read in another time",
-    "readout_direction": "the rows are read in another direction",
-    "timestamp_reference": "the frame stamps mean another instant of the exposure",
-    "exposure_time": "the exposure lasts longer or shorter than logged",
-    "gyro_bias": "the gyroscope reads a rate at rest",
-    "gyro_scale": "the gyroscope reads too much or too little",
-    "imu_rotation": "the gyroscope's axes are turned against the camera's",
-    "focal_length": "the focal length is another",
-    "focal_drift": "the focal length changes while filming",
-    "radial_distortion": "the lens bends straight lines",
-    "principal_point": "the optical axis meets the picture elsewhere",
-    "stabilisation": "an optical stabiliser moves the lens",
-    "scene_depth": "the scene is at another distance",
-    "frame_lag": "pictures come later than their stamps while the recorder starts",
-    "response_curve": "the exposure curve is bent otherwise",
-    "black_level": "black is stored as grey",
-    "vignetting": "the corners get less light",
-    "flicker": "the light pulses",
-    "gain_drift": "brightness changes that exposure and ISO do not explain",
-    "defocus": "the picture is out of focus",
-    "sharpening": "the phone sharpened its pictures",
-}
+CAUSE_WORDS = {name: effect.in_words for name, effect in EFFECTS.items()}
 QUANTITY_WORDS = {
     "geometry_rms_px": "points, px",
     "photometric_rms": "brightness, grey levels",
@@ -70,7 +48,10 @@ PARAMETER_WORDS = {
     "clock_skew": "Clock skew",
     "gyro_bias_rad_s": "Gyroscope bias",
     "gyro_scale": "Gyroscope scale",
+    "gyro_lowpass_hz": "Gyroscope's low pass",
     "fx_px": "Focal length",
+    "fy_px": "Focal length, vertical",
+    "pixel_aspect": "fy / fx",
     "response": "Exposure curve",
     "depth_m": "Scene depth",
 }

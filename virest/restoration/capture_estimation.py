@@ -16,6 +16,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import Capture, Frame
+from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
 from virest.image_formation.row_motion import FrameTranslation, frame_times_s
 from virest.inference.alignment import (
@@ -318,20 +319,7 @@ def _account(known: list[FrameMotion], alignment: VisualInertialAlignment) -> st
 
 def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
     """What the profile adds to the nominal model, one line each, and what becomes of it."""
-    ext = profile.extensions
-    lines = {
-        f"focal drift of {ext.focal_drift_per_s:+g} a second: followed": ext.focal_drift_per_s,
-        f"stabiliser cancelling {ext.stabilisation_fraction:g} above {ext.stabilisation_cutoff_hz:g} Hz: followed": (
-            ext.stabilisation_fraction
-        ),
-        f"frame lag of {ext.frame_lag_s:g} s at the start: first {ext.frame_lag_frames} frames at their true times": (
-            ext.frame_lag_frames
-        ),
-        f"vignetting of {ext.vignetting_corner_loss:g}: moved with the picture's place": ext.vignetting_corner_loss,
-        f"flicker of {ext.flicker_amplitude:g} at {ext.flicker_frequency_hz:g} Hz: undone": ext.flicker_amplitude,
-        f"gain of {len(ext.gain)} frames: kept, it is common to a whole frame": len(ext.gain),
-        f"defocus of {ext.defocus_sigma_px:g} px: undone with the blur": ext.defocus_sigma_px,
-    }
+    lines: dict[str, int] = {effect.applied(profile): 1 for effect in EFFECTS.values() if effect.applied(profile)}
     lines |= {f"field of {field.kind} over {', '.join(field.covariates)}: followed": 1 for field in profile.fields}
     bridged = len(profile.imu_untrusted_s) - len(profile.unbridged_s)
     lines[f"{bridged} stretches of an inertial log that is not trusted: bridged from the pictures"] = bridged

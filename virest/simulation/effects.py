@@ -1,7 +1,7 @@
 """Hidden effects: what the true camera does and its nominal profile does not say (contract, section 4).
 
-An effect is one line here: where its value goes in the profile, and what size it takes when none is given.  The
-simulator then renders with the true profile and writes the nominal one beside the movie.
+An effect of the table is one line here: how its values change the profile, and what size they take when none is given.
+The simulator then renders with the true profile and writes the nominal one beside the movie.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
+from virest.effects.table import EFFECTS as TABLE
 from virest.errors import SettingsError
 from virest.simulation.phone_isp import OFF, PhoneIsp
 
@@ -38,8 +39,6 @@ class EffectContext:
 class Effect:
     """One named effect."""
 
-    parameters: tuple[str, ...]
-    """Names of its numbers (or its one word), in the order in which VALUE lists them."""
     draw: Callable[[CameraProfile, EffectContext], list[Any]]
     """Values when none are given."""
     apply: Callable[[CameraProfile, list[Any]], CameraProfile]
@@ -52,6 +51,8 @@ class Effect:
     """How many of the last parameters may be left out of VALUE; they are drawn."""
     endless: bool = False
     """Whether infinity is a value (scene_depth: rotation only)."""
+    parameters: tuple[str, ...] = ()
+    """Names of its numbers (or its one word), in the order in which VALUE lists them; of the table of effects."""
     strengths: tuple[str, ...] = ()
     """Strengths of the phone's own processing that take the values, where no profile keeps them."""
 
@@ -177,6 +178,13 @@ def _scale_focal(profile: CameraProfile, values: list[float]) -> CameraProfile:
     return _lens(profile, fx_px=lens.fx_px * values[0], fy_px=lens.fy_px * values[0])
 
 
+def _stretch_pixels(profile: CameraProfile, values: list[float]) -> CameraProfile:
+    """fy is ``value`` times what square pixels would have; fx stays."""
+    lens = _lens(profile).intrinsics
+    assert lens is not None
+    return _lens(profile, fy_px=lens.fy_px * values[0])
+
+
 def _shift_principal_point(profile: CameraProfile, values: list[float]) -> CameraProfile:
     lens = _lens(profile).intrinsics
     assert lens is not None
@@ -215,103 +223,94 @@ def _replace_gain(profile: CameraProfile, values: list[float]) -> CameraProfile:
     return _extend(profile, gain=tuple(values))
 
 
-EFFECTS: dict[str, Effect] = {
+_BY_NAME: dict[str, Effect] = {
     "time_offset": Effect(
-        ("time_offset_s",),
         lambda p, c: [_signed(c, 0.004, 0.015)],
         lambda p, v: replace(p, time_offset_s=(p.time_offset_s or 0.0) + v[0]),
     ),
     "clock_skew": Effect(
-        ("clock_skew",),
         lambda p, c: [_signed(c, 0.002, 0.005)],
         lambda p, v: replace(p, clock_skew=p.clock_skew + v[0]),
     ),
     "readout_time": Effect(
-        ("readout_time_s",),
         lambda p, c: [round(p.shutter.readout_time_s * (1 + _signed(c, 0.15, 0.3)), 6)],
         lambda p, v: _shutter(p, readout_time_s=v[0]),
     ),
     "readout_direction": Effect(
-        ("readout_direction",),
         lambda p, c: [OPPOSITE[p.shutter.readout_direction]],
         lambda p, v: _shutter(p, readout_direction=v[0]),
         words=DIRECTIONS,
     ),
     "timestamp_reference": Effect(
-        ("timestamp",),
         lambda p, c: [str(c.rng.choice([s for s in STAMPS if s != p.shutter.timestamp]))],
         lambda p, v: _shutter(p, timestamp=v[0]),
         words=STAMPS,
     ),
     "exposure_time": Effect(
-        ("exposure_scale",),
         lambda p, c: [round(float(np.exp(_signed(c, 0.25, 0.45))), 4)],
         lambda p, v: _shutter(p, exposure_scale=p.shutter.exposure_scale * v[0]),
     ),
     "gyro_bias": Effect(
-        ("x", "y", "z"),
         lambda p, c: [_signed(c, 0.02, 0.06) for _ in range(3)],
         lambda p, v: replace(p, gyro_bias_rad_s=tuple(a + b for a, b in zip(p.gyro_bias_rad_s, v, strict=True))),
     ),
     "gyro_scale": Effect(
-        ("gyro_scale",),
         lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)],
         lambda p, v: replace(p, gyro_scale=tuple(s * v[0] for s in p.gyro_scale)),
     ),
-    "imu_rotation": Effect(("x", "y", "z"), lambda p, c: [_signed(c, 0.015, 0.04) for _ in range(3)], _rotate_imu),
-    "focal_length": Effect(("focal_scale",), lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)], _scale_focal),
+    "gyro_lowpass": Effect(
+        lambda p, c: [_between(c, 8.0, 20.0)],
+        lambda p, v: _extend(p, gyro_lowpass_hz=v[0]),
+    ),
+    "imu_rotation": Effect(lambda p, c: [_signed(c, 0.015, 0.04) for _ in range(3)], _rotate_imu),
+    "focal_length": Effect(lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)], _scale_focal),
+    "pixel_aspect": Effect(lambda p, c: [round(1 + _signed(c, 0.02, 0.05), 6)], _stretch_pixels),
     "focal_drift": Effect(
-        ("focal_drift_per_s",),
         lambda p, c: [_signed(c, 0.01, 0.03)],
         lambda p, v: _extend(p, focal_drift_per_s=v[0]),
     ),
-    "radial_distortion": Effect(("k1",), lambda p, c: [_signed(c, 0.04, 0.1)], _bend_radially),
+    "radial_distortion": Effect(lambda p, c: [_signed(c, 0.04, 0.1)], _bend_radially),
     "principal_point": Effect(
-        ("x", "y"),
         lambda p, c: [_signed(c, 0.01 * max(p.width, p.height), 0.03 * max(p.width, p.height)) for _ in range(2)],
         _shift_principal_point,
     ),
     "stabilisation": Effect(
-        ("fraction", "cutoff_hz"),
         lambda p, c: [_between(c, 0.4, 0.8), _between(c, 0.5, 1.5)],
         lambda p, v: _extend(p, stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
         optional=1,
     ),
-    "scene_depth": Effect(
-        ("depth_m",), lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0]), endless=True
-    ),
+    "scene_depth": Effect(lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0]), endless=True),
     "frame_lag": Effect(
-        ("lag_s", "frames"),
         _draw_frame_lag,
         lambda p, v: _extend(p, frame_lag_s=v[0], frame_lag_frames=int(v[1])),
         optional=1,
     ),
     "response_curve": Effect(
-        ("gamma",),
         lambda p, c: [round(float(np.exp(_signed(c, 0.15, 0.3))), 4)],
         lambda p, v: _curve(p, extra_gamma=v[0]),
     ),
-    "black_level": Effect(
-        ("black_level",), lambda p, c: [_between(c, 0.03, 0.08)], lambda p, v: _curve(p, black_level=v[0])
-    ),
-    "vignetting": Effect(
-        ("corner_loss",), lambda p, c: [_between(c, 0.3, 0.6)], lambda p, v: _extend(p, vignetting_corner_loss=v[0])
-    ),
+    "black_level": Effect(lambda p, c: [_between(c, 0.03, 0.08)], lambda p, v: _curve(p, black_level=v[0])),
+    "vignetting": Effect(lambda p, c: [_between(c, 0.3, 0.6)], lambda p, v: _extend(p, vignetting_corner_loss=v[0])),
     "flicker": Effect(
-        ("amplitude", "frequency_hz", "phase_rad"),
         lambda p, c: [_between(c, 0.15, 0.4), float(c.rng.choice([100.0, 120.0])), _between(c, 0, 6.28)],
         lambda p, v: _extend(p, flicker_amplitude=v[0], flicker_frequency_hz=v[1], flicker_phase_rad=v[2]),
         optional=2,
     ),
-    "gain_drift": Effect(("gain",), lambda p, c: _gain_walk(c, 0.12), _replace_gain, spread=True),
-    "defocus": Effect(
-        ("sigma_px",), lambda p, c: [_between(c, 1.0, 2.0)], lambda p, v: _extend(p, defocus_sigma_px=v[0])
-    ),
+    "gain_drift": Effect(lambda p, c: _gain_walk(c, 0.12), _replace_gain, spread=True),
+    "defocus": Effect(lambda p, c: [_between(c, 1.0, 2.0)], lambda p, v: _extend(p, defocus_sigma_px=v[0])),
     "sharpening": Effect(
-        ("amount", "radius_px"),
         lambda p, c: [_between(c, 0.7, 1.2), _between(c, 1.0, 1.8)],
         lambda p, v: p,
         optional=1,
         strengths=("sharpen", "sharpen_radius_px"),
     ),
 }
+
+_PARTS = {"gyro_bias": ("x", "y", "z"), "imu_rotation": ("x", "y", "z"), "principal_point": ("x", "y")}
+"""Vectors are given and noted part by part."""
+
+EFFECTS = {
+    name: replace(_BY_NAME[name], parameters=_PARTS.get(name, tuple(one.name for one in effect.parameters)))
+    for name, effect in TABLE.items()
+}
+"""All effects of the table."""

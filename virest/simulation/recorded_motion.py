@@ -18,6 +18,7 @@ from virest.camera.profile import CameraProfile
 from virest.errors import ImuError
 from virest.simulation.hand_motion import HandMotion, Waves, integrate_motion
 from virest.simulation.hidden import missing_rate_rad_s
+from virest.simulation.phone_gyro import before_low_pass
 
 Array = NDArray[np.float64]
 
@@ -42,12 +43,15 @@ class RecordedRate:
 def recorded_rate(
     sample_s: Array, gyro_rad_s: Array, profile: CameraProfile, accel_m_s2: Array | None = None
 ) -> RecordedRate:
-    """True rate of the camera, R_cam_imu ((measured − bias) / scale + fields), from samples (n,), (n, 3), rising times.
+    """True rate of the camera, from samples (n,), (n, 3) at rising times.
 
-    sample_s: seconds on the IMU's clock from stamp_0.  Raises ImuError for fewer than two samples.
+    R_cam_imu ((measured, before its low pass, − bias) / scale + fields).  sample_s: seconds on the IMU's clock from
+    stamp_0.  Raises ImuError for fewer than two samples.
     """
     if len(sample_s) < 2:
         raise ImuError(f"{len(sample_s)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
+    if profile.extensions.gyro_lowpass_hz:
+        gyro_rad_s = before_low_pass(sample_s, gyro_rad_s, profile.extensions.gyro_lowpass_hz)
     true = (gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
     true = true + missing_rate_rad_s(profile, sample_s, true, accel_m_s2)
     camera = true @ np.array(profile.r_cam_imu).T

@@ -23,7 +23,7 @@ from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposu
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
 from virest.simulation.hidden import NOTHING, Hidden, gyro_reading, shaded
-from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate
+from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
 from virest.simulation.scenes import Scene, hang_before, make_scene, move_things_before
@@ -273,7 +273,7 @@ def sample_imu(session: Session) -> ImuLog:
     imu_from_cam = np.array(true.r_cam_imu).T
     rate = _gyro_rate(session, time_s) @ imu_from_cam.T
     force = session.motion.specific_force_m_s2(time_s, np.array(true.p_cam_imu_m), GRAVITY_WORLD_M_S2) @ imu_from_cam.T
-    gyro = gyro_reading(true, time_s, rate, force) + _gyro_noise(settings, rate.shape, rng)
+    gyro = gyro_reading(true, time_s, rate, force) + _gyro_noise(session, rate.shape, rng)
     if session.hidden.gyro is not None:
         gyro = session.hidden.gyro(time_s, gyro, force)
     force = force + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
@@ -437,15 +437,22 @@ def _gain(session: Session, slot: int) -> float:
 
 def _gyro_rate(session: Session, time_s: Array) -> Array:
     """Rates (n, 3) as the gyroscope passes them on, camera axes."""
-    corner_hz = session.settings.isp.gyro_lowpass_hz
-    rate = session.motion.rate_rad_s
-    return low_passed_rate(rate, time_s, corner_hz) if corner_hz else rate(time_s)
+    rate, corners_hz = session.motion.rate_rad_s, _corners_hz(session)
+    if not corners_hz:
+        return rate(time_s)
+    return low_passed_rate(rate, time_s, corners_hz, usual_delay_s(session.settings.isp.gyro_lowpass_hz))
 
 
-def _gyro_noise(settings: SessionSettings, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-    isp = settings.isp
-    if isp.gyro_noise:
-        return gyro_noise(isp.gyro_noise, settings.imu_rate_hz, isp.gyro_lowpass_hz, shape, rng)
+def _corners_hz(session: Session) -> list[float]:
+    """Of the hidden low pass, whose delay is in the log, and of the phone's own, whose delay its stamps leave out."""
+    both = (session.true.extensions.gyro_lowpass_hz, session.settings.isp.gyro_lowpass_hz)
+    return [corner_hz for corner_hz in both if corner_hz]
+
+
+def _gyro_noise(session: Session, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+    settings = session.settings
+    if settings.isp.gyro_noise:
+        return gyro_noise(settings.isp.gyro_noise, settings.imu_rate_hz, _corners_hz(session), shape, rng)
     return settings.gyro_noise_rad_s * rng.normal(size=shape)
 
 

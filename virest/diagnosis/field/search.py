@@ -32,7 +32,6 @@ from virest.diagnosis.geometric_ladder import (
     Accepted,
     GeometricVerdict,
     p_of,
-    total_change,
 )
 from virest.inference.track_fit import Term, TrackFit
 
@@ -298,6 +297,6 @@ def _less(found: GeometricVerdict, model: Model, leaving: Accepted) -> Model:
     assert leaving.effect is not None
     assert leaving.effect.term is not None
     name = leaving.effect.term.name
-    back = -total_change(leaving.effect, found.nominal.profile, model.profile)
+    back = -leaving.effect.total_change(found.nominal.profile, model.profile)
     terms: Sequence[Term] = [term for term in model.terms if term.name != name]
     return replace(model, profile=leaving.effect.term.change(model.profile, back), terms=tuple(terms))

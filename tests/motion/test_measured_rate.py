@@ -1,0 +1,65 @@
+"""The rate behind a gyroscope's low pass: exact without noise, held back where there is nothing but noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from virest.camera.gyro_filter import cutoff_hz, delay_s
+from virest.capture.imu import ImuSamples
+from virest.motion.measured_rate import MeasuredRate, measured_rate, without_noise
+
+TIME_S = np.arange(0, 3, 0.005)
+CUTOFF_HZ = 10.0
+
+
+def measured(rate: np.ndarray) -> MeasuredRate:
+    """One rate on all three axes."""
+    gyro = np.stack([rate] * 3, axis=1)
+    return measured_rate(ImuSamples(TIME_S, gyro, np.full_like(gyro, np.nan)))
+
+
+def filtered(frequency_hz: float) -> np.ndarray:
+    """What the filter makes of cos(2π f t): its response by hand, H = 1 / (1 − x² + i √2 x) with x = f / cutoff."""
+    x = frequency_hz / CUTOFF_HZ
+    return np.real(np.exp(2j * np.pi * frequency_hz * TIME_S) / (1 - x**2 + 1j * np.sqrt(2) * x))
+
+
+@pytest.mark.parametrize("frequency_hz", [1.0, 4.0, 9.0])
+def test_a_filtered_rate_is_turned_back(frequency_hz: float) -> None:
+    """To the cosine that it was, at samples inside the log."""
+    pieces = measured(filtered(frequency_hz)).behind_low_pass(CUTOFF_HZ)
+    true = np.cos(2 * np.pi * frequency_hz * TIME_S)
+    np.testing.assert_allclose(pieces[3, 0, 80:-80], true[80:-81], atol=0.02)
+
+
+def test_no_filter_and_one_far_away_change_nothing() -> None:
+    """Cutoff 0 is none; at 10 kHz a rate of 4 Hz is late by 1e-4 of a radian."""
+    rate = measured(filtered(4.0))
+    assert rate.behind_low_pass(0.0) is rate.pieces
+    np.testing.assert_allclose(rate.behind_low_pass(1e4)[3], rate.pieces[3], atol=1e-3)
+
+
+def test_noise_is_not_enlarged_as_the_rate_is() -> None:
+    """White noise of 0.01 rad/s on top: a bare inverse enlarges it a hundred times at 100 Hz."""
+    noise = np.random.default_rng(5).normal(0, 0.01, len(TIME_S))
+    clean, noisy = (measured(filtered(3.0) + n).behind_low_pass(CUTOFF_HZ)[3, 0] for n in (0 * noise, noise))
+    spline, delay = CubicSpline(TIME_S, noise), delay_s(CUTOFF_HZ)
+    bare = noise + delay * spline(TIME_S, 1) + 0.5 * delay**2 * spline(TIME_S, 2)
+    assert np.std((noisy - clean)[40:-40]) < 0.1 * np.std(bare[40:-40])
+
+
+def test_noise_alone_goes_and_a_rate_stays(rng: np.random.Generator) -> None:
+    """Of pure noise hardly any is left; a turn ten times above it keeps all but a few hundredths."""
+    noise = rng.normal(0, 0.01, (600, 1))
+    assert without_noise(noise).std() < 0.005
+    rate = 0.1 * np.cos(2 * np.pi * 3.0 * TIME_S)[:, None]
+    assert (without_noise(rate + noise) - rate).std() < 0.005
+
+
+def test_cutoff_and_delay_are_each_others_inverse() -> None:
+    """40 Hz delays by 5.6 ms; 0 stands for no filter on both sides."""
+    assert delay_s(40.0) == pytest.approx(5.627e-3, rel=1e-3)
+    assert cutoff_hz(delay_s(17.0)) == pytest.approx(17.0)
+    assert delay_s(0.0) == cutoff_hz(0.0) == 0.0

@@ -1,0 +1,157 @@
+"""How steps change a profile, and which steps lead from one profile to another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from virest.camera.gyro_filter import cutoff_hz, delay_s
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.errors import SettingsError
+
+Array = NDArray[np.float64]
+CUTOFFS_HZ = (0.02, 20.0)
+"""A stabiliser's cutoff is held between these while it is fitted."""
+
+
+def lens_of(profile: CameraProfile) -> Intrinsics:
+    """The profile's lens. Raises SettingsError where the focal length is unknown."""
+    if profile.intrinsics is None:
+        raise SettingsError("the focal length is unknown", hint="set intrinsics.fx_px in camera.yaml")
+    return profile.intrinsics
+
+
+def with_shutter(profile: CameraProfile, **changes: Any) -> CameraProfile:
+    """The profile with values of its shutter replaced."""
+    return replace(profile, shutter=replace(profile.shutter, **changes))
+
+
+def extended(profile: CameraProfile, **changes: Any) -> CameraProfile:
+    """The profile with values of its extensions replaced."""
+    return replace(profile, extensions=replace(profile.extensions, **changes))
+
+
+def shift_offset(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] seconds to the time offset."""
+    return replace(profile, time_offset_s=(profile.time_offset_s or 0.0) + float(v[0]))
+
+
+def rotate_imu(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Put exp(v) on the left of R_cam_imu."""
+    turned = Rotation.from_rotvec(v).as_matrix() @ profile.rotation_cam_imu
+    return replace(profile, r_cam_imu=tuple(map(tuple, turned.tolist())))
+
+
+def rotation_between(before: CameraProfile, after: CameraProfile) -> Array:
+    """Rotation vector (3,) of R_after R_beforeᵀ."""
+    return np.asarray(Rotation.from_matrix(after.rotation_cam_imu @ before.rotation_cam_imu.T).as_rotvec())
+
+
+def add_bias(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v rad/s to the gyroscope's bias."""
+    return replace(profile, gyro_bias_rad_s=tuple((np.array(profile.gyro_bias_rad_s) + v).tolist()))
+
+
+def scale_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Multiply the gyroscope's scale by exp(v[0])."""
+    return replace(profile, gyro_scale=tuple((np.array(profile.gyro_scale) * np.exp(v[0])).tolist()))
+
+
+def delay_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] seconds to the delay of the gyroscope's low pass; a negative one is no filter's."""
+    late_s = delay_s(profile.extensions.gyro_lowpass_hz) + float(v[0])
+    return extended(profile, gyro_lowpass_hz=cutoff_hz(late_s))
+
+
+def lengthen_readout(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] seconds to the readout, the first row kept where it was."""
+    return with_shutter(profile, readout_time_s=max(profile.shutter.readout_time_s + float(v[0]), 0.0))
+
+
+def add_readout(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] seconds to the readout, the picture's middle row kept where it was; through 0 it turns about."""
+    signed = profile.shutter.readout_time_s + float(v[0])
+    return with_shutter(shift_offset(profile, np.array([-0.5 * v[0]])), readout_time_s=signed)
+
+
+def scale_focal(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Multiply the focal lengths by exp(v[0])."""
+    return replace(profile, intrinsics=lens_of(profile).scaled_focal(float(np.exp(v[0]))))
+
+
+def stretch_pixels(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Multiply fy by exp(v[0]); fx stays."""
+    lens = lens_of(profile)
+    return replace(profile, intrinsics=replace(lens, fy_px=lens.fy_px * float(np.exp(v[0]))))
+
+
+def pixel_aspect(profile: CameraProfile) -> float:
+    """fy / fx; 1 while the focal length is unknown."""
+    return 1.0 if profile.intrinsics is None else profile.intrinsics.fy_px / profile.intrinsics.fx_px
+
+
+def k1_of(profile: CameraProfile) -> float:
+    """First radial coefficient; 0 without distortion."""
+    lens = profile.intrinsics
+    return 0.0 if lens is None or not lens.coefficients else lens.coefficients[0]
+
+
+def add_k1(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] to k1."""
+    lens = lens_of(profile)
+    if lens.model == "none":
+        lens = replace(lens, model="radtan", coefficients=(0.0,) * 5)
+    coefficients = (lens.coefficients[0] + float(v[0]), *lens.coefficients[1:])
+    return replace(profile, intrinsics=replace(lens, coefficients=coefficients))
+
+
+def shift_principal_point(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v px to the principal point."""
+    lens = lens_of(profile)
+    return replace(profile, intrinsics=replace(lens, cx_px=lens.cx_px + float(v[0]), cy_px=lens.cy_px + float(v[1])))
+
+
+def principal_shift(before: CameraProfile, after: CameraProfile) -> Array:
+    """How far (2,) the principal point has moved, px."""
+    if before.intrinsics is None or after.intrinsics is None:
+        return np.zeros(2)
+    one, other = before.intrinsics, after.intrinsics
+    return np.array([other.cx_px - one.cx_px, other.cy_px - one.cy_px])
+
+
+def scale_exposure(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Multiply the exposure scale by exp(v[0])."""
+    return with_shutter(profile, exposure_scale=profile.shutter.exposure_scale * float(np.exp(v[0])))
+
+
+def drift_focal(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] 1/s to the drift of the focal length."""
+    return extended(profile, focal_drift_per_s=profile.extensions.focal_drift_per_s + float(v[0]))
+
+
+def stabilise(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] to the stabiliser's fraction, multiply its cutoff by exp(v[1]), add v[2:] rad to its lean at first."""
+    before = profile.extensions
+    lean = before.stabilisation_lean_rad
+    return extended(
+        profile,
+        stabilisation_fraction=before.stabilisation_fraction + float(v[0]),
+        stabilisation_cutoff_hz=float(np.clip(before.stabilisation_cutoff_hz * np.exp(v[1]), *CUTOFFS_HZ)),
+        stabilisation_lean_rad=(lean[0] + float(v[2]), lean[1] + float(v[3])),
+    )
+
+
+def stabilised_between(before: CameraProfile, after: CameraProfile) -> Array:
+    """(4,) the fraction's change; a cutoff has no nought to count from, and the lean is no part of the cause."""
+    change = after.extensions.stabilisation_fraction - before.extensions.stabilisation_fraction
+    return np.array([change, 0.0, 0.0, 0.0])
+
+
+def skew_clock(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] to the clock skew."""
+    return replace(profile, clock_skew=profile.clock_skew + float(v[0]))

@@ -1,0 +1,75 @@
+"""What of a prediction a change of the profile touches: what must be worked out anew, and what may be kept.
+
+A value that no line here names touches everything, so that a forgotten one costs time and never a stale prediction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from virest.camera.profile import CameraProfile
+
+
+@dataclass(frozen=True, slots=True)
+class Touched:
+    """Parts of what a profile makes of the inertial samples."""
+
+    rates: bool
+    """The true rates: everything is integrated anew."""
+    axes: bool
+    """The camera's axes on the IMU: trajectory and path turn along."""
+    lens: bool
+    """The lens, or how it moves."""
+
+
+RATES, AXES, LENS, NOTHING = "rates", "axes", "lens", "nothing"
+OF_PROFILE = {
+    "r_cam_imu": AXES,
+    "intrinsics": LENS,
+    # when a point is seen and how bright: asked of the profile itself for each prediction
+    **dict.fromkeys(("width", "height", "shutter", "readout_known", "time_offset_s", "clock_skew"), NOTHING),
+    **dict.fromkeys(("response", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "depth_m"), NOTHING),
+    **dict.fromkeys(("device", "estimates", "imu_untrusted_s", "imu_untrusted_stamp_0_ns", "lens_shape"), NOTHING),
+}
+"""Fields of a profile that do not touch everything."""
+OF_EXTENSIONS = {
+    **dict.fromkeys(("focal_drift_per_s", "stabilisation_fraction", "stabilisation_cutoff_hz"), LENS),
+    "stabilisation_lean_rad": LENS,
+    **dict.fromkeys(("frame_lag_s", "frame_lag_frames", "vignetting_corner_loss", "gain", "defocus_sigma_px"), NOTHING),
+    **dict.fromkeys(("flicker_amplitude", "flicker_frequency_hz", "flicker_phase_rad"), NOTHING),
+}
+"""Extensions that do not touch everything."""
+OF_FIELDS = {"rate": RATES, "scale": LENS, "delay": NOTHING, "gain": NOTHING}
+"""Fields in ``extensions.field``, by kind; the shutter and the lens hold the others."""
+
+
+def touched(before: CameraProfile, after: CameraProfile) -> Touched:
+    """What differs between the predictions of two profiles."""
+    found = {OF_PROFILE.get(name, RATES) for name in _changed(before, after) if name != "extensions"}
+    if before.extensions is not after.extensions:
+        changed = _changed(before.extensions, after.extensions)
+        found |= {OF_EXTENSIONS.get(name, RATES) for name in changed if name != "field"}
+        if "field" in changed:
+            found |= {OF_FIELDS.get(kind, RATES) for kind in _changed_kinds(before, after)}
+    # fields over what the camera logs have its clock, and move on the IMU's with the offset between the two
+    logged = any(field.log is not None for field in after.extensions.field)
+    later = logged and before.time_offset_s != after.time_offset_s
+    return Touched(RATES in found, AXES in found, LENS in found or later)
+
+
+def _changed(before: Any, after: Any) -> set[str]:
+    if before is after:
+        return set()
+    names = (entry.name for entry in fields(before))
+    pairs = ((name, getattr(before, name), getattr(after, name)) for name in names)
+    return {name for name, one, other in pairs if one is not other and one != other}
+
+
+def _changed_kinds(before: CameraProfile, after: CameraProfile) -> set[str]:
+    kinds = {field.kind for profile in (before, after) for field in profile.extensions.field}
+    return {kind for kind in kinds if _of_kind(before, kind) != _of_kind(after, kind)}
+
+
+def _of_kind(profile: CameraProfile, kind: str) -> list[Any]:
+    return [field for field in profile.extensions.field if field.kind == kind]
