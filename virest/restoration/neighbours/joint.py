@@ -142,8 +142,8 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     Of the difference's power, noise of both making E, half is the frame's.  Rings take overtones of edges for noise,
     which is no more than what half of all places differ by; it scatters, and E is ORDINARY times as much.  What a tile
     differs by only because its own shift is not the field's is another matter: it bends the picture near relief, and
-    none of it is ordinary.  Of a tile's own shift counts what the noise of shifts, noise_px on each axis, does not explain
-    (James & Stein 1961).
+    none of it is ordinary.  Of a tile's own shift counts what the noise of shifts, noise_px on each axis, does not
+    explain (James & Stein 1961).
     """
     left, both = (cv2.sqrBoxFilter(one, cv2.CV_32F, (AROUND, AROUND)) for one in agreement.differences(shift_px))
     if np.median(left / (OWN_ERROR * both + np.float32(independent_error))) > MOST_DIFFERENT:
@@ -231,7 +231,7 @@ def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array
 
 
 def _lasting_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px: float) -> float:
-    """Deviation, each axis, of what shifts (n, 2) have in common with those beside them: no noise, but the field's error.
+    """Deviation, each axis, of what shifts (n, 2) have in common with those beside them: the field's error, no noise.
 
     Noise of tiles side by side is independent, so the mean product of their shifts is the power of the rest.
     """
