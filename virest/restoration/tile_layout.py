@@ -127,7 +127,7 @@ def join_neighbours(
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
         if lamps is not None:
             trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
-        deconvolution.join(channels(one), kernels, kept, trust, alone)
+        deconvolution.join(channels(one), kernels, kept, ratio, trust, alone)
 
 
 def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:

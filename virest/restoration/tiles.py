@@ -48,6 +48,10 @@ class SharpTiles:
         return self._made[channel, number]
 
 
+LEAST_RATIO = np.float32(1e-12)
+"""Added to N / S, which is 0 for a mean."""
+
+
 class TileDeconvolution:
     """Windows, margins and kernels of one picture, ready to filter any number of its channels.
 
@@ -124,12 +128,19 @@ class TileDeconvolution:
         return projected
 
     def join(
-        self, channels: Sequence[Image], kernels: Image, sharpness: Image, trust: Image, alone: SharpTiles
+        self,
+        channels: Sequence[Image],
+        kernels: Image,
+        sharpness: Image,
+        ratio: Image,
+        trust: Image,
+        alone: SharpTiles,
     ) -> None:
         """Take a further picture of the same scene into account, channels (height, width).
 
-        kernels: (tiles, k, k).  sharpness: what its uncertain place leaves of it on average, a packed real factor;
-        the power |K|² stays, as in any expected data term.  trust: (height, width) 0 to 1; where it is little there
+        kernels: (tiles, k, k).  sharpness: what its uncertain place leaves of it on average, a packed real factor s;
+        the power |K|² stays, as in any expected data term.  What the place makes wrong, (1 − s²) |K|² of the signal, is
+        noise of its own beside that of a frame, N / S ``ratio``, and it weighs as much less.  trust: (height, width) 0 to 1; where it is little there
         stands in place of the picture what ``alone`` would be in it, which says nothing new.
         """
         if not self._joined:
@@ -139,8 +150,13 @@ class TileDeconvolution:
         parts = [trusted[top : top + patch, left : left + patch] for top, left in corners]
         least = [cv2.minMaxLoc(part)[0] for part in parts]
         used = [k for k, part in enumerate(parts) if least[k] == 1 or cv2.mean(part)[0] > LEAST_TRUSTED]
-        one, back = np.empty((2, self.size, self.size), np.float32)
+        one, weight, factor, back = np.empty((4, self.size, self.size), np.float32)
+        lost = 1 - sharpness**2
         for number, kernel in zip(used, _kernel_spectra(kernels[used], self.size), strict=True):
+            _power_inside(kernel, one)
+            _power_at_ends(kernel[None], one[None])
+            cv2.divide(ratio, cv2.add(cv2.multiply(lost, one), ratio + LEAST_RATIO), weight)
+            cv2.multiply(sharpness, weight, factor)
             share = self.periodic(trusted, *corners[number]).copy() if least[number] < 1 else None
             for channel, (plane, joined) in enumerate(zip(padded, self._joined, strict=True)):
                 tile = self.periodic(plane, *corners[number])
@@ -152,10 +168,8 @@ class TileDeconvolution:
                 spectrum = transforms.forward(tile, self._spectrum)
                 np.multiply(_inner_numbers(spectrum), _inner_numbers(kernel), out=_inner_numbers(back))
                 _ends(back)[:] = _ends_product(np.array(_ends(spectrum)), np.array(_ends(kernel)))
-                cv2.accumulateProduct(back, sharpness, joined[number])
-            _power_inside(kernel, one)
-            _power_at_ends(kernel[None], one[None])
-            self.powers[number] += one
+                cv2.accumulateProduct(back, factor, joined[number])
+            cv2.accumulateProduct(one, weight, self.powers[number])
 
     def alone(self, channels: Sequence[Image], ratio: Image) -> SharpTiles:
         """The tiles of the picture by itself, made sharp by the linear filter with N / S ``ratio``, as asked for.

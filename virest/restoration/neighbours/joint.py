@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField
 from virest.image_formation.neighbour import NeighbourView
-from virest.restoration.neighbours.registration import TileAgreement
+from virest.restoration.neighbours.registration import TILE, TileAgreement
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 from virest.restoration.statistics.tile_power import passed_power
@@ -44,6 +44,8 @@ LEAST_SHIFTS = 6
 LOOKED_AT = 6
 """Places at which a neighbour's kernels are looked at for what it may bring."""
 HUBER, ROBUST_STEPS = 1.5, 6
+BESIDE = 1.1
+"""Tiles no further apart than this, over their side, lie side by side; across a corner they are 1.3 to 1.4 apart."""
 HALF = 2
 """Colour is brought at this many times less resolution: a movie stores no more of it."""
 
@@ -109,11 +111,15 @@ def neighbour_picture(
     used = agreement.precision > 0
     if np.count_nonzero(used) < 2 * LEAST_SHIFTS:
         return None
-    affine, std_px = _affine(agreement.centres_px[used], agreement.shift_px[used], agreement.precision[used])
+    affine, typical_px = _affine(agreement.centres_px[used], agreement.shift_px[used], agreement.precision[used])
+    off_px = agreement.shift_px[used] - _at(affine, agreement.centres_px[used])
+    lasting_px = _lasting_px(agreement.centres_px[used], off_px, typical_px, TILE * agreement.times)
+    noise_px = np.sqrt(max(typical_px**2 - lasting_px**2, 0.0))
+    std_px = float(np.hypot(lasting_px, noise_px * np.sqrt(LEAST_SHIFTS / len(off_px))))
     source = view.map_px(lambda points_px: points_px - _at(affine, points_px))
     brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    trust = _trust(agreement, _at(affine, agreement.centres_px), std_px, independent_error)
+    trust = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
     height, width = light.shape
     places = source[agreement.times // 2 :: agreement.times, agreement.times // 2 :: agreement.times]
     inside = cv2.inRange(places, (0, 0), (width - 1, height - 1)) > 0
@@ -130,13 +136,13 @@ def neighbour_picture(
     )
 
 
-def _trust(agreement: TileAgreement, shift_px: Array, std_px: float, independent_error: float) -> Image:
+def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float) -> Image:
     """Noise of a frame over that of its neighbour, by how they differ around each place of the reduced picture.
 
     Of the difference's power, noise of both making E, half is the frame's.  Rings take overtones of edges for noise,
     which is no more than what half of all places differ by; it scatters, and E is ORDINARY times as much.  What a tile
     differs by only because its own shift is not the field's is another matter: it bends the picture near relief, and
-    none of it is ordinary.  Of a tile's own shift counts what the scatter of all tiles, std_px on each axis, does not
+    none of it is ordinary.  Of a tile's own shift counts what the noise of shifts, noise_px on each axis, does not
     explain (James & Stein 1961).
     """
     left, both = (cv2.sqrBoxFilter(one, cv2.CV_32F, (AROUND, AROUND)) for one in agreement.differences(shift_px))
@@ -146,7 +152,7 @@ def _trust(agreement: TileAgreement, shift_px: Array, std_px: float, independent
     expected = OWN_ERROR * both + np.float32(noise)
     trust = np.float32(0.5) / cv2.max(left / (np.float32(ORDINARY) * expected) - np.float32(0.5), 0.5)
     off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
-    sure = np.maximum(1 - 2 * std_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
+    sure = np.maximum(1 - 2 * noise_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
     own_px = shift_px + sure[:, None] * off_px
     misplaced = left - cv2.sqrBoxFilter(agreement.differences(own_px)[0], cv2.CV_32F, (AROUND, AROUND))
     trust *= expected / (expected + 2 * cv2.max(misplaced, 0.0))
@@ -222,6 +228,19 @@ def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array
         typical = max(float(np.median(distance)) / 1.1774, 1e-6)
         robust = np.minimum(1.0, HUBER * typical / np.maximum(distance, 1e-9))
     return found, typical
+
+
+def _lasting_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px: float) -> float:
+    """Deviation, each axis, of what shifts (n, 2) have in common with those beside them: the field's error, no noise.
+
+    Noise of tiles side by side is independent, so the mean product of their shifts is the power of the rest.
+    """
+    length = np.linalg.norm(off_px, axis=1, keepdims=True)
+    held = off_px * np.minimum(1.0, 2 * HUBER * typical_px / np.maximum(length, 1e-9))
+    apart = np.linalg.norm(centres_px[:, None] - centres_px, axis=-1)
+    beside = (apart > 0) & (apart <= BESIDE * spacing_px)
+    products = (held @ held.T)[beside]
+    return float(np.sqrt(max(products.mean() / 2, 0.0))) if len(products) else typical_px
 
 
 def _at(affine: Array, points_px: Array) -> Array:
