@@ -140,8 +140,9 @@ class TileDeconvolution:
 
         kernels: (tiles, k, k).  sharpness: what its uncertain place leaves of it on average, a packed real factor s;
         the power |K|² stays, as in any expected data term.  What the place makes wrong, (1 − s²) |K|² of the signal, is
-        noise of its own beside that of a frame, N / S ``ratio``, and it weighs as much less.  trust: (height, width) 0 to 1; where it is little there
-        stands in place of the picture what ``alone`` would be in it, which says nothing new.
+        noise of its own beside that of a frame, N / S ``ratio``, and it weighs as much less.  trust: (height, width)
+        0 to 1; where it is little there stands in place of the picture what ``alone`` would be in it, which says
+        nothing new.
         """
         if not self._joined:
             self._joined = [np.zeros_like(self.kernels) for _ in channels]
