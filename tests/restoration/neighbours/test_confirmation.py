@@ -54,8 +54,9 @@ def test_too_few_pairs_or_no_change_confirm_nothing():
 
 def test_a_larger_change_promises_more_and_a_larger_rest_less():
     """The promise grows with what was changed, falls with what the spectra leave, and has a deviation."""
-    found = ConfirmedGain(1.0, 0.2, 0.02, 4)
-    little, much, doubtful = (found.of_change_db(c, ideal) for c, ideal in ((5.0, 30.0), (50.0, 30.0), (50.0, 300.0)))
+    found, lost = ConfirmedGain(1.0, 0.2, 0.02, 4), 80.0
+    asked = ((5.0, lost, 30.0), (50.0, lost, 30.0), (50.0, lost, 300.0))
+    little, much, doubtful = (found.of_change_db(*one) for one in asked)
     assert 0 < little[0] < doubtful[0] < much[0]
     assert all(deviation > 0 for _, deviation in (little, much, doubtful))
 
