@@ -67,8 +67,8 @@ class ConfirmedGain:
 def removed(changed: float, lost: float) -> float:
     """Squared error that restoring removes, by what it changed and by what the blur took.
 
-    Either would be it, were the restoration right and were the spectra, and a change beyond what was lost is an error of
-    its own: the mean of their logarithms.  A fit that weighs them freely gives the change 0.36 ± 0.12.
+    Either would be it, were the restoration right and were the spectra, and a change beyond what was lost is an error
+    of its own: the mean of their logarithms.  A fit that weighs them freely gives the change 0.36 ± 0.12.
     """
     return float(np.sqrt(changed * max(lost, 0.0)))
 
