@@ -77,6 +77,15 @@ def test_noise_to_signal_is_of_the_right_order() -> None:
     assert luma.noise_to_signal[12] > 5 * luma.noise_to_signal[2]
 
 
+@pytest.mark.parametrize("length_px", [3.0, 15.0])
+def test_what_the_blur_took_is_measured(length_px: float) -> None:
+    """The mean square of what the blur changed, noise aside, comes back from the blurred picture alone."""
+    field = _field(length_px)
+    picture, sharp = _blurred(field, 2.0)
+    lost = np.mean((sharp - cv2.filter2D(sharp, -1, field.arrays()[0].astype(float))) ** 2)
+    assert measure_picture(picture, field, STRAIGHT)[0].blur_error == pytest.approx(lost, rel=0.12)
+
+
 def test_more_noise_promises_less() -> None:
     """The expected gain is positive under a clean blur and shrinks as noise grows."""
     field = _field()

@@ -291,7 +291,9 @@ def _deblurred(
     restored = _mixed(sharp, recorded, part)
     ideal = luma_model.ideal_error(joined.passed)
     alone = luma_model.ideal_error(np.zeros_like(joined.passed))
-    gain_db = (None, None) if confirmed is None else confirmed.of_change_db(_mean_square(restored, recorded), ideal)
+    gain_db: tuple[float | None, float | None] = (None, None)
+    if confirmed is not None:
+        gain_db = confirmed.of_change_db(_mean_square(restored, recorded), luma_model.blur_error, ideal)
     details = {
         "method": settings.deblur,
         "preset": settings.preset,

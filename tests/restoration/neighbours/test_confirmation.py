@@ -53,11 +53,14 @@ def test_too_few_pairs_or_no_change_confirm_nothing():
 
 
 def test_a_larger_change_promises_more_and_a_larger_rest_less():
-    """The promise grows with what was changed, falls with what the spectra leave, and has a deviation."""
-    found = ConfirmedGain(1.0, 0.2, 0.02, 4)
-    little, much, doubtful = (found.of_change_db(c, ideal) for c, ideal in ((5.0, 30.0), (50.0, 30.0), (50.0, 300.0)))
-    assert 0 < little[0] < doubtful[0] < much[0]
-    assert all(deviation > 0 for _, deviation in (little, much, doubtful))
+    """The promise grows with what was changed and what was lost, falls with what is left, and has a deviation."""
+    found, unlike = (ConfirmedGain(1.0, 0.2, left, 4) for left in (0.02, 0.1))
+    much = found.of_change_db(50.0, 80.0, 30.0)
+    less = [found.of_change_db(*asked) for asked in ((5.0, 80.0, 30.0), (50.0, 8.0, 30.0), (50.0, 80.0, 300.0))]
+    less.append(unlike.of_change_db(50.0, 80.0, 30.0))
+    assert all(0 < gain_db < much[0] for gain_db, _ in less)
+    assert all(deviation > 0 for _, deviation in (much, *less))
+    assert found.of_change_db(0.0, 80.0, 30.0)[0] == 0.0
 
 
 def test_neighbours_that_lack_something_else_confirm_nothing():

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
 """Added to the seeds of the captures that judge."""
-LEFT_OVER_NAMES = ("constant", "ideal filter's", "changed", "neighbours'")
+LEFT_OVER_NAMES = ("constant", "ideal filter's", "neighbours'")
 LEFT_OVER_PRESETS = ("fast", "balanced")
 OUTLYING_DB = 0.5
 """Errors of the promised gain beyond this count by less than their square."""
@@ -84,8 +84,7 @@ def fit_workloads(scale: Scale) -> list[Workload]:
 def fit_left_over(rows: Sequence[Row]) -> Row:
     """Coefficients of :data:`confirmation.LEFT_OVER` that promise the gains best, their deviations, and the scatter.
 
-    rows: with ``capture``, ``changed``, ``logarithms`` (1, ln ideal, ln changed, ln left) and ``gain_db``.  Captures
-    count alike.
+    rows: with ``capture``, ``removed``, ``logarithms`` (1, ln ideal, ln left) and ``gain_db``.  Captures count alike.
     """
     captures = np.array([row["capture"] for row in rows])
     names = list(dict.fromkeys(captures.tolist()))
@@ -93,7 +92,7 @@ def fit_left_over(rows: Sequence[Row]) -> Row:
     left_out = [_fitted([r for r in rows if r["capture"] != n], captures[captures != n]) for n in names]
     spread = np.sqrt((len(names) - 1) * np.var(left_out, axis=0)) if len(names) > 1 else np.full(len(fitted), np.nan)
     off_db = np.abs(_promised_db(rows, fitted) - [row["gain_db"] for row in rows])
-    slopes = (_promised_db(rows, fitted - (0.05, 0, 0, 0)) - _promised_db(rows, fitted)) / 0.05
+    slopes = (_promised_db(rows, fitted - (0.05, 0, 0)) - _promised_db(rows, fitted)) / 0.05
     return {
         "coefficients": fitted.tolist(),
         "std": spread.tolist(),
@@ -120,11 +119,11 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 class _Watched(ConfirmedGain):
     """Keeps what it is asked about."""
 
-    asked: list[tuple[float, float]] = field(default_factory=list)
+    asked: list[tuple[float, float, float]] = field(default_factory=list)
 
-    def of_change_db(self, changed: float, ideal: float) -> tuple[float, float]:
-        self.asked.append((changed, ideal))
-        return ConfirmedGain.of_change_db(self, changed, ideal)
+    def of_change_db(self, changed: float, lost: float, ideal: float) -> tuple[float, float]:
+        self.asked.append((changed, lost, ideal))
+        return ConfirmedGain.of_change_db(self, changed, lost, ideal)
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:
@@ -153,14 +152,14 @@ def _promises(
         for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=watched)):
             if restored.parameters["deblur"]["method"] == "none":
                 continue
-            changed, ideal = watched.asked[-1]
+            changed, lost, ideal = watched.asked[-1]
             before_db, valid_px = straight_db[restored.frame.index]
             yield {
                 "capture": workload.name,
                 "preset": preset,
                 "frame": restored.frame.index,
-                "changed": changed,
-                "logarithms": confirmation.tellers(ideal, changed, watched.left).tolist(),
+                "removed": confirmation.removed(changed, lost),
+                "logarithms": confirmation.tellers(ideal, watched.left).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
 
@@ -182,12 +181,12 @@ def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straig
 
 
 def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
-    logarithms, changed = (np.array([row[k] for row in rows]) for k in ("logarithms", "changed"))
-    return np.asarray(10 * np.log10(1 + changed / np.exp(logarithms @ coefficients)))
+    logarithms, removed = (np.array([row[k] for row in rows]) for k in ("logarithms", "removed"))
+    return np.asarray(10 * np.log10(1 + removed / np.exp(logarithms @ coefficients)))
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
-    """(4,) coefficients."""
+    """(3,) coefficients."""
     gain_db = np.array([row["gain_db"] for row in rows])
     weight = 1 / np.sqrt([np.count_nonzero(captures == name) for name in captures])
     weight /= weight.mean()

@@ -92,7 +92,8 @@ def survey_gain(
                 continue
             for other in (before, after):
                 assert other.motion is not None
-                view = neighbour_view(motion, other.motion, trajectory, lens)
+                further = None if refined is None else refined.further
+                view = neighbour_view(motion, other.motion, trajectory, lens, further=further)
                 judged = judged_change(view, *pictures, neighbours.light(other))
                 if judged is not None:
                     found.append(judged)

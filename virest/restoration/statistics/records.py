@@ -157,14 +157,25 @@ class PictureStatistics:
             return 0.0
         if self.places is not None:
             return self.places.expected_gain_db(self.signal, self.noise)
-        real = np.sqrt(self.passed) if self.real is None else self.real
-        left = np.sum(self.frequency * ((1 - 2 * real + self.passed) * self.signal + self.noise))
+        left = np.sum(self.frequency * (self._lost() + self.noise))
         return max(float(10 * np.log10(left / np.sum(self.frequency * self._wrong(further)))), 0.0)
 
     def ideal_error(self, further: Array) -> float:
         """Mean square, in grey levels, that the ideal linear filter leaves; arguments as of :meth:`joint_gain_db`."""
-        area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0])
-        return float(area @ self._wrong(further))
+        return float(self._area() @ self._wrong(further))
+
+    @property
+    def blur_error(self) -> float:
+        """Mean square, in grey levels, of what the picture misses for its blur."""
+        return float(self._area() @ self._lost())
+
+    def _area(self) -> Array:
+        return np.asarray(2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]))
+
+    def _lost(self) -> Array:
+        """(RINGS,) power of (1 − K) F."""
+        real = np.sqrt(self.passed) if self.real is None else self.real
+        return np.asarray((1 - 2 * real + self.passed) * self.signal)
 
     def _wrong(self, further: Array) -> Array:
         """(RINGS,) power of what the ideal linear filter leaves."""
