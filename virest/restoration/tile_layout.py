@@ -128,6 +128,7 @@ def join_neighbours(
         if lamps is not None:
             trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
         deconvolution.join(channels(one), kernels, kept, ratio, trust, alone)
+    deconvolution.share_noise()
 
 
 def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:

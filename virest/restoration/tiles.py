@@ -95,6 +95,8 @@ class TileDeconvolution:
             self.powers += variance(self.size)
         self._joined: list[Image] = []
         """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra of each channel."""
+        self._together: Image = self.kernels
+        """Σ w K_k with the picture's own, (tiles, size, size); once pictures are joined, how sure their sum is."""
         self._without_highlights: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
         self._rest: dict[int, Image] = {}
@@ -124,6 +126,7 @@ class TileDeconvolution:
             ends[number] = _ends(spectrum)
         _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
         if self._joined:
+            projected *= self._together
             projected += self._joined[number_joined]
         return projected
 
@@ -146,6 +149,7 @@ class TileDeconvolution:
         """
         if not self._joined:
             self._joined = [np.zeros_like(self.kernels) for _ in channels]
+            self._together = self.kernels.copy()
         padded, trusted = [self.padded(channel) for channel in channels], self.padded(trust)
         corners, patch = list(self.grid.corners()), self.patch
         parts = [trusted[top : top + patch, left : left + patch] for top, left in corners]
@@ -171,6 +175,23 @@ class TileDeconvolution:
                 _ends(back)[:] = _ends_product(np.array(_ends(spectrum)), np.array(_ends(kernel)))
                 cv2.accumulateProduct(back, factor, joined[number])
             cv2.accumulateProduct(one, weight, self.powers[number])
+            cv2.accumulateProduct(kernel, factor, self._together[number])
+
+    def share_noise(self) -> None:
+        """Once all are joined: what neighbours add counts as the noise that they may share allows.
+
+        A coder repeats a still scene with its noise.  Noise N common to all is projected back to |Σ w K|² N, where
+        independent noise makes Σ w |K|² N: that is no less along different paths, and along one path nothing is gained.
+        The data term weighs by the ratio of both, at most 1.
+        """
+        one = np.empty((self.size, self.size), np.float32)
+        for number, together in enumerate(self._together if self._joined else ()):
+            _power_inside(together, one)
+            _power_at_ends(together[None], one[None])
+            power = self.powers[number]
+            np.divide(power, np.maximum(cv2.max(one, power), LEAST_RATIO), out=together)
+            for spectra in (self.powers, *self._joined):
+                spectra[number] *= together
 
     def alone(self, channels: Sequence[Image], ratio: Image) -> SharpTiles:
         """The tiles of the picture by itself, made sharp by the linear filter with N / S ``ratio``, as asked for.
