@@ -420,8 +420,10 @@ def _beyond_limits(fit: TrackFit, observed: ObservedTracks) -> dict[str, str]:
 
 
 def _is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
-    """Known well enough, and not by a single moment alone."""
+    """Known well enough, and not by a single moment alone; a readout within two deviations of 0 has no known sense."""
     known = bool(np.all(np.sqrt(variance) <= MAX_STD[name]))
+    if name == "readout_time" and abs(fit.profile.shutter.readout_time_s) < 2 * float(np.sqrt(variance[0])):
+        return False
     return known and bool(np.all(fit.stretches[fit.slices[name]] >= MIN_STRETCHES))
 
 
