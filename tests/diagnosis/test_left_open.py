@@ -10,7 +10,7 @@ from motion.synthetic_tracks import Recording, Setup
 
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import FarClock, candidates_of
-from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
 from virest.diagnosis.geometric_ladder import is_plausible
 from virest.diagnosis.left_open import variance_left_open
@@ -35,7 +35,7 @@ def left_open(given: CameraProfile, further: tuple[str, ...]) -> tuple[float, fl
     model = Model(fitted.profile, None, (offset.term,))
     candidates = candidates_of(evidence, given, model, set(), (), FarClock())
     more = [candidate for candidate in candidates if candidate.name in further and candidate.added]
-    found = variance_left_open(evidence, model, [offset], more, GeometricEffect.total_change, is_plausible, one_by_one)
+    found = variance_left_open(evidence, model, [offset], more, is_plausible, one_by_one)
     error = fitted.profile.time_offset_s - camera.profile.time_offset_s
     return error, float(fitted.std("time_offset")[0] ** 2), float(found["time_offset"][0])
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from virest.image_formation.blur import Image, fast_size, tile_grid
 from virest.restoration.statistics.on_tiles import packed_frequency
 from virest.restoration.tiles import (
+    SharpTiles,
     TileDeconvolution,
     _ends,
     _ends_product,
@@ -279,3 +280,63 @@ def test_tiles_that_see_no_hole_are_not_touched() -> None:
     corners = list(grid.corners())
     expected = [n for n, (top, left) in enumerate(corners) if top - 16 <= 20 < top + 80 and left - 16 <= 70 < left + 80]
     assert deconvolution.touched(holes) == expected
+
+
+def _stroke(across: bool) -> NDArray[np.float32]:
+    kernel = np.zeros((15, 15), np.float32)
+    cv2.line(kernel, *(((2, 7), (12, 7)) if across else ((7, 2), (7, 12))), 1.0)
+    return kernel / kernel.sum()
+
+
+def _joined(
+    picture: Image, kernel: Image, further: Image, its_kernel: Image, sharpness: float = 1.0, ratio: float = 1e-3
+) -> TileDeconvolution:
+    """Tiles of a picture to which a further one was joined that is trusted everywhere."""
+    grid = tile_grid(*picture.shape, 64, 16)
+    count = len(grid.centres_px)
+    deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], count, 0), 16)
+    sharp, noise = (np.full((deconvolution.size,) * 2, value, np.float32) for value in (sharpness, ratio))
+    nowhere = SharpTiles(lambda *_: pytest.fail("a picture that is trusted everywhere needs no other"))
+    kernels = np.repeat(its_kernel[None], count, 0)
+    deconvolution.join([further], kernels, sharp, noise, np.ones_like(picture), nowhere)
+    deconvolution.share_noise()
+    return deconvolution
+
+
+def test_a_picture_joined_with_itself_says_nothing_new() -> None:
+    """A coder that repeats a still frame repeats its noise: twice the same measurement weighs as much as once."""
+    picture, kernel = texture(100, 150).astype(np.float32), _lopsided_kernel()
+    twice = _joined(picture, kernel, picture, kernel)
+    once = TileDeconvolution(twice.grid, np.repeat(kernel[None], len(twice.grid.centres_px), 0), 16)
+    np.testing.assert_allclose(twice.powers, once.powers, rtol=1e-4, atol=1e-9)
+    projected = once.back_projected(picture)
+    np.testing.assert_allclose(twice.back_projected(picture), projected, atol=1e-5 * np.abs(projected).max())
+
+
+def test_a_picture_blurred_along_another_path_tells_what_the_first_lost() -> None:
+    """Strokes across and down pass each other's lost frequencies; together they are sharper than either alone."""
+    rng = np.random.default_rng(3)
+    sharp = texture(140, 200).astype(np.float32)
+    across, down = _stroke(True), _stroke(False)
+    first, second = (
+        cv2.filter2D(sharp, cv2.CV_32F, kernel) + rng.normal(0, 0.01, sharp.shape).astype(np.float32)
+        for kernel in (across, down)
+    )
+
+    def error(deconvolution: TileDeconvolution) -> float:
+        ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
+        restored = deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(first), ratio, ratio))
+        return float(np.mean((restored - sharp)[20:-20, 20:-20] ** 2))
+
+    together = error(_joined(first, across, second, down))
+    alone = error(_joined(first, across, first, across))
+    assert together < 0.5 * alone
+
+
+def test_a_neighbour_whose_place_is_uncertain_weighs_less() -> None:
+    """What is left of it on average, s, makes (1 - s^2) |K|^2 of the signal an error of its own."""
+    picture, across, down = texture(100, 150).astype(np.float32), _stroke(True), _stroke(False)
+    known, uncertain = (_joined(picture, across, picture, down, sharpness).powers for sharpness in (1.0, 0.5))
+    alone = TileDeconvolution(tile_grid(100, 150, 64, 16), np.repeat(across[None], len(known), 0), 16).powers
+    gain_known, gain_uncertain = (float((powers - alone).clip(0).sum()) for powers in (known, uncertain))
+    assert 0 < gain_uncertain < 0.2 * gain_known

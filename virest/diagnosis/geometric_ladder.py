@@ -175,9 +175,7 @@ def _left_open(course: SearchContext, verdict: GeometricVerdict) -> dict[str, Ar
         return {}
     tried = {entry.name for entry in verdict.accepted}
     further = [candidate for candidate in course.candidates(verdict.model, tried) if candidate.added]
-    return variance_left_open(
-        course.evidence, verdict.model, effects, further, GeometricEffect.total_change, is_plausible, course.each
-    )  # fmt: skip
+    return variance_left_open(course.evidence, verdict.model, effects, further, is_plausible, course.each)
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,6 @@ from virest.inference.track_fit import TrackFit
 Array = NDArray[np.float64]
 ASIDE = 3.0
 """Standard deviations on either side at which the model's own fit begins again."""
-Change = Callable[[GeometricEffect, CameraProfile, CameraProfile], Array]
 Plausible = Callable[[Evidence, GeometricEffect, CameraProfile, Array], bool]
 
 
@@ -34,14 +33,12 @@ def variance_left_open(
     model: Model,
     effects: Sequence[GeometricEffect],
     further: Sequence[Candidate],
-    change: Change,
     plausible: Plausible,
     each: ParallelMap,
 ) -> dict[str, Array]:
     """Variance (k,) by which the values of effects in a model depend on causes that are not, by the effects' names.
 
-    further: causes that may be added, at all places where their fits may begin.  change: values of an effect between
-    two profiles.  plausible: whether a phone can be so.
+    further: causes that may be added, at all places where their fits may begin.  plausible: whether a phone can be so.
     """
     table = evidence.table(model, SCREEN_POINTS)
     base = fit_model(evidence.imu, model, model.terms, table)
@@ -55,9 +52,9 @@ def variance_left_open(
         effect, name = candidate.effect, candidate.name
         if effect is None or fitted.cost >= best.get(name, base).cost:
             continue
-        if plausible(evidence, effect, fitted.profile, change(effect, model.profile, fitted.profile)):
+        if plausible(evidence, effect, fitted.profile, effect.total_change(model.profile, fitted.profile)):
             best[name] = fitted
-    return {effect.name: _spread(base, others, list(best.values()), effect, change) for effect in effects}
+    return {effect.name: _spread(base, others, list(best.values()), effect) for effect in effects}
 
 
 def _aside(model: Model, effects: Sequence[GeometricEffect], fitted: TrackFit) -> list[Model]:
@@ -79,13 +76,11 @@ def _moved(model: Model, fitted: TrackFit, step: Array) -> Model:
     return replace(model, profile=profile)
 
 
-def _spread(
-    base: TrackFit, others: Sequence[TrackFit], wider: Sequence[TrackFit], effect: GeometricEffect, change: Change
-) -> Array:
+def _spread(base: TrackFit, others: Sequence[TrackFit], wider: Sequence[TrackFit], effect: GeometricEffect) -> Array:
     """Variance (k,): the widest of the model's own ends, and what each further cause adds to it."""
-    own = [change(effect, base.profile, other.profile) ** 2 for other in others]
+    own = [effect.total_change(base.profile, other.profile) ** 2 for other in others]
     freedom = [np.maximum(_variance(other, effect) - _variance(base, effect), 0.0) for other in wider]
-    moved = [change(effect, base.profile, other.profile) ** 2 for other in wider]
+    moved = [effect.total_change(base.profile, other.profile) ** 2 for other in wider]
     excess = [np.maximum(shift - free, 0.0) for shift, free in zip(moved, freedom, strict=True)]
     nothing = np.zeros(len(_variance(base, effect)))
     return np.asarray(np.max([nothing, *own], axis=0) + np.sum([nothing, *excess], axis=0))

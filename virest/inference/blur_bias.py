@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 UNSURE = 0.35
 """Standard deviation of e as a part of it: of how unlike textures are."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
-"""Frequencies that are summed, up to so many cycles per pixel; beyond lies what pixels average out."""
+"""Highest frequency summed, cycles per pixel; pixels average out what lies beyond."""
 NODES = 15
 """Of the quadrature along a path: e is exact to 1 % up to 8 px of blur in both directions, and to 25 % up to 12 px."""
 MOST_PX = 0.3

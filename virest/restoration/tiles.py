@@ -95,8 +95,10 @@ class TileDeconvolution:
             self.powers += variance(self.size)
         self._joined: list[Image] = []
         """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra of each channel."""
-        self._together: Image = self.kernels
-        """Σ w K_k with the picture's own, (tiles, size, size); once pictures are joined, how sure their sum is."""
+        self._kernel_sums: Image | None = None
+        """Σ w K_k with the picture's own, (tiles, size, size), while pictures are being joined."""
+        self._evidence: Image | None = None
+        """Weight of the data term, (tiles, size, size) real factors; None: 1."""
         self._without_highlights: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
         self._rest: dict[int, Image] = {}
@@ -125,8 +127,9 @@ class TileDeconvolution:
             np.multiply(_inner_numbers(spectrum), _inner_numbers(self.kernels[number]), out=inner)
             ends[number] = _ends(spectrum)
         _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
+        if self._evidence is not None:
+            projected *= self._evidence
         if self._joined:
-            projected *= self._together
             projected += self._joined[number_joined]
         return projected
 
@@ -147,9 +150,9 @@ class TileDeconvolution:
         0 to 1; where it is little there stands in place of the picture what ``alone`` would be in it, which says
         nothing new.
         """
-        if not self._joined:
+        if self._kernel_sums is None:
             self._joined = [np.zeros_like(self.kernels) for _ in channels]
-            self._together = self.kernels.copy()
+            self._kernel_sums = self.kernels.copy()
         padded, trusted = [self.padded(channel) for channel in channels], self.padded(trust)
         corners, patch = list(self.grid.corners()), self.patch
         parts = [trusted[top : top + patch, left : left + patch] for top, left in corners]
@@ -175,7 +178,7 @@ class TileDeconvolution:
                 _ends(back)[:] = _ends_product(np.array(_ends(spectrum)), np.array(_ends(kernel)))
                 cv2.accumulateProduct(back, factor, joined[number])
             cv2.accumulateProduct(one, weight, self.powers[number])
-            cv2.accumulateProduct(kernel, factor, self._together[number])
+            cv2.accumulateProduct(kernel, factor, self._kernel_sums[number])
 
     def share_noise(self) -> None:
         """Once all are joined: what neighbours add counts as the noise that they may share allows.
@@ -184,14 +187,15 @@ class TileDeconvolution:
         independent noise makes Σ w |K|² N: that is no less along different paths, and along one path nothing is gained.
         The data term weighs by the ratio of both, at most 1.
         """
-        one = np.empty((self.size, self.size), np.float32)
-        for number, together in enumerate(self._together if self._joined else ()):
-            _power_inside(together, one)
-            _power_at_ends(together[None], one[None])
-            power = self.powers[number]
-            np.divide(power, np.maximum(cv2.max(one, power), LEAST_RATIO), out=together)
+        if self._kernel_sums is None:
+            return
+        common, self._evidence, self._kernel_sums = np.empty_like(self._tile), self._kernel_sums, None
+        for number, (total, power) in enumerate(zip(self._evidence, self.powers, strict=True)):
+            _power_inside(total, common)
+            _power_at_ends(total[None], common[None])
+            weight = np.divide(power, np.maximum(cv2.max(common, power), LEAST_RATIO), out=total)
             for spectra in (self.powers, *self._joined):
-                spectra[number] *= together
+                spectra[number] *= weight
 
     def alone(self, channels: Sequence[Image], ratio: Image) -> SharpTiles:
         """The tiles of the picture by itself, made sharp by the linear filter with N / S ``ratio``, as asked for.

@@ -19,7 +19,7 @@ from virest.image_formation.point_model import seen_s
 
 Array = NDArray[np.float64]
 CHANCE = 1e-4
-"""That any pair of a capture grows so much by chance."""
+"""Family-wise false-alarm rate: of any pair of a capture growing this much by chance."""
 LEAST_POINTS, LEAST_PAIRS = 8, 15
 INSTANTS, REACH = 49, 1.5
 """Instants that are tried, over this many frames before and after."""

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 OWN_ERROR = 0.01
 """Part of the signal that differs in any two frames: the tone curve acts on each one's own blur."""
 MOST_DIFFERENT = 4.0
-"""A neighbour that differs in half of all places by so many times what noise explains is not used.  Right ones were
+"""A neighbour whose median difference is this many times what noise explains is not used.  Right ones were
 seen to differ by 0.05 to 0.9 times that (3 at 0.08 bits a pixel), pictures of other places by 5 to 1500."""
 LEAST_TRUST = 0.25
 """Where a neighbour weighs less it is not used."""

@@ -1,0 +1,87 @@
+"""How sure it is where a neighbour's picture lies: the field of its tiles' shifts, and what bends near relief."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from virest.restoration.neighbours.joint import _lasting_px, _trust
+from virest.restoration.neighbours.registration import AROUND, TILE, WIDE, TileAgreement, _wide_spectra
+
+SPACING_PX = 64.0
+CENTRES_PX = np.stack(np.meshgrid(np.arange(12), np.arange(9)), axis=-1).reshape(-1, 2) * SPACING_PX
+
+
+def test_shifts_that_scatter_alone_are_no_error_of_the_field(rng: np.random.Generator) -> None:
+    """Noise of tiles side by side is independent: no more of it is taken for the field's than chance makes."""
+    lasting = [_lasting_px(CENTRES_PX, rng.normal(0, 0.2, CENTRES_PX.shape), 0.2, SPACING_PX) for _ in range(200)]
+    assert np.mean(np.square(lasting)) < 0.05 * 0.2**2
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.1])
+def test_a_smooth_rest_is_an_error_of_the_field(rng: np.random.Generator, noise_px: float) -> None:
+    """A rest that changes slowly over the picture comes back as its deviation on each axis, under noise too."""
+    waves = 0.2 * np.sin(2 * np.pi * CENTRES_PX / (9 * SPACING_PX))
+    off = waves + rng.normal(0, noise_px, waves.shape)
+    typical = float(np.median(np.linalg.norm(off, axis=1)) / 1.1774)
+    expected = float(np.sqrt(np.mean(waves**2)))
+    assert _lasting_px(CENTRES_PX, off, typical, SPACING_PX) == pytest.approx(expected, rel=0.25)
+
+
+def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:
+    """Two frames of one texture, three by four tiles; in one the neighbour shows what the frame has so far on."""
+    height, width = 3 * TILE, 4 * TILE
+    spectrum = np.fft.fft2(rng.normal(size=(height + 2 * AROUND, width + 2 * AROUND)))
+    fy, fx = np.meshgrid(np.fft.fftfreq(spectrum.shape[0]), np.fft.fftfreq(spectrum.shape[1]), indexing="ij")
+    smooth = spectrum * np.exp(-((np.hypot(fx, fy) / 0.08) ** 2))
+
+    def picture(shift_px: float) -> np.ndarray:
+        found = np.fft.ifft2(smooth * np.exp(2j * np.pi * fx * shift_px)).real
+        return (1 + 0.3 * found / found.std()).astype(np.float32)[AROUND:-AROUND, AROUND:-AROUND]
+
+    here, moved = picture(0.0), picture(near_shift_px)
+    tops_lefts = np.stack(np.meshgrid(np.arange(3), np.arange(4), indexing="ij"), axis=-1).reshape(-1, 2) * TILE
+    spectra = _wide_spectra(here, tops_lefts)
+    shift = np.zeros((len(tops_lefts), 2))
+    relief = 5
+    shift[relief, 0] = near_shift_px
+    there = np.stack([
+        (moved if k == relief else here)[top : top + TILE, left : left + TILE]
+        for k, (top, left) in enumerate(tops_lefts)
+    ])  # fmt: skip
+    there += rng.normal(0, 1e-3, there.shape).astype(np.float32)
+    return TileAgreement(
+        tops_lefts,
+        tops_lefts[:, ::-1] + (TILE - 1) / 2,
+        shift,
+        np.ones(len(shift)),
+        spectra,
+        there,
+        np.full(len(shift), 0.09),
+        1.0,
+        1.0,
+        np.zeros((height, width), bool),
+        4,
+        np.ones((WIDE, WIDE // 2 + 1)),
+        1,
+    )
+
+
+def test_relief_that_lies_elsewhere_weighs_little(rng: np.random.Generator) -> None:
+    """A tile that fits only where its own shift puts it bends the picture: it weighs little, the rest as before."""
+    agreement = _agreement(1.0, rng)
+    trust = _trust(agreement, np.zeros_like(agreement.shift_px), 0.02, 1e-4)
+    near = trust[TILE + 16 : 2 * TILE - 16, TILE + 16 : 2 * TILE - 16]
+    far = trust[:, 3 * TILE + 16 : -16]
+    assert far.mean() > 0.9
+    assert near.mean() < 0.5 * far.mean()
+
+
+def test_a_shift_that_noise_explains_costs_no_weight(rng: np.random.Generator) -> None:
+    """Where shifts scatter as much anyway, a tile's own is no sign of relief."""
+    agreement = _agreement(0.05, rng)
+    field = np.zeros_like(agreement.shift_px)
+    uncertain, certain = (_trust(agreement, field, noise_px, 1e-4) for noise_px in (0.1, 0.0))
+    near = np.s_[TILE + 16 : 2 * TILE - 16, TILE + 16 : 2 * TILE - 16]
+    assert uncertain[near].mean() > certain[near].mean()
+    assert uncertain[near].mean() > 0.9
