@@ -5,12 +5,13 @@
 #   make lint     ruff and mypy
 #   make readme   run what README and docs show and write its output into them; ARGS="--list" lists the blocks
 #   make docs     the documentation as a site in site/, with the manual page virest.1; make figures draws its pictures anew
+#   make mutants  small faults in the code that no fast test notices; ARGS="--rooms diagnosis --count 20"
 #   make sample   write sample_data/ anew
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: demo test bench lint readme docs figures sample clean
+.PHONY: demo test bench lint readme docs figures mutants sample clean
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   := .venv
@@ -53,6 +54,10 @@ figures: $(READY)
 		--width 640 --height 480 --response five_segment --overwrite --quiet
 	$(BIN)/virest calibrate-curve demo-out/bracket --out demo-out/curve.yaml --plot docs/images/curve.png --overwrite
 	rm -rf demo-out/bracket demo-out/curve.yaml
+
+mutants: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[mutation]'
+	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python tests/mutants.py $(ARGS)
 
 sample: $(READY)
 	$(BIN)/python -m virest.app.sample sample_data

@@ -3,11 +3,12 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fork_server import ForkServer
 
 ROOT = Path(__file__).resolve().parent.parent
 RunVirest = Callable[..., subprocess.CompletedProcess[str]]
@@ -28,17 +29,26 @@ def realdata() -> Path:
 
 
 @pytest.fixture(scope="session")
-def virest() -> RunVirest:
-    """The program as its users run it: ``virest("process", folder)`` gives returncode, stdout, stderr."""
+def virest() -> Iterator[RunVirest]:
+    """The program as its users run it: ``virest("process", folder)`` gives returncode, stdout, stderr.
 
-    def run(*arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 1200, **environment: str):
-        return subprocess.run(
-            [sys.executable, "-m", "virest", *map(str, arguments)],
-            cwd=cwd, input=stdin, capture_output=True, text=True, timeout=timeout, check=False,
-            env={**os.environ, **environment},
-        )  # fmt: skip
+    Forked from a process that has imported it already, where that can be; with variables of its own it is started anew.
+    """
+    with ForkServer() as server:
 
-    return run
+        def run(
+            *arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 1200, **environment: str
+        ):
+            words = [*map(str, arguments)]
+            if hasattr(os, "fork") and not environment:
+                return server.run(words, cwd, stdin, timeout)
+            return subprocess.run(
+                [sys.executable, "-m", "virest", *words],
+                cwd=cwd, input=stdin, capture_output=True, text=True, timeout=timeout, check=False,
+                env={**os.environ, **environment},
+            )  # fmt: skip
+
+        yield run
 
 
 @pytest.fixture
