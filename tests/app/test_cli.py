@@ -28,12 +28,14 @@ def below(folder: Path) -> set[str]:
 
 
 def content(run: Path) -> dict[str, Any]:
-    """Everything in a run's folder, without what a clock or the command line decides."""
+    """Everything in a run's folder, without what a clock, the command line or the capture's place decides."""
     found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
     lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
     found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
     account = json.loads(found["run.json"])
-    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
+    for file in account["inputs"]:
+        del file["path"]
+    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command", "source")}
     return found
 
 
@@ -390,8 +392,18 @@ sys.exit(run(sys.argv[1:]))
 """
 
 
+@pytest.fixture(scope="session")
+def undisturbed(virest: Virest, _tiny_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What a run of ``tiny`` leaves that straightens it from beginning to end."""
+    capture = shutil.copytree(_tiny_capture, tmp_path_factory.mktemp("undisturbed") / "tiny")
+    assert virest("process", "tiny", "--jobs", "1", "--deblur", "none", cwd=capture.parent).returncode == 0
+    return content(capture.parent / "virest-out/tiny")
+
+
 @pytest.mark.parametrize(("code", "after"), [("ENOSPC", 0), ("ENOSPC", 3), ("EDQUOT", 13), ("EROFS", 0)])
-def test_a_disk_that_takes_no_more(virest: Virest, tiny: Path, code: str, after: int) -> None:
+def test_a_disk_that_takes_no_more(
+    virest: Virest, tiny: Path, undisturbed: dict[str, Any], code: str, after: int
+) -> None:
     """Full, over quota, read-only: exit 8, one line, no half-written file, and --resume goes on afterwards."""
     arguments = ["process", str(tiny), "--out", str(tiny.parent / "out"), "--jobs", "1", "--deblur", "none"]
     command = [sys.executable, "-c", INJECTED.format(code=code, after=after), *arguments]
@@ -401,9 +413,7 @@ def test_a_disk_that_takes_no_more(virest: Virest, tiny: Path, code: str, after:
     if after < 10:
         assert not (tiny.parent / "out/tiny").exists()
     assert virest(*arguments, "--resume").returncode == 0
-    undisturbed = [*arguments[:3], str(tiny.parent / "again"), *arguments[4:]]
-    assert virest(*undisturbed).returncode == 0
-    assert content(tiny.parent / "out/tiny") == content(tiny.parent / "again/tiny")
+    assert content(tiny.parent / "out/tiny") == undisturbed
 
 
 @pytest.mark.parametrize(
@@ -529,22 +539,32 @@ ITERATIONS = 150
 """A fifth of a second for each frame of ``swing``: a run is still at work when it is stopped."""
 
 
-@pytest.fixture
-def slow(tmp_path: Path) -> tuple[object, ...]:
+@pytest.fixture(scope="module")
+def slow(tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
     """Arguments that make a run slow."""
-    file = tmp_path / "slow.yaml"
+    file = tmp_path_factory.mktemp("slow") / "slow.yaml"
     file.write_text(f"virest_settings: 1\niterations: {ITERATIONS}\nneighbours: 0\n")
     return ("--settings", file)
 
 
+@pytest.fixture(scope="module")
+def undisturbed_swing(
+    virest: Virest, swing: Path, slow: tuple[object, ...], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    """What an undisturbed run of ``swing`` leaves, by one process."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    assert virest("process", swing, *slow, "--jobs", 1, "--out", out).returncode == 0
+    return content(out / "swing")
+
+
 @pytest.mark.scenario
-@pytest.mark.parametrize("jobs", [1, 2])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("number", "jobs"), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)])
 def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
     virest: Virest,
     start: Callable[..., Any],
     swing: Path,
     slow: tuple[object, ...],
+    undisturbed_swing: dict[str, Any],
     tmp_path: Path,
     jobs: int,
     number: signal.Signals,
@@ -560,8 +580,7 @@ def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
     assert "Traceback" not in errors
     assert not [name for name in below(tmp_path / "out") if name.endswith((".part", ".lock", "run.json"))]
     assert virest(*arguments, tmp_path / "out", "--resume").returncode == 0
-    assert virest(*arguments, tmp_path / "undisturbed").returncode == 0
-    assert content(tmp_path / "out/swing") == content(tmp_path / "undisturbed/swing")
+    assert content(tmp_path / "out/swing") == undisturbed_swing
 
 
 @pytest.mark.scenario
@@ -589,11 +608,11 @@ def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
 @pytest.mark.scenario
 @pytest.mark.parametrize("preset", ["fast", "balanced", "best"])
 def test_the_bytes_do_not_depend_on_the_number_of_jobs(virest: Virest, tiny: Path, tmp_path: Path, preset: str) -> None:
-    """One process, two, three: the same files."""
-    for jobs in (1, 2, 3):
+    """One process and three: the same files."""
+    for jobs in (1, 3):
         result = virest("process", tiny, "--out", tmp_path / str(jobs), "--preset", preset, "--jobs", jobs)
         assert result.returncode == 0, result.stderr
-    assert content(tmp_path / "1/tiny") == content(tmp_path / "2/tiny") == content(tmp_path / "3/tiny")
+    assert content(tmp_path / "1/tiny") == content(tmp_path / "3/tiny")
 
 
 @pytest.mark.scenario

@@ -48,7 +48,9 @@ def run_dying(step: int, tiny: Path, out: Path, *options: str) -> "subprocess.Co
 
 
 @pytest.mark.scenario
-def test_killed_before_any_change_of_the_folder_resume_ends_the_same(tiny: Path, tmp_path: Path) -> None:
+def test_killed_before_any_change_of_the_folder_resume_ends_the_same(
+    virest: Virest, tiny: Path, tmp_path: Path
+) -> None:
     """Steps drawn from all: making folders, opening parts, renaming them, the end's clearing away."""
     done = run_dying(0, tiny, tmp_path / "undisturbed")
     assert done.returncode == 0, done.stderr
@@ -58,7 +60,7 @@ def test_killed_before_any_change_of_the_folder_resume_ends_the_same(tiny: Path,
     for step in {last, *random.Random(42).sample(range(1, steps + 1), min(KILLS, steps))}:
         out = tmp_path / f"killed-{step}"
         assert run_dying(step, tiny, out).returncode == -signal.SIGKILL
-        again = run_dying(0, tiny, out, "--resume")
+        again = virest("process", tiny, "--out", out, "--preset", "fast", "--jobs", "1", "-q", "--resume")
         assert again.returncode == 0, (step, again.stderr)
         assert content(out / "tiny") == expected, step
         assert sorted(p.name for p in out.iterdir()) == ["tiny"]
