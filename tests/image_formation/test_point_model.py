@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from virest.calibration.geometry import right_way_round
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
-from virest.image_formation.point_model import ground, predict, seen_s, with_profile
+from virest.image_formation.point_model import ground, predict, pulse_delay_s, seen_s, with_profile
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import Term
 from virest.motion.integration import integrate_gyro
@@ -106,6 +106,31 @@ def test_parallax_of_a_direction_lies_along_what_travel_does() -> None:
     assert np.abs(across).max() < 0.02
     # c₁ − c₂ points back along the travel
     assert ((moved * unit).sum(axis=1) < 0.01).all()
+
+
+@pytest.mark.parametrize("setup", NEAR.values(), ids=NEAR)
+def test_the_way_of_parallax_is_the_same_with_slopes_and_without(setup: Setup) -> None:
+    """By a difference quotient or by the lens's slope: pixels per inverse depth along what the camera travels."""
+    recording, table = recorded(setup), recorded(setup).table()
+    known, scene = ground(recording.imu, recording.profile, translation=True), recording.scene(table)
+    quick, exact = (predict(known, table, scene, slopes=slopes).along_px for slopes in (False, True))
+    assert quick is not None
+    assert exact is not None
+    np.testing.assert_allclose(quick, exact, atol=1e-3 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("exposure_s", [0.0005, 0.004, 0.013])
+def test_pulsing_lamps_move_the_mean_time_of_the_light(exposure_s: float) -> None:
+    """Against the integral of the light over the exposure."""
+    profile = recorded(Setup()).profile
+    pulsing = replace(profile.extensions, flicker_amplitude=0.6, flicker_frequency_hz=100.0, flicker_phase_rad=0.4)
+    profile = replace(profile, extensions=pulsing)
+    middle_s = np.linspace(0.3, 0.33, 7)
+    around_s = (np.arange(20_000) + 0.5) / 20_000 * exposure_s - 0.5 * exposure_s
+    light = 1 + 0.6 * np.sin(2 * np.pi * 100.0 * (middle_s[:, None] + around_s) + 0.4)
+    expected_s = (light * around_s).sum(axis=1) / light.sum(axis=1)
+    found_s = pulse_delay_s(profile, middle_s, np.full(7, exposure_s))
+    np.testing.assert_allclose(found_s, expected_s, atol=1e-6 * exposure_s)
 
 
 # ── the gyroscope's part ─────────────────────────────────────────────────────────────────────────────────────────

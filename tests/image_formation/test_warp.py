@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.camera.shutter import READOUT_DIRECTIONS
+from virest.image_formation.neighbour import turn_jacobian_px
 from virest.image_formation.row_motion import FrameTranslation, row_motion
 from virest.image_formation.warp import (
     corner_points,
@@ -209,3 +210,19 @@ def test_the_stabiliser_holds_the_picture() -> None:
     free, kept = (moved_between(m, centre, m.start_s, m.start_s + 0.02) - centre for m in (motion, held))
     assert np.abs(free).max() > 3
     np.testing.assert_allclose(kept, 0, atol=0.02)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_turn_jacobian_is_that_of_turned_rays(lens: tuple[str, tuple[float, ...]]) -> None:
+    """x' = exp(angle) x, by exact rotations to both sides; of a lens with its distortion."""
+    camera = TurningCamera(phone(lens=lens))
+    motion = row_motion(camera.trajectory, camera.profile, 0.1, 0.012)
+    points = _points()
+    found = turn_jacobian_px(motion, points)
+    assert found.shape == (len(points), 2, 3)
+    rays = motion.optics.rays(points, motion.reference_s)
+    for axis, turn in enumerate(1e-4 * np.eye(3)):
+        there, back = (
+            motion.optics.project(Rotation.from_rotvec(way * turn).apply(rays), motion.reference_s) for way in (1, -1)
+        )
+        np.testing.assert_allclose(found[..., axis], (there - back) / 2e-4, atol=1e-3 * np.abs(found).max())
