@@ -84,14 +84,8 @@ def become(arguments: list[str], cwd: str, streams: list[str]) -> None:
         setattr(sys, name, stream)
         setattr(sys, f"__{name}__", stream)
     sys.argv = ["virest", *arguments]
-    code: object = 0
-    try:
-        runpy.run_module("virest", run_name="__main__", alter_sys=True)
-    except SystemExit as end:
-        code = end.code
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code if isinstance(code, int) else int(code is not None))
+    runpy.run_module("virest", run_name="__main__", alter_sys=True)
+    sys.exit()
 
 
 if __name__ == "__main__":

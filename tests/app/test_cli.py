@@ -28,14 +28,12 @@ def below(folder: Path) -> set[str]:
 
 
 def content(run: Path) -> dict[str, Any]:
-    """Everything in a run's folder, without what a clock, the command line or the capture's place decides."""
+    """Everything in a run's folder, OUT/NAME, without what a clock, the command line or the place of OUT decides."""
     found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
     lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
     found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
-    account = json.loads(found["run.json"])
-    for file in account["inputs"]:
-        del file["path"]
-    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command", "source")}
+    account = json.loads(found["run.json"].decode().replace(str(run.parent.parent), "."))
+    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
     return found
 
 
@@ -395,9 +393,11 @@ sys.exit(run(sys.argv[1:]))
 @pytest.fixture(scope="session")
 def undisturbed(virest: Virest, _tiny_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What a run of ``tiny`` leaves that straightens it from beginning to end."""
-    capture = shutil.copytree(_tiny_capture, tmp_path_factory.mktemp("undisturbed") / "tiny")
-    assert virest("process", "tiny", "--jobs", "1", "--deblur", "none", cwd=capture.parent).returncode == 0
-    return content(capture.parent / "virest-out/tiny")
+    folder = tmp_path_factory.mktemp("undisturbed")
+    capture = shutil.copytree(_tiny_capture, folder / "tiny")
+    options = ("--out", folder / "out", "--jobs", "1", "--deblur", "none")
+    assert virest("process", capture, *options).returncode == 0
+    return content(folder / "out/tiny")
 
 
 @pytest.mark.parametrize(("code", "after"), [("ENOSPC", 0), ("ENOSPC", 3), ("EDQUOT", 13), ("EROFS", 0)])
