@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,7 @@ from virest.calibration.response_curve import curve_distance_levels
 from virest.camera.profile import parse_profile
 from virest.camera.response import ResponseCurve
 
-
-def virest(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the program."""
-    command = [sys.executable, "-m", "virest", *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600, check=False)
+Virest = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def write_bracket(folder: Path, curve: ResponseCurve, wrong: dict[int, float] | None = None) -> Path:
@@ -40,7 +36,7 @@ def write_bracket(folder: Path, curve: ResponseCurve, wrong: dict[int, float] | 
     return table
 
 
-def test_a_bracket_becomes_a_block_for_the_profile(tmp_path: Path) -> None:
+def test_a_bracket_becomes_a_block_for_the_profile(virest: Virest, tmp_path: Path) -> None:
     """JSON as the contract has it, a YAML block that a profile takes, and a figure; nothing else is left behind."""
     table = write_bracket(tmp_path / "bracket", FIVE, {2: 1.5})
     done = virest("calibrate-curve", "bracket", "--exposures", table, "--out", "c.yaml", "--plot", "c.png", "--json",
@@ -61,7 +57,7 @@ def test_a_bracket_becomes_a_block_for_the_profile(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bracket", "c.png", "c.yaml"]
 
 
-def test_people_read_a_table(tmp_path: Path) -> None:
+def test_people_read_a_table(virest: Virest, tmp_path: Path) -> None:
     """Each picture with its exposure, its error and the verdict; curve.yaml unless named."""
     table = write_bracket(tmp_path / "bracket", SRGB)
     done = virest("calibrate-curve", "bracket", "--exposures", table, "--kind", "srgb", cwd=tmp_path)
@@ -73,7 +69,7 @@ def test_people_read_a_table(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-def test_refusals_are_one_line_with_their_code(tmp_path: Path) -> None:
+def test_refusals_are_one_line_with_their_code(virest: Virest, tmp_path: Path) -> None:
     """Nothing is written, nothing is printed but the line."""
     table = write_bracket(tmp_path / "bracket", SRGB)
     rows = table.read_text().splitlines()
@@ -120,7 +116,7 @@ def test_a_still_capture_under_auto_exposure_gives_the_curve(
     assert not any(p["contradicts"] for p in facts["pictures"])
 
 
-def test_a_capture_whose_exposure_stays_is_refused(tmp_path: Path) -> None:
+def test_a_capture_whose_exposure_stays_is_refused(virest: Virest, tmp_path: Path) -> None:
     """Exit 6: one exposure says nothing of the curve."""
     simulate_command(tmp_path / "trip", width=160, height=120, frames=6, rate_rad_s=0.0)
     done = virest("calibrate-curve", "trip", cwd=tmp_path)
@@ -129,7 +125,7 @@ def test_a_capture_whose_exposure_stays_is_refused(tmp_path: Path) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_brackets_that_determine_nothing_leave_by_6(tmp_path: Path) -> None:
+def test_brackets_that_determine_nothing_leave_by_6(virest: Virest, tmp_path: Path) -> None:
     """A folder of one picture, pictures all clipped, and two exposures too far apart to overlap."""
     light = np.random.default_rng(8).uniform(0.0, 1.0, (90, 120, 1)).repeat(3, axis=2) ** 2 * 200 + 20
     scene = cv2.GaussianBlur(light, (0, 0), 3)
