@@ -14,9 +14,24 @@ ROOT = Path(__file__).resolve().parent.parent
 RunVirest = Callable[..., subprocess.CompletedProcess[str]]
 
 
+SHARING = {"calibrate_command", "calibrate_stories", "cluster", "evaluate_command", "evaluate_slam", "export_command",
+           "export_scenes", "guided_tracking", "local_blur", "log_against_truth", "neighbours", "restoration_gain",
+           "run_folder", "translation"}  # fmt: skip
+"""Files whose tests share captures that take seconds to simulate: each file runs in one process."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the fast tests first, then the scenarios."""
-    items.sort(key=lambda item: item.get_closest_marker("scenario") is not None)
+    """Run the fast tests first, then the scenarios, the whole stories before single tests of the program."""
+
+    def order(item: pytest.Item) -> tuple[bool, bool]:
+        return item.get_closest_marker("scenario") is not None, item.path.parent.name != "scenarios"
+
+    items.sort(key=order)
+    for item in items:
+        name = item.path.stem.removeprefix("test_")
+        if name in SHARING:
+            kind = "scenarios" if item.get_closest_marker("scenario") else "fast"
+            item.add_marker(pytest.mark.xdist_group(f"{name} {kind}"))
 
 
 @pytest.fixture(scope="session")

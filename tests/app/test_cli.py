@@ -535,8 +535,8 @@ def test_inspect_prints_what_it_can(virest: Virest, tiny: Path, *, as_json: bool
 
 # ── being stopped ────────────────────────────────────────────────────────────────────────────────────────────────
 
-ITERATIONS = 150
-"""A fifth of a second for each frame of ``swing``: a run is still at work when it is stopped."""
+ITERATIONS = 80
+"""A tenth of a second for each frame of ``swing``: a run is still at work when it is stopped."""
 
 
 @pytest.fixture(scope="module")
