@@ -1,0 +1,38 @@
+"""The small fits inside the searches: sines of unequal weights, growth beside a shift, what was not found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from virest.diagnosis.field.sudden import _growth
+from virest.diagnosis.photometry_effects import _sines
+from virest.diagnosis.refit_photometry import _exposure_variance
+
+
+def test_a_sine_under_unequal_weights_is_found_with_its_phase(rng: np.random.Generator) -> None:
+    """Patches of levels of their own that are seen at few, crowded instants: sine and cosine are not orthogonal."""
+    patch = np.repeat(np.arange(40), 12)
+    time_s = rng.uniform(0, 0.013, patch.size)
+    stiffness = rng.uniform(0.1, 10.0, patch.size)
+    level = rng.normal(0, 0.3, 40)[patch]
+    frequency = np.arange(90.0, 110.0, 2.0)
+    angle = 2 * np.pi * 100.0 * time_s
+    values = level + 0.2 * np.sin(angle) - 0.1 * np.cos(angle)
+    fit, power = _sines(patch, values, stiffness, time_s, frequency)
+    assert frequency[np.argmax(power)] == 100.0
+    np.testing.assert_allclose(fit[5], (0.2, -0.1), atol=1e-6)
+
+
+@pytest.mark.parametrize("growth", [0.02, -0.01])
+def test_growth_is_told_from_a_shift_and_from_points_that_went_astray(rng: np.random.Generator, growth: float) -> None:
+    """A tenth of the points went elsewhere."""
+    arm = rng.uniform(-300, 300, (200, 2))
+    off = growth * arm + (3.0, -2.0) + rng.normal(0, 0.1, arm.shape)
+    off[:20] += rng.normal(0, 30, (20, 2))
+    assert _growth(arm, off) == pytest.approx(growth, abs=2e-4)
+
+
+def test_an_exposure_that_was_not_found_adds_nothing() -> None:
+    """No cause, no variance."""
+    assert _exposure_variance([]) == 0.0
