@@ -14,7 +14,8 @@ from motion.synthetic_motion import R_CAM_IMU, Setup, Synthetic, hand_motion, ma
 from virest.camera.profile import CameraProfile, read_profile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.inference.alignment import Agreement, OffsetEstimate, check_agreement, choose_pairs, estimate_time_offset
+from virest.inference.alignment import Agreement, OffsetEstimate, check_agreement, estimate_time_offset
+from virest.inference.frame_selection import choose_pairs
 from virest.inference.tracking import TrackPair, track_pairs
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")

@@ -25,10 +25,10 @@ from virest.inference.alignment import (
     MIN_EXPLAINED,
     OffsetEstimate,
     check_agreement,
-    choose_pairs,
     estimate_time_offset,
 )
 from virest.inference.coarse_alignment import align_coarsely
+from virest.inference.frame_selection import choose_pairs
 from virest.inference.guide_choice import find_guide
 from virest.inference.observed_tracks import GUESSED_FOCAL, observe_tracks
 from virest.inference.tracking import TrackPair, track_pairs
