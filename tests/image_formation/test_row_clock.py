@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from virest.inference.point_fit import point_table
 
 from virest.camera.field import Field
 from virest.camera.intrinsics import Intrinsics
@@ -15,7 +16,6 @@ from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import seen_s
 from virest.image_formation.row_clock import RowClock
 from virest.image_formation.row_motion import frame_times_s, row_motion
-from virest.inference.point_fit import point_table
 from virest.inference.tracking import TrackPair
 from virest.motion.integration import integrate_gyro
 

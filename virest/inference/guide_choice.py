@@ -23,9 +23,9 @@ from virest.camera.profile import CameraProfile
 from virest.capture.join import median_period_s
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_clock import RowClock, row_time_s
-from virest.inference.frame_selection import choose_pairs
 from virest.inference.coarse_alignment import axis_maps
 from virest.inference.frame_rotations import gyro_turns
+from virest.inference.frame_selection import choose_pairs
 from virest.inference.guidance import GyroGuide, gyro_guide
 from virest.inference.observed_tracks import frame_times
 from virest.inference.parallel import ParallelMap, one_by_one

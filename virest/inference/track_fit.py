@@ -51,6 +51,8 @@ NOT_AT_ALL = (0.0, 0.0)
 ALMOST_NOTHING = 1e-9
 ANY_DEPTH = 1e6
 """Spread of inverse depths that leaves a point free to lie anywhere along its parallax."""
+ONE_DIRECTION = 1.15
+"""One direction of travel for the whole capture stays if it leaves less than this many times what one a pair leaves."""
 SPREAD_PASSES, SPREAD_TOLERANCE = 3, 0.2
 """The spread of depths is measured anew after each descent until it changes by less than this part."""
 
@@ -626,6 +628,13 @@ def one_direction() -> DirectedMotion:
 def many_directions(table: TrackTable) -> DirectedMotion:
     """A direction for each pair, to be found."""
     return DirectedMotion(np.zeros((table.n_pairs, 3)))
+
+
+def fit_directed(imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: Sequence[Term]) -> TrackFit:
+    """Fit across the parallax of one direction of travel where that explains the points, else of one for each pair."""
+    many = fit_tracks(imu, table, profile, terms, many_directions(table))
+    one = fit_tracks(imu, table, profile, terms, one_direction())
+    return one if one.scale < ONE_DIRECTION * many.scale else many
 
 
 def _directed(table: TrackTable, at: Prediction, motion: DirectedMotion) -> tuple[Prediction, DirectedMotion]:
