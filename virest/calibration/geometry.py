@@ -31,7 +31,7 @@ from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
-from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, many_directions, start_scene
+from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
 from virest.motion.displacement import drift_std_m
@@ -170,7 +170,7 @@ def calibrate_geometry(
     left_out = 0.0
     for _ in range(ASTRAY_PASSES):
         table = observed.table(MANY_POINTS)
-        fit = fit_tracks(capture.imu, table, rough.profile, wanted, _for_table(rough.scene, table))
+        fit = fit_tracks(capture.imu, table, rough.profile, wanted, for_table(rough.scene, table))
         observed, astray = observed.without_astray(table.first_px, fit.distance)
         left_out += (1 - left_out) * astray
         if not astray:
@@ -221,13 +221,6 @@ def _with_lag(found: GeometryCalibration, lag: StartUpLag) -> GeometryCalibratio
     extensions = replace(found.profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
     value = CalibratedValue("lag_s", 0.0, lag.lag_s, None, lag.determined, lag.note)
     return replace(found, profile=replace(found.profile, extensions=extensions), values=(*found.values, value))
-
-
-def _for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
-    """The motion for a table whose pairs may be others."""
-    if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
-        return many_directions(table)
-    return scene
 
 
 # ── coarse ───────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -151,8 +151,9 @@ def align_coarsely(
 
 
 def _runner_up(explained: Array, best: int) -> int | None:
-    """The best offset outside the valley of the best one, which ends where twice as much is left unexplained."""
-    worse = 1 - explained > 2 * (1 - explained[best])
+    """The best offset outside the valley of the best one: where twice as much is left, or half as much explained."""
+    left = 1 - explained[best]
+    worse = 1 - explained > min(2 * left, 0.5 * (1 + left))
     numbers = np.arange(len(worse))
     below = np.max(numbers[worse & (numbers < best)], initial=-1)
     above = np.min(numbers[worse & (numbers > best)], initial=len(worse))

@@ -7,6 +7,7 @@ drift apart by is fitted about the middle of the points, where it does not touch
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.image_formation.point_model import TrackTable
 from virest.inference.coarse_alignment import MIN_EXPLAINED, MIN_MOTION_PX, MIN_PAIRS, STEP_S, align_coarsely
 from virest.inference.frame_rotations import gyro_turns
 from virest.inference.observed_tracks import MIN_TRACKS, ObservedTracks
 from virest.inference.profile_terms import CLOCK_SKEW, SMALL_BIAS, careful_terms, shift_offset
-from virest.inference.track_fit import TrackFit, fit_directed, fit_tracks
+from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, many_directions
 from virest.inference.tracking_bias import bias_std
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import settling_time_s
@@ -27,8 +29,6 @@ Array = NDArray[np.float64]
 POINTS = 2500
 """Tracked points used in the fit; evenly thinned beyond."""
 IMU_MARGIN_S = 0.5
-TURNING_ONLY = 1.15
-"""Whitened differences of this size need no translation."""
 TRANSLATION_RATIO = 1.25
 """The camera moves where differences are this much larger in all directions than across the best parallax."""
 MAX_STD_S = 0.02
@@ -110,7 +110,9 @@ def estimate_time_offset(
         reason = "the inertial data do not cover the frames at any offset searched"
         return OffsetEstimate(start_s, float("inf"), False, reason)
     if (doubt := coarse.doubt(len(observed.pairs), observed.lens.fx_px)) is not None:
-        return OffsetEstimate(start_s, float("inf"), False, doubt[0], coarse.explained)
+        still = coarse.motion_rad * observed.lens.fx_px < MIN_MOTION_PX
+        explained = float("nan") if still else coarse.explained
+        return OffsetEstimate(start_s, float("inf"), False, doubt[0], explained)
     lens = profile.intrinsics or observed.lens.scaled_focal(coarse.gain)
     start = replace(profile, time_offset_s=coarse.time_offset_s, intrinsics=lens)
     found = refine_time_offset(observed, imu, start, focal_known=not free_focal)
@@ -143,12 +145,24 @@ def refine_time_offset(
 
     skew = replace(CLOCK_SKEW, change=skewed, prior_std=(0.005,))
     terms = (*careful_terms(start, offset_known=False, focal_known=focal_known), skew)
-    fit = fit_tracks(imu, table, start, terms)
-    if fit.scale > TURNING_ONLY:
-        across = fit_directed(imu, table, fit.profile, terms)
-        fit = across if fit.scale > TRANSLATION_RATIO * across.scale else fit
+    fit = _simplest(imu, table, start, terms)
+    covered, astray = covered.without_astray(table.first_px, fit.distance)
+    if astray and len(covered.pairs) >= MIN_PAIRS:
+        table = covered.table(POINTS)
+        fit = fit_tracks(imu, table, fit.profile, terms, for_table(fit.scene, table))
     spread_s = float(np.std(0.5 * (table.first_stamp_s + table.second_stamp_s) - middle_s))
     return _concluded(fit, observed, start, middle_s, spread_s, focal_known)
+
+
+def _simplest(imu: ImuSamples, table: TrackTable, start: CameraProfile, terms: Sequence[Term]) -> TrackFit:
+    """Turning alone, or with the direction of travel that the points ask for."""
+    turning = fit_tracks(imu, table, start, terms)
+    if start.depth_m is not None and np.isinf(start.depth_m):
+        return turning
+    many = fit_tracks(imu, table, turning.profile, terms, many_directions(table))
+    if turning.scale < TRANSLATION_RATIO * many.scale:
+        return turning
+    return fit_directed(imu, table, turning.profile, terms, many)
 
 
 def _concluded(
@@ -180,7 +194,7 @@ def _concluded(
         variance += (drift * np.hypot(middle_s, spread_s)) ** 2
         notes.append(f"the offset drifts by {1e3 * drift:.2f} ms a second: the clocks' rates differ")
     bias_std_rad_s = std("gyro_bias")
-    changed = np.abs(fit.value("gyro_bias")) / np.array(SMALL_BIAS.prior_std)
+    changed = np.abs(np.subtract(found.gyro_bias_rad_s, start.gyro_bias_rad_s)) / np.array(SMALL_BIAS.prior_std)
     if fit.scene is not None or np.max(changed) > FOREIGN_BIAS:
         bias_std_rad_s = np.full(3, np.nan)
     focal_px, focal_std_px = None, None

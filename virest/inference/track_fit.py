@@ -630,9 +630,21 @@ def many_directions(table: TrackTable) -> DirectedMotion:
     return DirectedMotion(np.zeros((table.n_pairs, 3)))
 
 
-def fit_directed(imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: Sequence[Term]) -> TrackFit:
-    """Fit across the parallax of one direction of travel where that explains the points, else of one for each pair."""
-    many = fit_tracks(imu, table, profile, terms, many_directions(table))
+def for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
+    """The motion for a table whose pairs may be others."""
+    if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
+        return many_directions(table)
+    return scene
+
+
+def fit_directed(
+    imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: Sequence[Term], many: TrackFit | None = None
+) -> TrackFit:
+    """Fit across the parallax of one direction of travel where that explains the points, else of one for each pair.
+
+    many: the latter fit, where it is known already.
+    """
+    many = many or fit_tracks(imu, table, profile, terms, many_directions(table))
     one = fit_tracks(imu, table, profile, terms, one_direction())
     return one if one.scale < ONE_DIRECTION * many.scale else many
 
