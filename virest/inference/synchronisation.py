@@ -35,6 +35,10 @@ MAX_STD_S = 0.02
 UNKNOWN_EXPOSURE_STD_S = 0.008
 UNKNOWN_READOUT_STD_S = 0.003
 """At least, where the readout is fitted: lens and parallax shear pictures too."""
+CONTRADICTED = 1.3
+"""Robust residual, in units of tracking's own noise, above which something is wrong with the model.  Right profiles
+leave 0.9 to 1.15 (simulated captures, hand-held and walking); a stabiliser of a tenth or a focal length 2 % off leave
+more than 2."""
 MAX_FOCAL_SPREAD = 0.25
 DRIFT_SIGMA, LEAST_DRIFT = 4.0, 5e-4
 NEAR_S = 0.01
@@ -71,7 +75,7 @@ class OffsetEstimate:
     """How the offset drifts: the clock skew that the profile may lack."""
     drift_std_s_per_s: float = float("inf")
     focal_px: float | None = None
-    """Fitted where the profile knows none and the motion determines it to a quarter."""
+    """Fitted where the profile knows none, the points follow the fit and the motion determines it to a quarter."""
     focal_std_px: float | None = None
     travels: bool = False
     """Whether the points were judged across the parallax of a camera that travels."""
@@ -198,7 +202,8 @@ def _concluded(
     if fit.scene is not None or np.max(changed) > FOREIGN_BIAS:
         bias_std_rad_s = np.full(3, np.nan)
     focal_px, focal_std_px = None, None
-    if not focal_known and found.intrinsics is not None and (spread := std("focal_length")[0]) <= MAX_FOCAL_SPREAD:
+    told = not focal_known and fit.scale < CONTRADICTED  # a stabiliser shows as another focal length, and leaves more
+    if told and found.intrinsics is not None and (spread := std("focal_length")[0]) <= MAX_FOCAL_SPREAD:
         focal_px, focal_std_px = found.intrinsics.fx_px, float(found.intrinsics.fx_px * spread)
     return OffsetEstimate(
         offset_s, float(np.sqrt(variance)), determined, "; ".join(notes), float("nan"), found.gyro_bias_rad_s,
