@@ -37,6 +37,7 @@ SOFTENING = 3.0
 GAINS = (0.4, 2.5)
 """Of pitch and yaw, where the focal length is guessed."""
 MIN_PAIRS = 8
+"""Fewer pairs of frames tell no clocks."""
 MIN_MOTION_PX = 0.4
 """Least rms of the pictures' changing turns from frame to frame, at the focal length."""
 MIN_EXPLAINED, MIN_EXPLAINED_BY_PAIR, MAX_MIN_EXPLAINED = 0.5, 5.0, 0.9

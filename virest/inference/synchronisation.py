@@ -17,7 +17,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
 from virest.inference.coarse_alignment import MIN_EXPLAINED, MIN_MOTION_PX, MIN_PAIRS, STEP_S, align_coarsely
-from virest.inference.frame_rotations import gyro_turns
+from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.inference.observed_tracks import MIN_TRACKS, ObservedTracks
 from virest.inference.profile_terms import CLOCK_SKEW, SMALL_BIAS, careful_terms, shift_offset
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, many_directions
@@ -231,12 +231,12 @@ def check_agreement(
     """
     if reason := _too_few(observed, imu):
         return Agreement(True, f"too little to tell: {reason}", tested=False)
-    offset_s, focal_px = profile.time_offset_s or 0.0, observed.lens.fx_px
-    seen_px, told_px = (focal_px * turns for turns in _changes_rad(observed, imu, profile))
+    offset_s, focal_px, turns = profile.time_offset_s or 0.0, observed.lens.fx_px, observed.turns(profile)
+    seen_px, told_px = (focal_px * changes for changes in _changes_rad(turns, imu, profile))
     if max(_rms(seen_px), _rms(told_px)) < MIN_MOTION_PX:
         return Agreement(True, "too little motion to tell")
     free_focal = profile.intrinsics is None
-    coarse = align_coarsely(observed.turns(profile), imu, profile, search_s, own_axes=True, free_focal=free_focal)
+    coarse = align_coarsely(turns, imu, profile, search_s, own_axes=True, free_focal=free_focal)
     explained = -np.inf if coarse is None else coarse.explained_near(offset_s, AGREEMENT_SLACK_S)
     if coarse is None or not np.isfinite(explained):
         return Agreement(True, "too little to tell: no inertial data at the frames")
@@ -272,9 +272,8 @@ def _clearly_better(tried_s: Array, explained_at: Array, offset_s: float, figure
     return float(tried_s[best]) + steps * STEP_S if chi_square > CLEARLY_BETTER else None
 
 
-def _changes_rad(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> tuple[Array, Array]:
+def _changes_rad(turns: FrameRotations, imu: ImuSamples, profile: CameraProfile) -> tuple[Array, Array]:
     """The changing turns of pictures and gyroscope at the profile's offset, (p, 3) each."""
-    turns = observed.turns(profile)
     times = (np.asarray(profile.imu_time_s(time_s)) for time_s in (turns.first_s, turns.second_s))
     told = gyro_turns(integrate_gyro(imu, profile), *times)
     return turns.detrended(turns.vector_rad), turns.detrended(told)

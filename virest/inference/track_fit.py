@@ -29,13 +29,11 @@ from virest.image_formation.point_model import (
     predict,
     with_profile,
 )
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN
 from virest.inference.travel_direction import find_directions, without_directions
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 Array = NDArray[np.float64]
-CAUCHY = 2.4
-"""A point this many standard deviations away has half its weight."""
-RAYLEIGH_MEDIAN, NORMAL_MEDIAN = 1.1774, 0.6745
 MAX_ITERATIONS = 15
 CONVERGED = 0.02
 """A step below this part of every standard deviation ends the fit."""

@@ -21,8 +21,9 @@ from virest.inference.chance import chi2_tail, student_tail
 from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.profile_terms import CLOCK_SKEW, careful_terms, shift_offset
+from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
 from virest.inference.synchronisation import CONTRADICTED
-from virest.inference.track_fit import CAUCHY, RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
+from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import DirectedMotion, Motion
 from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
