@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motion.synthetic_motion import R_CAM_IMU, Setup, Synthetic, hand_motion, make
+from motion.synthetic_motion import R_CAM_IMU, Setup, Synthetic, hand_motion, make, observed_pairs
+from motion.synthetic_tracks import Setup as Hand
+from motion.synthetic_tracks import recorded as hand
 
-from virest.camera.profile import CameraProfile, read_profile
+from virest.camera.profile import CameraProfile, Extensions, read_profile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.inference.frame_selection import choose_pairs
@@ -19,6 +21,7 @@ from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.synchronisation import Agreement, OffsetEstimate, check_agreement, estimate_time_offset
 from virest.inference.tracking import track_pairs
 
+SWAYING = Hand(seed=31, frames=40, points=60, gyro_noise_rad_s=0.001)
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
 
 
@@ -137,6 +140,30 @@ def test_unknown_focal_length_is_found_with_the_offset() -> None:
     assert found.focal_px is not None
     assert abs(found.focal_px / 980.0 - 1) < 0.01
     assert abs(found.time_offset_s - 0.1) < 1e-3
+
+
+def test_a_stabiliser_is_not_taken_for_another_focal_length() -> None:
+    """It halves what the pictures turn by; the points do not follow such a lens, and no focal length is told."""
+    for fraction, told in ((0.0, True), (0.5, False)):
+        recording = hand(replace(SWAYING, stabilised=(fraction, 1.0)))
+        unknown = replace(recording.profile, intrinsics=None, time_offset_s=None, extensions=Extensions())
+        observed = observed_pairs(recording.pairs, recording.stamp_s, recording.exposure_s, unknown)
+        assert (estimate_time_offset(observed, recording.imu, unknown).focal_px is not None) is told
+
+
+def test_a_dashboard_is_left_out() -> None:
+    """Points of the lower quarter that rest in the picture do not move offset or focal length."""
+    recorded = make(Setup(hand_motion(72, 0.3), time_offset_s=0.02, points=160))
+    pairs = []
+    for pair in recorded.pairs:
+        rests = pair.points_first_px[:, 1] > 960
+        second_px = np.where(rests[:, None], pair.points_first_px, pair.points_second_px)
+        pairs.append(replace(pair, points_second_px=second_px))
+    unknown = replace(recorded.profile, intrinsics=None)
+    found = estimate_time_offset(replace(recorded, pairs=pairs).observed(unknown), recorded.imu, unknown)
+    assert found.determined, found.reason
+    assert abs(found.time_offset_s - 0.02) < 1e-4
+    assert found.focal_px == pytest.approx(980.0, rel=0.005)
 
 
 def test_drifting_clock_is_named() -> None:

@@ -22,7 +22,6 @@ from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.profile_terms import CLOCK_SKEW, careful_terms, shift_offset
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
-from virest.inference.synchronisation import CONTRADICTED
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import DirectedMotion, Motion
@@ -31,6 +30,10 @@ from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+CONTRADICTED = 1.3
+"""Robust residual, in units of tracking's own noise, above which something is wrong with the model.  Right profiles
+leave 0.9 to 1.15 (simulated captures, hand-held and walking); a stabiliser of a tenth or a focal length 2 % off leave
+more than 2."""
 MOST_LEFT = 0.5
 """Part of the contradiction, as a variance beyond tracking's, that may remain for what was found to be taken."""
 HELD_OUT_P = 0.05
