@@ -37,8 +37,8 @@ UNKNOWN_READOUT_STD_S = 0.003
 """At least, where the readout is fitted: lens and parallax shear pictures too."""
 MAX_FOCAL_LEFT = 1.5
 """Residual, in units of tracking's noise, up to which a focal length is told.  A stabiliser of a tenth makes it 8 to
-9 % too short and leaves 1.7 to 3.5 at 0.2 and 0.1 px of noise; a principal point 9 px off leaves 1.15 to 1.4, and no error
-of the focal length above 0.1 % (tracks made from three analytic motions)."""
+9 % too short and leaves 1.7 to 3.5 at 0.2 and 0.1 px of noise; a principal point 9 px off leaves 1.15 to 1.4, and
+no error of the focal length above 0.1 % (tracks made from three analytic motions)."""
 MAX_FOCAL_SPREAD = 0.25
 DRIFT_SIGMA, LEAST_DRIFT = 4.0, 5e-4
 NEAR_S = 0.01
