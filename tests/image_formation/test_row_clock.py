@@ -15,8 +15,6 @@ from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import seen_s
 from virest.image_formation.row_clock import RowClock
 from virest.image_formation.row_motion import frame_times_s, row_motion
-from virest.inference.point_fit import point_table
-from virest.inference.tracking import TrackPair
 from virest.motion.integration import integrate_gyro
 
 PHONE = CameraProfile(
@@ -98,6 +96,3 @@ def test_all_that_read_rows_agree(direction: str, timestamp: str) -> None:
     np.testing.assert_allclose(reference_s, first_row_s + np.array([0.0, 0.016]), atol=1e-12)
     stamps_s, logged_s = np.full(3, 1.2), np.full(3, 0.008)
     np.testing.assert_allclose(seen_s(profile, POINTS_PX, stamps_s, logged_s), middle_s, atol=1e-12)
-    table = point_table([TrackPair(0, 1, POINTS_PX, POINTS_PX)], stamps_s, logged_s, profile)
-    np.testing.assert_allclose(profile.imu_time_s(table.first_s), first_row_s + 0.006, atol=1e-12)
-    np.testing.assert_allclose(table.first_fraction, fraction, atol=1e-12)

@@ -7,6 +7,7 @@ code under test is used but its records.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
+from virest.capture.records import Frame
+from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
@@ -99,10 +102,16 @@ class Synthetic:
     """Knows all but the offset and the bias."""
     orientation: Slerp = field(repr=False)
 
-    @property
-    def arguments(self) -> tuple[list[TrackPair], Array, Array, ImuSamples, CameraProfile]:
-        """In the order that estimators take them."""
-        return self.pairs, self.frame_time_s, self.exposure_s, self.imu, self.profile
+    def observed(self, profile: CameraProfile | None = None) -> ObservedTracks:
+        """The tracks as a profile sees them; None: the recording's own."""
+        return observed_pairs(self.pairs, self.frame_time_s, self.exposure_s, profile or self.profile)
+
+
+def observed_pairs(pairs: list[TrackPair], stamp_s: Array, exposure_s: Array, profile: CameraProfile) -> ObservedTracks:
+    """Tracked pairs of a movie without a capture folder."""
+    times = zip(stamp_s, exposure_s, strict=True)
+    frames = tuple(Frame(k, k, float(t), None if np.isnan(e) else float(e)) for k, (t, e) in enumerate(times))
+    return observe_tracks(SimpleNamespace(frames=frames), pairs, profile)  # type: ignore[arg-type]
 
 
 def make(setup: Setup, imu_hz: float = 200.0) -> Synthetic:

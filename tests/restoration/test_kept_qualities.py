@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.image_formation.light import FrameLight
-from virest.inference.alignment import OffsetEstimate
+from virest.inference.synchronisation import OffsetEstimate
 from virest.restoration import capture_estimation
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.frame import _relit
@@ -47,13 +46,9 @@ def test_frames_are_copied_where_the_offset_is_not_known_well_enough(
     std_s: float, copied: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At a radian a second and 500 px, 4 ms are 2 px: as much as the blur that is to be undone."""
-    estimate = OffsetEstimate(
-        0.02, std_s, (0.0,) * 3, (0.01,) * 3, 0.1, 0.1, 0.99, 0.02, 0.0, 0.0, 0.001, None, None, "rotation", 60, 4000,
-        True, "",
-    )  # fmt: skip
+    estimate = OffsetEstimate(0.02, std_s, True, explained=0.99)
     monkeypatch.setattr(capture_estimation, "estimate_time_offset", lambda *_: estimate)
     lens = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
     profile = replace(CameraProfile(640, 480, intrinsics=lens), time_offset_s=None)
-    capture = SimpleNamespace(imu=None, frames=())
-    plan = capture_estimation._filled(RestorationPlan(profile, PRESETS["balanced"]), capture, [])  # type: ignore[arg-type]
+    plan = capture_estimation._filled(RestorationPlan(profile, PRESETS["balanced"]), None, None)  # type: ignore[arg-type]
     assert (plan.copy_reason is not None) is copied

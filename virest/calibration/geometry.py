@@ -27,11 +27,11 @@ from virest.image_formation.point_model import TrackTable, ground
 from virest.image_formation.row_clock import row_time_s
 from virest.inference import profile_terms as terms_of
 from virest.inference.blur_bias import blur_bias_px
-from virest.inference.coarse_alignment import CoarseAlignment, align_coarsely, align_with_skew
+from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
-from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, one_direction, start_scene
+from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
 from virest.motion.displacement import drift_std_m
@@ -40,21 +40,12 @@ from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-MIN_PAIRS = 8
-MIN_MOTION_PX = 0.4
-"""Least rms of the pictures' changing turns from frame to frame, at the focal length."""
-MIN_EXPLAINED, MIN_EXPLAINED_BY_PAIR, MAX_MIN_EXPLAINED = 0.5, 5.0, 0.9
-"""Pictures follow the gyroscope if it explains 0.5 + 5 / pairs, at most 0.9, of their turns."""
-MIN_DISTINCT = 1.6
-"""The best offset leaves less than 1 / this of what the runner-up leaves unexplained."""
 FEW_POINTS, MANY_POINTS = 2000, 7000
 START_INVERSE_DEPTH_PER_M = 0.5
 EXPLAINED_SCALE = 1.15
 """Whitened differences of this size need no translation."""
 TRANSLATION_GAIN = 0.97
 """A translation stays if it brings the differences below this part."""
-ONE_DIRECTION = 1.15
-"""One direction of travel for the whole capture stays if it leaves less than this many times what one a pair leaves."""
 DIRECTION_COST = 12.0
 """Readouts along rows and along columns are told apart from this difference in cost, in units of its own noise."""
 OUTLIER_WEIGHT = 0.1
@@ -179,7 +170,7 @@ def calibrate_geometry(
     left_out = 0.0
     for _ in range(ASTRAY_PASSES):
         table = observed.table(MANY_POINTS)
-        fit = fit_tracks(capture.imu, table, rough.profile, wanted, _for_table(rough.scene, table))
+        fit = fit_tracks(capture.imu, table, rough.profile, wanted, for_table(rough.scene, table))
         observed, astray = observed.without_astray(table.first_px, fit.distance)
         left_out += (1 - left_out) * astray
         if not astray:
@@ -232,13 +223,6 @@ def _with_lag(found: GeometryCalibration, lag: StartUpLag) -> GeometryCalibratio
     return replace(found, profile=replace(found.profile, extensions=extensions), values=(*found.values, value))
 
 
-def _for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
-    """The motion for a table whose pairs may be others."""
-    if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
-        return many_directions(table)
-    return scene
-
-
 # ── coarse ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -260,28 +244,8 @@ def _require_coarse(
         raise CalibrationError(
             "the inertial data cover the frames at no offset within a second", hint="check the clocks by virest inspect"
         )
-    motion_px = coarse.motion_rad * observed.lens.fx_px
-    if motion_px < MIN_MOTION_PX:
-        raise CalibrationError(
-            f"the pictures hardly change their turn ({motion_px:.2f} px from frame to frame)",
-            hint="shake the phone about all three axes; a camera at rest or a steady pan determines nothing",
-        )
-    least = min(MIN_EXPLAINED + MIN_EXPLAINED_BY_PAIR / len(observed.pairs), MAX_MIN_EXPLAINED)
-    if coarse.explained < least:
-        raise CalibrationError(
-            f"the pictures do not follow the gyroscope: it explains {max(coarse.explained, 0):.0%} of their turns",
-            hint="stabilised in the camera, or not of this recording?",
-        )
-    if coarse.at_end:
-        raise CalibrationError(
-            f"the time offset lies at the end of the search ({coarse.time_offset_s:+.2f} s)",
-            hint="give a time_offset_s to search about",
-        )
-    if 1 - coarse.runner_up < MIN_DISTINCT * (1 - coarse.explained):
-        raise CalibrationError(
-            f"offsets of {coarse.time_offset_s:+.3f} and {coarse.runner_up_s:+.3f} s fit the pictures about equally",
-            hint="move less regularly",
-        )
+    if (doubt := coarse.doubt(len(observed.pairs), observed.lens.fx_px)) is not None:
+        raise CalibrationError(doubt[0], hint=doubt[1])
     return coarse, skew
 
 
@@ -357,10 +321,7 @@ def _fit_with_translation(
         scene = start_scene(imu, known, table, START_INVERSE_DEPTH_PER_M)
         inertial = fit_tracks(imu, table, start, wanted, scene)
         return inertial if inertial.scale < TRANSLATION_GAIN * plain.scale else plain
-    many = fit_tracks(imu, table, start, wanted, many_directions(table))
-    one = fit_tracks(imu, table, start, wanted, one_direction())
-    log.debug("translation: none %.3f, one direction %.3f, one for each pair %.3f", plain.scale, one.scale, many.scale)
-    return one if one.scale < ONE_DIRECTION * many.scale else many
+    return fit_directed(imu, table, start, wanted)
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────

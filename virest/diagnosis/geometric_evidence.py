@@ -14,6 +14,7 @@ from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, centre, ground, seen_s
 from virest.inference.comparable_noise import noise_distances
 from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
@@ -21,8 +22,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 CAP = 4.0
 """Differences count up to this many of their own median scales: single lost tracks do not decide."""
-RAYLEIGH_MEDIAN = 1.1774
-CAUCHY = 2.4
 BLOCK_LENGTHS = (7, 11, 8, 13, 9)
 """Pairs in a block of time, in turn: fixed lengths beat with periodic faults."""
 FULL_LENGTH_PAIRS = 60

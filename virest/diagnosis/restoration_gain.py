@@ -31,7 +31,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_motion import RowMotion, covering_both, row_motion
 from virest.image_formation.warp import moved_between
-from virest.inference.alignment import choose_pairs
+from virest.inference.frame_selection import choose_pairs
 from virest.inference.guidance import GyroGuide, MapBetween, map_between
 from virest.inference.guide_choice import find_guide
 from virest.inference.parallel import ParallelMap, one_by_one

@@ -34,6 +34,17 @@ SKEW_GAIN = 0.8
 """Another clock rate is taken if it leaves less than this part of what the profile's leaves unexplained."""
 SOFTENING = 3.0
 """Pairs further off than this many typical deviations are held back."""
+GAINS = (0.4, 2.5)
+"""Of pitch and yaw, where the focal length is guessed."""
+MIN_PAIRS = 8
+"""Fewer pairs of frames tell no clocks."""
+MIN_MOTION_PX = 0.4
+"""Least rms of the pictures' changing turns from frame to frame, at the focal length."""
+MIN_EXPLAINED, MIN_EXPLAINED_BY_PAIR, MAX_MIN_EXPLAINED = 0.5, 5.0, 0.9
+"""Pictures follow the gyroscope if it explains 0.5 + 5 / pairs, at most 0.9, of their turns: with few pairs, unrelated
+motion reaches 0.7 at some offset within a second; with 40 it stays below 0.5."""
+MIN_DISTINCT = 1.6
+"""The best offset leaves less than 1 / this of what the runner-up leaves unexplained."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +58,7 @@ class CoarseAlignment:
     explained: float
     """Part of the pictures' changing turns that the gyroscope then explains."""
     runner_up: float
-    """The same at the best offset elsewhere."""
+    """The same at the best offset outside its valley."""
     runner_up_s: float
     axes_changed: bool
     """Whether another rotation than the profile's was taken."""
@@ -55,12 +66,57 @@ class CoarseAlignment:
     """rms of the pictures' changing turns from frame to frame."""
     at_end: bool
     """Whether the offset lies at the end of the search."""
+    gain: float
+    """Pitch and yaw in the pictures over those of the gyroscope; 1 where the focal length is known."""
+    offset_s: Array
+    """(k,) all that were tried."""
+    explained_at: Array
+    """(k,) what each of them explains."""
+
+    def explained_near(self, offset_s: float, within_s: float) -> float:
+        """The most that is explained within some time of an offset; -inf where none was tried."""
+        return float(np.max(self.explained_at, where=np.abs(self.offset_s - offset_s) <= within_s, initial=-np.inf))
+
+    def doubt(self, pairs: int, focal_px: float) -> tuple[str, str] | None:
+        """Why the offset is not to be trusted, and what to do; None: it is."""
+        motion_px = self.motion_rad * focal_px
+        if motion_px < MIN_MOTION_PX:
+            return (
+                f"the pictures hardly change their turn ({motion_px:.2f} px from frame to frame)",
+                "shake the phone about all three axes; a camera at rest or a steady pan determines nothing",
+            )
+        if self.explained < min(MIN_EXPLAINED + MIN_EXPLAINED_BY_PAIR / pairs, MAX_MIN_EXPLAINED):
+            return (
+                f"the pictures do not follow the gyroscope: it explains {max(self.explained, 0):.0%} of their turns",
+                "stabilised in the camera, or not of this recording?",
+            )
+        if self.at_end:
+            return (
+                f"the time offset lies at the end of the search ({self.time_offset_s:+.2f} s)",
+                "give a time_offset_s to search about",
+            )
+        if 1 - self.runner_up < MIN_DISTINCT * (1 - self.explained):
+            return (
+                f"offsets of {self.time_offset_s:+.3f} and {self.runner_up_s:+.3f} s fit the pictures about equally",
+                "move less regularly",
+            )
+        return None
 
 
 def align_coarsely(
-    turns: FrameRotations, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
+    turns: FrameRotations,
+    imu: ImuSamples,
+    profile: CameraProfile,
+    search_s: float = 1.0,
+    *,
+    own_axes: bool = False,
+    free_focal: bool = False,
 ) -> CoarseAlignment | None:
-    """Search offsets within ± search_s of the profile's; None if the inertial data cover the pairs nowhere."""
+    """Search offsets within ± search_s of the profile's; None if the inertial data cover the pairs nowhere.
+
+    Bias and slow drift are free.  own_axes: no others than the profile's are tried.  free_focal: one gain for pitch and
+    yaw is fitted with the profile's axes, as a guessed focal length needs.
+    """
     centre = profile.time_offset_s or 0.0
     steps = int(np.ceil(search_s / STEP_S))
     offsets = centre + STEP_S * np.arange(-steps, steps + 1, dtype=float)
@@ -74,22 +130,37 @@ def align_coarsely(
     covered = inside.mean(axis=1) >= MIN_COVERED
     if not covered.any() or motion <= 0:
         return None
-    free, rotation = _best_rotations(seen, gyro, inside)
-    own = _explained(seen, gyro, inside, np.broadcast_to(profile.rotation_cam_imu, rotation.shape))
-    free, own = np.where(covered, free, -np.inf), np.where(covered, own, -np.inf)
-    best_own, best_free = int(np.argmax(own)), int(np.argmax(free))
-    same = abs(offsets[best_own] - offsets[best_free]) <= SAME_VALLEY_S
-    keep = 1 - own[best_own] < max(KEEP_PROFILE * (1 - free[best_free]), 1e-3)
-    keep = keep or (same and 1 - own[best_own] < MAX_PROFILE_LEFT)
-    explained, best = (own, best_own) if keep else (free, best_free)
-    chosen = profile.rotation_cam_imu if keep else rotation[best]
-    away = np.abs(offsets - offsets[best]) > SAME_VALLEY_S
-    other = int(np.argmax(np.where(away, explained, -np.inf)))
-    runner_up = float(explained[other]) if away.any() else -np.inf
+    axes = profile.rotation_cam_imu
+    gain = _gains(seen, gyro @ axes.T, inside) if free_focal else np.ones(len(offsets))
+    own = np.where(covered, _explained(seen, gyro, inside, axes[None], gain), -np.inf)
+    best, explained, keep = int(np.argmax(own)), own, True
+    if not own_axes:
+        free, rotation = _best_rotations(seen, gyro, inside)
+        free = np.where(covered, free, -np.inf)
+        best_free = int(np.argmax(free))
+        same = abs(offsets[best] - offsets[best_free]) <= SAME_VALLEY_S
+        keep = 1 - own[best] < max(KEEP_PROFILE * (1 - free[best_free]), 1e-3)
+        keep = keep or (same and 1 - own[best] < MAX_PROFILE_LEFT)
+        if not keep:
+            best, explained, gain, axes = best_free, free, np.ones(len(offsets)), rotation[best_free]
+    other = _runner_up(explained, best)
     return CoarseAlignment(
-        float(offsets[best]), chosen, float(explained[best]), runner_up, float(offsets[other]), not keep, motion,
-        best in (0, len(offsets) - 1),
+        float(offsets[best]), axes, float(explained[best]), -np.inf if other is None else float(explained[other]),
+        float(offsets[best if other is None else other]), not keep, motion, best in (0, len(offsets) - 1),
+        float(gain[best]), offsets, explained,
     )  # fmt: skip
+
+
+def _runner_up(explained: Array, best: int) -> int | None:
+    """The best offset outside the valley of the best one: where twice as much is left, or half as much explained."""
+    left = 1 - explained[best]
+    worse = 1 - explained > min(2 * left, 0.5 * (1 + left))
+    numbers = np.arange(len(worse))
+    below = np.max(numbers[worse & (numbers < best)], initial=-1)
+    above = np.min(numbers[worse & (numbers > best)], initial=len(worse))
+    held = np.concatenate([[-np.inf], explained, [-np.inf]])
+    peak = (explained >= held[:-2]) & (explained > held[2:]) & ((numbers <= below) | (numbers >= above))
+    return int(np.argmax(np.where(peak, explained, -np.inf))) if peak.any() else None
 
 
 def align_with_skew(
@@ -139,15 +210,27 @@ def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tupl
     return explained, rotation
 
 
+def _gains(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> Array:
+    """Pitch and yaw in the pictures over those of the gyroscope (k,), both in camera axes."""
+    used = inside[..., None]
+    cross = (seen[:, :2] * gyro[..., :2] * used).sum(axis=(1, 2))
+    return np.clip(cross / np.maximum((gyro[..., :2] ** 2 * used).sum(axis=(1, 2)), 1e-18), *GAINS)
+
+
 def _soft_weights(seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array) -> Array:
     squared = ((seen - gyro @ np.swapaxes(rotation, -1, -2)) ** 2).sum(axis=-1)
     scale = np.maximum(np.median(squared, axis=1, keepdims=True), 1e-14)
     return inside / (1 + squared / (SOFTENING**2 * scale))
 
 
-def _explained(seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array) -> Array:
+def _explained(
+    seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array, gain: Array | None = None
+) -> Array:
     """1 − (what is left) / (what there was), soft beyond the typical turn: single pairs gone astray do not decide."""
-    left = ((seen - gyro @ np.swapaxes(rotation, -1, -2)) ** 2).sum(axis=-1)
+    told = gyro @ np.swapaxes(rotation, -1, -2)
+    if gain is not None:
+        told[..., :2] *= gain[:, None, None]
+    left = ((seen - told) ** 2).sum(axis=-1)
     before = np.broadcast_to((seen**2).sum(axis=-1), left.shape)
     scale = np.median((seen**2).sum(axis=-1)) + 1e-12
     return 1 - (np.log1p(left / scale) * inside).sum(axis=1) / np.maximum(

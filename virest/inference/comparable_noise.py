@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from virest.image_formation.point_model import predict
 from virest.inference.observed_tracks import ObservedTracks
-from virest.inference.track_fit import ANY_DEPTH, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, TrackFit
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN
+from virest.inference.track_fit import ANY_DEPTH, TrackFit
 from virest.inference.track_noise import (
-    CAUCHY,
     ORDERS,
     POINTS_PER_TERM,
     REWEIGHTINGS,

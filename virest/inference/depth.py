@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, TrackTable, predict, turned
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
@@ -33,11 +34,9 @@ NEAR_S = 1.0
 """Points seen within this time of a frame speak for it."""
 OUTSIDE = 0.05
 """Points up to this part of the picture beyond its edge speak for it too."""
-CAUCHY = 2.4
 REWEIGHTINGS = 6
 FEWEST_SPREAD = 0.02
 """A plane fitted to a whole window is trusted no better than to this part of its inverse depth at one frame."""
-NORMAL_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,6 @@ from virest.motion.trajectory import Trajectory, vector_from_rotation
 
 Array = NDArray[np.float64]
 REWEIGHTINGS = 8
-SOFT_CAP = 1.0
-"""A pair's deviation counts fully up to about this part of the typical turn; beyond it ever less (moving objects)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,24 +38,6 @@ class FrameRotations:
         basis = np.stack([lasting, lasting * (self.middle_s - self.middle_s.mean())], axis=-1)
         q, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0).clip(1e-9))
         return values - q @ (q.T @ values)
-
-
-@dataclass(frozen=True, slots=True)
-class OffsetScan:
-    """How well the gyroscope explains the pictures' turns at each offset tried."""
-
-    offset_s: Array
-    """(k,)."""
-    explained: Array
-    """(k,) 1 − (what is left) / (what there was), both after detrending; at most 1, below 0 worse than no gyroscope."""
-    gain: Array
-    """(k,) pitch and yaw in the pictures over those of the gyroscope; 1 where the focal length is known."""
-
-    def peaks(self) -> NDArray[np.intp]:
-        """Find indices of the local maxima, ends included, best first."""
-        held = np.concatenate([[-np.inf], self.explained, [-np.inf]])
-        top = np.flatnonzero((held[1:-1] >= held[:-2]) & (held[1:-1] > held[2:]))
-        return top[np.argsort(-self.explained[top])]
 
 
 def picture_rotation(lens: Intrinsics, pair: TrackPair) -> Array:
@@ -86,41 +66,6 @@ def gyro_turns(trajectory: Trajectory, first_s: Array, second_s: Array) -> Array
     """Predict what the pictures' rotation vectors (..., 3) should be between times (...) on the IMU clock."""
     after = trajectory.orientation(second_s)
     return vector_from_rotation(np.swapaxes(after, -1, -2) @ trajectory.orientation(first_s))
-
-
-def scan_offsets(
-    turns: FrameRotations, trajectory: Trajectory, clock_skew: float, offsets_s: Array, free_gain: bool = False
-) -> OffsetScan:
-    """Compare the pictures' turns with the gyroscope's at each offset; bias and slow drift are free.
-
-    Offsets at which any pair would lie outside the inertial data are tried with the pairs that are left, and are given
-    up below three quarters of them.  free_gain: fit one gain for pitch and yaw, as an unknown focal length needs.
-    """
-    first = turns.first_s * (1 + clock_skew) + offsets_s[:, None]
-    second = turns.second_s * (1 + clock_skew) + offsets_s[:, None]
-    start_s, end_s = trajectory.span_s
-    inside = (first >= start_s) & (second <= end_s)
-    predicted = turns.detrended(gyro_turns(trajectory, first, second))
-    seen = turns.detrended(turns.vector_rad)
-    gain = _gains(seen, predicted, inside) if free_gain else np.ones(len(offsets_s))
-    predicted[..., :2] *= gain[:, None, None]
-    scale = SOFT_CAP * np.sqrt(np.median((seen**2).sum(axis=-1))) + 1e-6
-    before = _soft_energy(np.broadcast_to(seen, predicted.shape), scale, inside)
-    explained = 1.0 - _soft_energy(seen - predicted, scale, inside) / np.maximum(before, 1e-18)
-    enough = inside.sum(axis=1) >= 0.75 * len(turns.first_s)
-    return OffsetScan(offsets_s, np.where(enough, explained, -np.inf), gain)
-
-
-def _gains(seen: Array, predicted: Array, inside: NDArray[np.bool_]) -> Array:
-    used = inside[..., None]
-    cross = (seen[:, :2] * predicted[..., :2] * used).sum(axis=(1, 2))
-    power = (predicted[..., :2] ** 2 * used).sum(axis=(1, 2))
-    return np.clip(cross / np.maximum(power, 1e-18), 0.4, 2.5)
-
-
-def _soft_energy(vectors: Array, scale: float, inside: NDArray[np.bool_]) -> Array:
-    squared = (vectors**2).sum(axis=-1)
-    return (np.log1p(squared / scale**2) * inside).sum(axis=-1)
 
 
 def _unit(rays: Array) -> Array:

@@ -23,9 +23,9 @@ from virest.camera.profile import CameraProfile
 from virest.capture.join import median_period_s
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_clock import RowClock, row_time_s
-from virest.inference.alignment import choose_pairs
-from virest.inference.coarse_alignment import axis_maps
+from virest.inference.coarse_alignment import MIN_PAIRS, axis_maps
 from virest.inference.frame_rotations import gyro_turns
+from virest.inference.frame_selection import choose_pairs
 from virest.inference.guidance import GyroGuide, gyro_guide
 from virest.inference.observed_tracks import frame_times
 from virest.inference.parallel import ParallelMap, one_by_one
@@ -37,7 +37,6 @@ Array = NDArray[np.float64]
 Reader = Callable[[Sequence[int]], Iterable[tuple[int, Picture | None]]]
 SAMPLE_FRAMES, RUN_FRAMES = 32, 8
 """Four runs of frames where the gyroscope is liveliest."""
-MIN_PAIRS = 8
 LONG_SIDE_PX, TILE_PX, REACH_PX = 192, 33, 48
 """Of the shrunk pictures: a quarter of the longer side a frame is within reach, 480 px of 1920."""
 TILES = 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from virest.camera.profile import CameraProfile
 from virest.effects.changes import add_readout, rotate_imu, shift_offset
 from virest.effects.table import EFFECTS
 from virest.inference.track_fit import Term
@@ -28,3 +29,18 @@ IMU_ROTATION, GYRO_BIAS, GYRO_SCALE = TERMS["imu_rotation"], TERMS["gyro_bias"],
 FOCAL, K1, PRINCIPAL_POINT = TERMS["focal_length"], TERMS["radial_distortion"], TERMS["principal_point"]
 FOCAL_DRIFT, STABILISATION = TERMS["focal_drift"], TERMS["stabilisation"]
 EXPOSURE_SCALE = TERMS["exposure_time"]
+
+STATED_OFFSET, SMALL_BIAS = replace(TIME_OFFSET, prior_std=(0.03,)), replace(GYRO_BIAS, prior_std=(0.02,) * 3)
+NEAR_AXES = replace(IMU_ROTATION, prior_std=(0.03,) * 3)
+STATED_READOUT, UNKNOWN_READOUT = replace(READOUT, prior_std=(0.003,)), replace(READOUT, prior_std=(0.02,))
+"""How far a careful profile may be off, and what no phone's readout exceeds."""
+
+
+def careful_terms(profile: CameraProfile, *, offset_known: bool, focal_known: bool) -> tuple[Term, ...]:
+    """What a careful profile may be a little off in, and what it leaves open.
+
+    offset_known, focal_known: these are stated; otherwise they are free.
+    """
+    offset = STATED_OFFSET if offset_known else TIME_OFFSET
+    readout = STATED_READOUT if profile.readout_known else UNKNOWN_READOUT
+    return (offset, SMALL_BIAS, NEAR_AXES, readout, *(() if focal_known else (FOCAL,)))

@@ -20,6 +20,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from virest.image_formation.point_model import SMALLEST_DEPTH
 from virest.inference.depth import Sightings
+from virest.inference.robust import CAUCHY
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief, angles
 
@@ -53,7 +54,7 @@ MATCHED_CELLS, MATCHED_GROWTH = 2.0, 0.18
 (Spitzer 1976), taken four times looser, since depths step rather than bend."""
 STIFFNESSES = (0.25, 1.0, 4.0)
 """Times stiffer than that: what tells held-out points best is taken."""
-CAUCHY, REWEIGHTINGS = 2.4, 1
+REWEIGHTINGS = 1
 STD_STEP = 6
 """Standard deviations are worked out at every such node."""
 JUDGED_INSTANTS, MIN_JUDGED_CELLS = 4, 12

@@ -29,13 +29,11 @@ from virest.image_formation.point_model import (
     predict,
     with_profile,
 )
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN
 from virest.inference.travel_direction import find_directions, without_directions
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 Array = NDArray[np.float64]
-CAUCHY = 2.4
-"""A point this many standard deviations away has half its weight."""
-RAYLEIGH_MEDIAN, NORMAL_MEDIAN = 1.1774, 0.6745
 MAX_ITERATIONS = 15
 CONVERGED = 0.02
 """A step below this part of every standard deviation ends the fit."""
@@ -51,6 +49,8 @@ NOT_AT_ALL = (0.0, 0.0)
 ALMOST_NOTHING = 1e-9
 ANY_DEPTH = 1e6
 """Spread of inverse depths that leaves a point free to lie anywhere along its parallax."""
+ONE_DIRECTION = 1.15
+"""One direction of travel for the whole capture stays if it leaves less than this many times what one a pair leaves."""
 SPREAD_PASSES, SPREAD_TOLERANCE = 3, 0.2
 """The spread of depths is measured anew after each descent until it changes by less than this part."""
 
@@ -626,6 +626,25 @@ def one_direction() -> DirectedMotion:
 def many_directions(table: TrackTable) -> DirectedMotion:
     """A direction for each pair, to be found."""
     return DirectedMotion(np.zeros((table.n_pairs, 3)))
+
+
+def for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
+    """The motion for a table whose pairs may be others."""
+    if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
+        return many_directions(table)
+    return scene
+
+
+def fit_directed(
+    imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: Sequence[Term], many: TrackFit | None = None
+) -> TrackFit:
+    """Fit across the parallax of one direction of travel where that explains the points, else of one for each pair.
+
+    many: the latter fit, where it is known already.
+    """
+    many = many or fit_tracks(imu, table, profile, terms, many_directions(table))
+    one = fit_tracks(imu, table, profile, terms, one_direction())
+    return one if one.scale < ONE_DIRECTION * many.scale else many
 
 
 def _directed(table: TrackTable, at: Prediction, motion: DirectedMotion) -> tuple[Prediction, DirectedMotion]:

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
 from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
 REWEIGHTINGS = 6
-CAUCHY = 2.4
-RAYLEIGH_MEDIAN = 1.1774
 POINTS_PER_TERM = 4
 """A cubic flow has 10 terms an axis; with fewer points than this many times the terms a lower order is taken."""
 ENOUGH_POINTS = 36

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-CAUCHY = 2.4
-NORMAL_MEDIAN = 0.6745
 FIRST_PASSES, LATER_PASSES = 12, 4
 
 

@@ -19,6 +19,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, centre, ground, with_profile
+from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.depth import (
     FrameDepth,
     Sightings,
@@ -28,8 +29,17 @@ from virest.inference.depth import (
     triangulate_relief,
 )
 from virest.inference.observed_tracks import WINDOW_S, ObservedTracks
-from virest.inference.profile_terms import FOCAL, GYRO_BIAS, IMU_ROTATION, READOUT, TIME_OFFSET
+from virest.inference.profile_terms import (
+    FOCAL,
+    GYRO_BIAS,
+    NEAR_AXES,
+    SMALL_BIAS,
+    STATED_OFFSET,
+    TIME_OFFSET,
+    UNKNOWN_READOUT,
+)
 from virest.inference.relief import View, WindowRelief, find_relief, picture_grid
+from virest.inference.robust import RAYLEIGH_MEDIAN
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.inference.tracking_bias import SHARED_RELIEF
 from virest.motion.displacement import Displacement
@@ -42,7 +52,6 @@ STRETCH_S = 14.0
 RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
 """Frames to be tracked: runs of consecutive ones, spread over each window."""
 POINTS_PER_WINDOW = 800
-MIN_PAIRS = 8
 MIN_POINTS = 200
 START_INVERSE_DEPTH_PER_M = 0.5
 MAX_RELATIVE_STD = 0.1
@@ -62,12 +71,6 @@ GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
 MAX_ITERATIONS = 15
 STILL_ITERATIONS = 8
 """Rotation alone is there to be compared with; it does not matter to the last digit."""
-RAYLEIGH_MEDIAN = 1.1774
-OFFSET_PRIOR_S, ROTATION_PRIOR_RAD, READOUT_PRIOR_S = 0.03, 0.03, 0.03
-"""How far a profile that states a value may be wrong: these are fitted along so that they do not pass for parallax."""
-BIAS_PRIOR_RAD_S = 0.02
-"""The same of a gyroscope's bias.  Before a tilted wall another travel with another turn shows nearly the same picture
-(a plane's second motion); that turn would have to be a bias that no phone's gyroscope has."""
 STATED_DEPTH_STD = 0.02
 """How far a profile's depth may be off, part of it."""
 TRACKING_BIAS_PX = 0.04
@@ -475,13 +478,15 @@ def _parts(observed: ObservedTracks) -> list[ObservedTracks]:
 
 
 def nuisance_terms(profile: CameraProfile) -> tuple[Term, ...]:
-    """What is fitted beside the scene: everything that could pass for parallax."""
+    """What is fitted beside the scene: everything that could pass for parallax.
+
+    Before a tilted wall another travel with another turn shows nearly the same picture (a plane's second motion); that
+    turn would have to be a bias that no phone's gyroscope has.
+    """
     known = profile.time_offset_s is not None and "time_offset_s" not in profile.estimates
-    offset = replace(TIME_OFFSET, prior_std=(OFFSET_PRIOR_S,)) if known else TIME_OFFSET
-    bias = replace(GYRO_BIAS, prior_std=(BIAS_PRIOR_RAD_S,) * 3)
-    terms = [offset, bias, replace(IMU_ROTATION, prior_std=(ROTATION_PRIOR_RAD,) * 3)]
+    terms = [STATED_OFFSET if known else TIME_OFFSET, SMALL_BIAS, NEAR_AXES]
     if not profile.readout_known:
-        terms.append(replace(READOUT, prior_std=(READOUT_PRIOR_S,)))
+        terms.append(UNKNOWN_READOUT)
     focal = profile.estimates.get("fx_px")
     if focal is not None and isinstance(focal.std, float) and focal.std and profile.intrinsics is not None:
         terms.append(replace(FOCAL, prior_std=(focal.std / profile.intrinsics.fx_px,)))

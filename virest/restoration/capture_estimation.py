@@ -16,21 +16,21 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import Capture, Frame
+from virest.capture.imu import ImuSamples
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
 from virest.image_formation.row_motion import FrameTranslation, frame_times_s
-from virest.inference.alignment import (
+from virest.inference.coarse_alignment import MIN_EXPLAINED, STEP_S, align_coarsely
+from virest.inference.frame_selection import choose_pairs
+from virest.inference.guide_choice import find_guide
+from virest.inference.observed_tracks import GUESSED_FOCAL, ObservedTracks, observe_tracks
+from virest.inference.synchronisation import (
     AGREEMENT_SLACK_S,
-    COARSE_STEP_S,
-    MIN_EXPLAINED,
     OffsetEstimate,
     check_agreement,
-    choose_pairs,
     estimate_time_offset,
+    refine_time_offset,
 )
-from virest.inference.coarse_alignment import align_coarsely
-from virest.inference.guide_choice import find_guide
-from virest.inference.observed_tracks import GUESSED_FOCAL, observe_tracks
 from virest.inference.tracking import TrackPair, track_pairs
 from virest.inference.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.motion.integration import integrate_gyro
@@ -103,7 +103,7 @@ def _planned(
     all_pairs = track_pairs(kept_powers(pictures, looked_at, curve, powers), guide=guide)
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
-        plan = _filled(plan, capture, _through_resting_lens(tracked, capture, profile))
+        plan = _filled(plan, capture.imu, observe_tracks(capture, tracked, profile))
     alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
@@ -115,17 +115,21 @@ def _planned(
             settled = _with_clock(settled, profile, alignment)
         plan = settled
     if plan.refusal is None and not _clock_agrees(alignment, plan.profile):
-        pairs = _through_resting_lens(tracked, capture, plan.profile)
-        agreement = check_agreement(pairs, *_times(capture), capture.imu, plan.profile)
-        if np.isnan(agreement.motion_px) and not followed:
+        resting = _through_resting_lens(tracked, capture, plan.profile)
+        agreement = check_agreement(observe_tracks(capture, resting, plan.profile), capture.imu, plan.profile)
+        if not agreement.tested and not followed:
             plan = plan.noted(NoteCode.UNCHECKED, f"{UNCHECKED} ({agreement.reason})")
         if not agreement.agrees and not followed:
             plan = plan.refused(NoteCode.DISAGREEMENT, f"pictures and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
-            estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
-            offset_s, std_s = agreement.best_offset_s, COARSE_STEP_S
+            offset_s, std_s = agreement.best_offset_s, STEP_S
+            estimate = refine_time_offset(
+                observe_tracks(capture, tracked, plan.profile),
+                capture.imu,
+                replace(plan.profile, time_offset_s=offset_s),
+            )
             if estimate.determined:
-                offset_s, std_s = estimate.at_readout(plan.profile.shutter.readout_time_s), estimate.std_s
+                offset_s, std_s = estimate.time_offset_s, estimate.std_s
             plan = _with_doubt(plan, profile.time_offset_s, offset_s, std_s)
     if plan.refusal is not None:
         return plan
@@ -358,10 +362,6 @@ def resting_points(
     return lens.lens.project(lens.rays(points_px, time_s))
 
 
-def _times(capture: Capture) -> tuple[list[float], list[float | None]]:
-    return [f.time_s for f in capture.frames], [f.exposure_s for f in capture.frames]
-
-
 def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
     """A note for each value that is a documented default."""
     notes = []
@@ -376,9 +376,9 @@ def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
     return tuple(notes)
 
 
-def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> RestorationPlan:
+def _filled(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTracks) -> RestorationPlan:
     """The plan with time offset, gyroscope bias and focal length as far as the pictures determine them."""
-    estimate = estimate_time_offset(pairs, *_times(capture), capture.imu, plan.profile)
+    estimate = estimate_time_offset(observed, imu, plan.profile)
     plan = _with_focal(plan, estimate)
     if plan.profile.time_offset_s is not None:
         return plan
@@ -389,7 +389,7 @@ def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> 
         if estimate.explained < MIN_EXPLAINED:
             return plan.refused(NoteCode.NOT_FOLLOWING, "the pictures do not follow the gyroscope")
         return plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")
-    offset_s = estimate.at_readout(plan.profile.shutter.readout_time_s)
+    offset_s = estimate.time_offset_s
     profile = plan.profile.with_estimate(
         "time_offset_s", offset_s, estimate.std_s, "tracked points against the gyroscope", time_offset_s=offset_s
     )
@@ -403,7 +403,7 @@ def _filled(plan: RestorationPlan, capture: Capture, pairs: list[TrackPair]) -> 
 def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfile:
     """Take the gyroscope's bias over where it is significant and no parallax can have faked it."""
     bias, std = np.array(estimate.bias_rad_s), np.array(estimate.bias_std_rad_s)
-    if estimate.translation != "rotation" or not np.all(np.isfinite(std)) or np.all(np.abs(bias) < 3 * std):
+    if not np.all(np.isfinite(std)) or np.all(np.abs(bias) < 3 * std):
         return profile
     source = "tracked points against the gyroscope"
     values = tuple(float(b) for b in bias)

@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
-from virest.inference.coarse_alignment import SKEWS
-from virest.inference.frame_rotations import scan_offsets
+from virest.inference.coarse_alignment import MIN_PAIRS, SKEWS, align_coarsely
 from virest.inference.observed_tracks import ObservedTracks, guessed_lens, observe_tracks
 from virest.inference.tracking import TrackPair
 from virest.inference.visual_inertial import VisualInertialAlignment
-from virest.motion.integration import integrate_gyro
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.plan_notes import NoteCode
-from virest.restoration.profile_conflict import CONTRADICTED, MIN_PAIRS, Settled, settle_conflict
+from virest.restoration.profile_conflict import CONTRADICTED, Settled, settle_conflict
 
 OFFSET_SOURCE = "tracked points against the gyroscope"
 MAX_OFFSET_STD_S = 0.003
@@ -25,7 +21,6 @@ MAX_OFFSET_STD_S = 0.003
 paths, would be off by 0.1 rad/s."""
 MAX_FOCAL_SPREAD = 0.05
 """An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
-SEARCH_S, STEP_S = 1.0, 0.004
 FOLLOWED = 0.95
 """Part of the points' motion that must be explained for a residual to be a matter of the scene, not of the clocks."""
 LEAST_EXPLAINED = 0.3
@@ -112,15 +107,12 @@ def _begun(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -
     observed = observed.covered(capture.imu, profile)
     if len(observed.pairs) < MIN_PAIRS:
         return None
-    turns, trajectory = observed.turns(profile), integrate_gyro(capture.imu, profile)
-    steps = int(np.ceil(SEARCH_S / STEP_S))
-    offsets = STEP_S * np.arange(-steps, steps + 1, dtype=float)
+    turns, unset = observed.turns(profile), replace(profile, time_offset_s=None)
     least, begun = 1 - LEAST_EXPLAINED, None
     for skew in (0.0, *SKEWS):
-        scan = scan_offsets(turns, trajectory, profile.clock_skew + skew, offsets, free_gain=True)
-        best = int(np.argmax(scan.explained))
-        left = 1 - float(scan.explained[best])
-        if left < least and 0 < best < len(offsets) - 1:
-            least = left
-            begun = float(offsets[best] + skew * turns.middle_s.mean())
+        skewed = replace(unset, clock_skew=profile.clock_skew + skew)
+        found = align_coarsely(turns, capture.imu, skewed, own_axes=True, free_focal=True)
+        if found is not None and 1 - found.explained < least and not found.at_end:
+            least = 1 - found.explained
+            begun = found.time_offset_s + skew * float(turns.middle_s.mean())
     return None if begun is None else replace(profile, time_offset_s=begun)

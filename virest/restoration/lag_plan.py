@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
+from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.observed_tracks import observe_tracks
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.tracking import track_pairs
@@ -17,7 +18,6 @@ from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.plan_notes import NoteCode
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
-MIN_PAIRS = 8
 MOST_FRAMES = 90
 SOURCE = "repeated frames, and turns of the frames against the gyroscope's"
 

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, ground
-from virest.inference import profile_terms as terms_of
 from virest.inference.chance import chi2_tail, student_tail
+from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.observed_tracks import ObservedTracks
-from virest.inference.profile_terms import CLOCK_SKEW, shift_offset
-from virest.inference.track_fit import RAYLEIGH_MEDIAN, Term, TrackFit, fit_tracks, many_directions, start_scene
+from virest.inference.profile_terms import CLOCK_SKEW, careful_terms, shift_offset
+from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
+from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import DirectedMotion, Motion
 from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
@@ -30,8 +31,9 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 CONTRADICTED = 1.3
-"""Robust residual, in units of tracking's own noise, above which a cause is sought.  Right profiles leave 0.9 to 1.15
-(simulated captures, hand-held and walking); a stabiliser of a tenth or a focal length 2 % off leave more than 2."""
+"""Robust residual, in units of tracking's own noise, above which something is wrong with the model.  Right profiles
+leave 0.9 to 1.15 (simulated captures, hand-held and walking); a stabiliser of a tenth or a focal length 2 % off leave
+more than 2."""
 MOST_LEFT = 0.5
 """Part of the contradiction, as a variance beyond tracking's, that may remain for what was found to be taken."""
 HELD_OUT_P = 0.05
@@ -44,22 +46,13 @@ TOLD_SIGMA = 3.0
 MAX_CAUSES = 3
 JUDGED = 2
 """Causes judged on held-out blocks each time, those first that fit best."""
-MIN_PAIRS, BLOCKS = 8, 8
+BLOCKS = 8
 POINTS, START_POINTS, STARTS = 1500, 400, 2
 """Points of a fit, and of the search for where it may begin; fits begin at the best few starts."""
-CAUCHY = 2.4
 MAX_ITERATIONS = 10
 START_INVERSE_DEPTH_PER_M = 0.5
 TRANSLATION_GAIN = 0.9
 """A travelling camera is fitted where it leaves less than this part of what turning alone leaves."""
-NUISANCES = (
-    replace(terms_of.TIME_OFFSET, prior_std=(0.03,)),
-    replace(terms_of.GYRO_BIAS, prior_std=(0.02,) * 3),
-    replace(terms_of.IMU_ROTATION, prior_std=(0.03,) * 3),
-    replace(terms_of.READOUT, prior_std=(0.003,)),
-)
-"""What a profile may be a little off in."""
-UNKNOWN_READOUT_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +93,7 @@ def settle_conflict(
     observed = observed.covered(imu, profile)
     if profile.intrinsics is None or len(observed.pairs) < MIN_PAIRS:
         return Settled(profile)
-    nuisances = _nuisances(profile, offset_known, focal_known)
+    nuisances = careful_terms(profile, offset_known=offset_known, focal_known=focal_known)
     search = _Search(imu, observed.table(POINTS), observed.table(START_POINTS), profile, nuisances)
     base = search.base()
     noise_px = float(np.median(observed.noise_px))
@@ -142,15 +135,6 @@ def _focal(fit: TrackFit, noise_px: float) -> tuple[float, float]:
     focal_px = fit.profile.intrinsics.fx_px
     std = np.hypot(fit.std("focal_length"), bias_std(fit, "focal_length", noise_px))
     return focal_px, focal_px * float(std[0])
-
-
-def _nuisances(profile: CameraProfile, offset_known: bool, focal_known: bool) -> tuple[Term, ...]:
-    offset, bias, rotation, readout = NUISANCES
-    if not offset_known:
-        offset = terms_of.TIME_OFFSET
-    if not profile.readout_known:
-        readout = replace(readout, prior_std=(UNKNOWN_READOUT_S,))
-    return (offset, bias, rotation, readout) if focal_known else (offset, bias, rotation, readout, terms_of.FOCAL)
 
 
 def _std(fit: TrackFit, cause: Cause, noise_px: float) -> Array:

@@ -1,0 +1,283 @@
+"""Pictures and gyroscope on one clock: the time offset, the gyroscope's bias, and whether the two agree at all.
+
+Coarse: turns of the pictures against the gyroscope's at every offset within the search.  Fine: every tracked point at
+its own row's time (track_fit), with what a careful profile may be a little off in beside the offset.  What the clocks
+drift apart by is fitted about the middle of the points, where it does not touch the offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.image_formation.point_model import TrackTable
+from virest.inference.coarse_alignment import MIN_EXPLAINED, MIN_MOTION_PX, MIN_PAIRS, STEP_S, align_coarsely
+from virest.inference.frame_rotations import FrameRotations, gyro_turns
+from virest.inference.observed_tracks import MIN_TRACKS, ObservedTracks
+from virest.inference.profile_terms import CLOCK_SKEW, SMALL_BIAS, careful_terms, shift_offset
+from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, many_directions
+from virest.inference.tracking_bias import bias_std
+from virest.motion.integration import integrate_gyro
+from virest.motion.optics import settling_time_s
+
+Array = NDArray[np.float64]
+POINTS = 2500
+"""Tracked points used in the fit; evenly thinned beyond."""
+IMU_MARGIN_S = 0.5
+TRANSLATION_RATIO = 1.25
+"""The camera moves where differences are this much larger in all directions than across the best parallax."""
+MAX_STD_S = 0.02
+UNKNOWN_EXPOSURE_STD_S = 0.008
+UNKNOWN_READOUT_STD_S = 0.003
+"""At least, where the readout is fitted: lens and parallax shear pictures too."""
+MAX_FOCAL_LEFT = 1.5
+"""Residual, in units of tracking's noise, up to which a focal length is told.  A stabiliser of a tenth makes it 8 to
+9 % too short and leaves 1.7 to 3.5 at 0.2 and 0.1 px of noise; a principal point 9 px off leaves 1.15 to 1.4, and
+no error of the focal length above 0.1 % (tracks made from three analytic motions)."""
+MAX_FOCAL_SPREAD = 0.25
+DRIFT_SIGMA, LEAST_DRIFT = 4.0, 5e-4
+NEAR_S = 0.01
+FOREIGN_BIAS = 4.0
+"""A bias further from the profile's than this many prior deviations is an unmodelled scene, lens or axis map."""
+AGREEMENT_SLACK_S = 0.03
+"""An offset wrong by this is a matter for calibration, not a sign that pictures and gyroscope are strangers."""
+CLEARLY_BETTER = 30.0
+"""Chi-square (one degree of freedom) above which another offset is clearly better; errors of pairs go together, so
+more than nine."""
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetEstimate:
+    """The time offset and what came with it; t_imu = t_cam (1 + clock_skew) + time_offset_s."""
+
+    time_offset_s: float
+    """At the middle of the points, with the profile's readout and its meaning of a stamp."""
+    std_s: float
+    """Includes what the model leaves open; inf where not determined."""
+    determined: bool
+    """Whether the offset may be used."""
+    reason: str = ""
+    """Why not; or what to keep in mind; may be empty."""
+    explained: float = float("nan")
+    """Part of the pictures' changing turns that the gyroscope explains, at most 1."""
+    bias_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Gyroscope bias, IMU axes, as profiles hold it."""
+    bias_std_rad_s: tuple[float, float, float] = (float("nan"),) * 3
+    """NaN where it is not determined, or parallax may have faked it."""
+    readout_s: float = 0.0
+    """Fitted; negative where the rows are read the other way."""
+    drift_s_per_s: float = 0.0
+    """How the offset drifts: the clock skew that the profile may lack."""
+    drift_std_s_per_s: float = float("inf")
+    focal_px: float | None = None
+    """Fitted where the profile knows none, the points follow the fit and the motion determines it to a quarter."""
+    focal_std_px: float | None = None
+    travels: bool = False
+    """Whether the points were judged across the parallax of a camera that travels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """Whether the pictures move as the gyroscope says."""
+
+    agrees: bool
+    reason: str = ""
+    tested: bool = True
+    """Whether there were points and samples enough to ask."""
+    explained: float = float("nan")
+    """Part of the pictures' changing turns that the gyroscope explains at the profile's offset; NaN: unknown."""
+    best_offset_s: float | None = None
+    """Another offset at which they would agree, or agree clearly better; None: there is none, or none is needed."""
+
+
+# ── the time offset ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def estimate_time_offset(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
+) -> OffsetEstimate:
+    """Find the time offset within ± search_s of the profile's (of 0 where that is unknown), and the gyroscope's bias.
+
+    Never raises for poor data: the result says that nothing is determined, and why.
+    """
+    start_s, free_focal = profile.time_offset_s or 0.0, profile.intrinsics is None
+    if reason := _too_few(observed, imu):
+        return OffsetEstimate(start_s, float("inf"), False, reason)
+    turns = observed.turns(profile)
+    coarse = align_coarsely(turns, imu, profile, search_s, own_axes=True, free_focal=free_focal)
+    if coarse is None:
+        reason = "the inertial data do not cover the frames at any offset searched"
+        return OffsetEstimate(start_s, float("inf"), False, reason)
+    if (doubt := coarse.doubt(len(observed.pairs), observed.lens.fx_px)) is not None:
+        still = coarse.motion_rad * observed.lens.fx_px < MIN_MOTION_PX
+        explained = float("nan") if still else coarse.explained
+        return OffsetEstimate(start_s, float("inf"), False, doubt[0], explained)
+    lens = profile.intrinsics or observed.lens.scaled_focal(coarse.gain)
+    start = replace(profile, time_offset_s=coarse.time_offset_s, intrinsics=lens)
+    found = refine_time_offset(observed, imu, start, focal_known=not free_focal)
+    found = replace(found, explained=coarse.explained_near(found.time_offset_s, NEAR_S))
+    if found.determined and abs(found.time_offset_s - start_s) > search_s:
+        return replace(found, determined=False, reason=f"the offset left the search (±{search_s:g} s)")
+    if found.determined and found.explained < MIN_EXPLAINED:
+        reason = f"at the fitted offset the gyroscope explains only {max(found.explained, 0.0):.0%} of the turns"
+        return replace(found, determined=False, reason=reason)
+    return found
+
+
+def refine_time_offset(
+    observed: ObservedTracks, imu: ImuSamples, start: CameraProfile, *, focal_known: bool = True
+) -> OffsetEstimate:
+    """Fit the offset to tracked points from a profile whose offset is right to a few hundredths of a second."""
+    assert start.time_offset_s is not None
+    covered = observed.covered(imu, start)
+    if len(covered.pairs) < MIN_PAIRS:
+        reason = f"{len(covered.pairs)} pairs of frames lie inside the inertial data"
+        return OffsetEstimate(start.time_offset_s, float("inf"), False, reason)
+    table = covered.table(POINTS)
+    first_s, last_s = float(table.first_stamp_s.min()), float(table.second_stamp_s.max())
+    middle_s = float(np.mean(0.5 * (table.first_stamp_s + table.second_stamp_s)))
+    margin_s = IMU_MARGIN_S + settling_time_s(start)
+    imu = imu.between(float(start.imu_time_s(first_s)) - margin_s, float(start.imu_time_s(last_s)) + margin_s)
+
+    def skewed(profile: CameraProfile, v: Array) -> CameraProfile:
+        return shift_offset(CLOCK_SKEW.change(profile, v), -middle_s * v)
+
+    skew = replace(CLOCK_SKEW, change=skewed, prior_std=(0.005,))
+    terms = (*careful_terms(start, offset_known=False, focal_known=focal_known), skew)
+    fit = _simplest(imu, table, start, terms)
+    covered, astray = covered.without_astray(table.first_px, fit.distance)
+    if astray and len(covered.pairs) >= MIN_PAIRS:
+        table = covered.table(POINTS)
+        fit = fit_tracks(imu, table, fit.profile, terms, for_table(fit.scene, table))
+    spread_s = float(np.std(0.5 * (table.first_stamp_s + table.second_stamp_s) - middle_s))
+    return _concluded(fit, observed, start, middle_s, spread_s, focal_known)
+
+
+def _simplest(imu: ImuSamples, table: TrackTable, start: CameraProfile, terms: Sequence[Term]) -> TrackFit:
+    """Turning alone, or with the direction of travel that the points ask for."""
+    turning = fit_tracks(imu, table, start, terms)
+    if start.depth_m is not None and np.isinf(start.depth_m):
+        return turning
+    many = fit_tracks(imu, table, turning.profile, terms, many_directions(table))
+    if turning.scale < TRANSLATION_RATIO * many.scale:
+        return turning
+    return fit_directed(imu, table, turning.profile, terms, many)
+
+
+def _concluded(
+    fit: TrackFit, observed: ObservedTracks, start: CameraProfile, middle_s: float, spread_s: float, focal_known: bool
+) -> OffsetEstimate:
+    found, noise_px, notes = fit.profile, float(np.median(observed.noise_px)), []
+
+    def std(name: str) -> Array:
+        return np.asarray(np.hypot(fit.std(name), bias_std(fit, name, noise_px)))
+
+    readout_off_s, drift = (
+        found.shutter.readout_time_s - start.shutter.readout_time_s,
+        found.clock_skew - start.clock_skew,
+    )
+    offset_s = (found.time_offset_s or 0.0) + 0.5 * readout_off_s + drift * middle_s
+    variance, readout_std_s, drift_std = std("time_offset")[0] ** 2, std("readout_time")[0], std("clock_skew")[0]
+    if start.readout_known:
+        variance += 0.25 * max(readout_off_s**2 - readout_std_s**2, 0.0)
+    else:
+        variance += 0.25 * (readout_std_s**2 + UNKNOWN_READOUT_STD_S**2)
+        notes.append("readout unknown: the offset and half the readout are determined together only")
+    determined = bool(np.sqrt(variance) <= MAX_STD_S)
+    if not determined:
+        notes = [f"the motion does not determine the offset (standard deviation {1e3 * np.sqrt(variance):.0f} ms)"]
+    if not observed.exposure_known:
+        variance += UNKNOWN_EXPOSURE_STD_S**2
+        notes.append("exposure unknown: the offset contains half of it")
+    if abs(drift) > max(DRIFT_SIGMA * drift_std, LEAST_DRIFT):
+        variance += (drift * np.hypot(middle_s, spread_s)) ** 2
+        notes.append(f"the offset drifts by {1e3 * drift:.2f} ms a second: the clocks' rates differ")
+    bias_std_rad_s = std("gyro_bias")
+    changed = np.abs(np.subtract(found.gyro_bias_rad_s, start.gyro_bias_rad_s)) / np.array(SMALL_BIAS.prior_std)
+    if fit.scene is not None or np.max(changed) > FOREIGN_BIAS:
+        bias_std_rad_s = np.full(3, np.nan)
+    focal_px, focal_std_px = None, None
+    told = not focal_known and fit.scale < MAX_FOCAL_LEFT
+    if told and found.intrinsics is not None and (spread := std("focal_length")[0]) <= MAX_FOCAL_SPREAD:
+        focal_px, focal_std_px = found.intrinsics.fx_px, float(found.intrinsics.fx_px * spread)
+    return OffsetEstimate(
+        offset_s, float(np.sqrt(variance)), determined, "; ".join(notes), float("nan"), found.gyro_bias_rad_s,
+        tuple(bias_std_rad_s.tolist()), found.shutter.readout_time_s, drift, float(drift_std), focal_px, focal_std_px,
+        fit.scene is not None,
+    )  # fmt: skip
+
+
+def _too_few(observed: ObservedTracks, imu: ImuSamples) -> str:
+    if len(observed.pairs) < MIN_PAIRS:
+        return f"{len(observed.pairs)} pairs of frames with {MIN_TRACKS} or more tracked points; {MIN_PAIRS} are needed"
+    return f"{len(imu)} gyroscope samples" if len(imu) < 8 else ""
+
+
+# ── agreement ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def check_agreement(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
+) -> Agreement:
+    """Tell whether the pictures turn as the gyroscope says at the profile's offset, give or take AGREEMENT_SLACK_S.
+
+    Bias and steady drift are free, moving objects and parallax count little.  Too little to tell counts as agreement:
+    nothing speaks against the gyroscope.
+    """
+    if reason := _too_few(observed, imu):
+        return Agreement(True, f"too little to tell: {reason}", tested=False)
+    offset_s, focal_px, turns = profile.time_offset_s or 0.0, observed.lens.fx_px, observed.turns(profile)
+    seen_px, told_px = (focal_px * changes for changes in _changes_rad(turns, imu, profile))
+    if max(_rms(seen_px), _rms(told_px)) < MIN_MOTION_PX:
+        return Agreement(True, "too little motion to tell")
+    free_focal = profile.intrinsics is None
+    coarse = align_coarsely(turns, imu, profile, search_s, own_axes=True, free_focal=free_focal)
+    explained = -np.inf if coarse is None else coarse.explained_near(offset_s, AGREEMENT_SLACK_S)
+    if coarse is None or not np.isfinite(explained):
+        return Agreement(True, "too little to tell: no inertial data at the frames")
+    if explained >= MIN_EXPLAINED:
+        better = _clearly_better(coarse.offset_s, coarse.explained_at, offset_s, 3 * len(observed.pairs))
+        return Agreement(True, explained=explained, best_offset_s=better)
+    elsewhere = None if coarse.doubt(len(observed.pairs), focal_px) else coarse.time_offset_s
+    hint = "stabilised pictures, or not of this recording?"
+    if elsewhere is not None:
+        hint = f"at an offset of {elsewhere:+.3f} s it would explain {coarse.explained:.0%}"
+    reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the pictures' rotation: {hint}"
+    return Agreement(False, reason, explained=explained, best_offset_s=elsewhere)
+
+
+def _clearly_better(tried_s: Array, explained_at: Array, offset_s: float, figures: int) -> float | None:
+    """Offset near the given one that leaves clearly less unexplained; None: there is none.
+
+    What is left, as a parabola over the offset, has its least there; times ``figures`` / least, the difference is a
+    chi-square of one.
+    """
+    near = np.abs(tried_s - offset_s) <= AGREEMENT_SLACK_S
+    best = int(np.argmax(np.where(near, explained_at, -np.inf)))
+    if not 0 < best < len(tried_s) - 1:
+        return None
+    before, here, after = 1 - explained_at[best - 1 : best + 2]
+    bend, lean = (before + after) / 2 - here, (after - before) / 2
+    if not np.isfinite(bend) or bend <= 0:
+        return None
+    steps = float(np.clip(-lean / (2 * bend), -0.5, 0.5))
+    least = max(float(here + lean * steps + bend * steps**2), 1e-9)
+    at_given = 1 - float(np.interp(offset_s, tried_s, explained_at))
+    chi_square = figures * (at_given / least - 1)
+    return float(tried_s[best]) + steps * STEP_S if chi_square > CLEARLY_BETTER else None
+
+
+def _changes_rad(turns: FrameRotations, imu: ImuSamples, profile: CameraProfile) -> tuple[Array, Array]:
+    """The changing turns of pictures and gyroscope at the profile's offset, (p, 3) each."""
+    times = (np.asarray(profile.imu_time_s(time_s)) for time_s in (turns.first_s, turns.second_s))
+    told = gyro_turns(integrate_gyro(imu, profile), *times)
+    return turns.detrended(turns.vector_rad), turns.detrended(told)
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean((vectors**2).sum(axis=-1))))
