@@ -120,15 +120,15 @@ def join_neighbours(
     if not blurred.neighbours:
         return
     centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
-    size, alone, lamps = own[0].shape[::-1], deconvolution.alone(own, ratio), _lit_by_lamps(blurred)
+    size, lamps, further = own[0].shape[::-1], _lit_by_lamps(blurred), []
     for one in blurred.neighbours:
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
         kept = _kept_sharpness(one.shift_std_px / scale, deconvolution.size)
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
         if lamps is not None:
             trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
-        deconvolution.join(channels(one), kernels, kept, ratio, trust, alone)
-    deconvolution.share_noise()
+        further.append(tiles.FurtherPicture(channels(one), kernels, kept, trust))
+    deconvolution.join(own, further, ratio)
 
 
 def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:

@@ -37,8 +37,6 @@ ORDINARY = 16.0
 up to 1 dB); things that move differ by 10 to 400 times and lose nothing by 16."""
 LEAST_ALIKE = 0.5
 """Part of a picture that a neighbour must show in its place to tell what moves."""
-AROUND = 17
-"""Side of what lies around a place, in reduced pixels."""
 LEAST_SHIFTS = 6
 """An affine field of shifts has six unknowns; as many tiles again must bear it out."""
 LOOKED_AT = 6
@@ -145,7 +143,8 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     none of it is ordinary.  Of a tile's own shift counts what the noise of shifts, noise_px on each axis, does not
     explain (James & Stein 1961).
     """
-    left, both = (cv2.sqrBoxFilter(one, cv2.CV_32F, (AROUND, AROUND)) for one in agreement.differences(shift_px))
+    tiles, both = agreement.differences(shift_px), agreement.power_around(agreement.shown())
+    left = agreement.power_around(tiles)
     if np.median(left / (OWN_ERROR * both + np.float32(independent_error))) > MOST_DIFFERENT:
         return np.zeros_like(left)
     noise = min(independent_error, float(np.median(left)))
@@ -153,8 +152,9 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     trust = np.float32(0.5) / cv2.max(left / (np.float32(ORDINARY) * expected) - np.float32(0.5), 0.5)
     off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
     sure = np.maximum(1 - 2 * noise_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
-    own_px = shift_px + sure[:, None] * off_px
-    misplaced = left - cv2.sqrBoxFilter(agreement.differences(own_px)[0], cv2.CV_32F, (AROUND, AROUND))
+    own = np.flatnonzero(sure)
+    tiles[own] = agreement.differences(shift_px[own] + sure[own, None] * off_px[own], own)
+    misplaced = left - agreement.power_around(tiles)
     trust *= expected / (expected + 2 * cv2.max(misplaced, 0.0))
     return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
 

@@ -31,6 +31,8 @@ AROUND = TILE // 4
 """What a tile is blurred together with on each side: half of the longest path that is compared."""
 WIDE = TILE + 2 * AROUND
 INNER = slice(AROUND, AROUND + TILE)
+NEARBY = 17
+"""Side of what lies around a place, in reduced pixels."""
 MOST_TILES = 16
 LEAST_TILES = 4
 """A turn has three unknowns and a tile's shift tells two; fewer tiles leave nothing to check it by."""
@@ -140,10 +142,10 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
     there = _kernel_spectra(view.field(), tops_lefts, times)
     if there is None:
         return None
-    a, apart = _spectra(_blurred(tiles.spectra * there)), np.zeros(2)
+    a, apart = _spectra(_inner(tiles.spectra * there)), np.zeros(2)
     for _ in range(2):
         b = _wide_spectra(_brought(view, second, times, apart), tops_lefts)
-        b = _spectra(_blurred(b * tiles.kernels))
+        b = _spectra(_inner(b * tiles.kernels))
         common = _common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
             break
@@ -183,22 +185,29 @@ class TileAgreement:
     times: int
     """How many times smaller the compared pictures are."""
 
-    def differences(self, shift_px: Array) -> tuple[Image, Image]:
-        """What the frame, so far (n, 2) on, has less than the neighbour, and what both have, in light over its mean.
+    def differences(self, shift_px: Array, numbers: NDArray[np.intp] | slice = slice(None)) -> Image:
+        """What the frame's tiles, so far (n, 2) on, have less than the neighbour's: (n, TILE, TILE), light over mean.
 
-        Of the reduced picture, (height, width) each.  Nearer to its edges than the blur reaches, where what lies beyond
-        decides, stands what is next to that.
+        numbers: of those tiles.
         """
-        here = fft.irfft2(_shifted(self.here, shift_px / self.times), (WIDE, WIDE))[:, INNER, INNER]
+        return np.asarray(self.there[numbers] - _inner(_shifted(self.here[numbers], shift_px / self.times)))
+
+    def shown(self) -> Image:
+        """What both show, (n, TILE, TILE), in light over its mean."""
+        return self.there - 1
+
+    def power_around(self, tiles: Image) -> Image:
+        """Mean square of tiles (n, TILE, TILE) around each place, in a picture (height, width) of the reduced size.
+
+        Nearer to its edges than the blur reaches, where what lies beyond decides, stands what is next to that.
+        """
         height, width = self.tops_lefts.max(axis=0) + TILE
-        left, both = np.zeros((2, height, width), np.float32)
-        for (top, start), one, other in zip(self.tops_lefts.tolist(), here, self.there, strict=True):
-            left[top : top + TILE, start : start + TILE] = other - one
-            both[top : top + TILE, start : start + TILE] = other - 1
-        inner = slice(self.blur_px, height - self.blur_px), slice(self.blur_px, width - self.blur_px)
-        edge = (self.blur_px,) * 4
-        left, both = (cv2.copyMakeBorder(one[inner], *edge, cv2.BORDER_REFLECT) for one in (left, both))
-        return left, both
+        whole = np.zeros((height, width), np.float32)
+        for (top, left), tile in zip(self.tops_lefts.tolist(), tiles, strict=True):
+            whole[top : top + TILE, left : left + TILE] = tile
+        inner = whole[self.blur_px : height - self.blur_px, self.blur_px : width - self.blur_px]
+        whole = cv2.copyMakeBorder(inner, *(self.blur_px,) * 4, cv2.BORDER_REFLECT)
+        return cv2.sqrBoxFilter(whole, cv2.CV_32F, (NEARBY, NEARBY))
 
     def expected_error(self, frequency: Array, noise: Array, slope: float) -> float:
         """The mean square difference that independent noise makes, in light over its mean.
@@ -223,7 +232,7 @@ def tile_agreement(
     there = _brought(view, second, tiles.times)
     wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles), TILE // 4)
     lamps = (cv2.max(tiles.light, there) > CLIPPED_LIGHT).astype(np.uint8)
-    here, there_blurred = _blurred(wide), _blurred(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
+    here, there_blurred = _inner(wide), _inner(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
     a, b = _spectra(here), _spectra(there_blurred)
     shift, precision = _tile_shifts(a, b, np.zeros(2))
     means = [np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
@@ -266,7 +275,7 @@ def judged_change(
         return None
     there = _cut(_brought(view, second, times), tops_lefts)
     b = _spectra(there)
-    onto = [_spectra(_blurred(_wide_spectra(picture, tops_lefts) * kernels)) for picture in (recorded, restored)]
+    onto = [_spectra(_inner(_wide_spectra(picture, tops_lefts) * kernels)) for picture in (recorded, restored)]
     shift, precision = _tile_shifts(onto[0] + onto[1], b, np.zeros(2))
     onto = [_shifted(a, shift) for a in onto]
     used = (precision > 0) & (np.maximum(_cut(recorded, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT)
@@ -334,9 +343,10 @@ def _wide_spectra(picture: Image, tops_lefts: NDArray[np.intp]) -> NDArray[np.co
     return np.asarray(fft.rfft2(_cut(padded, tops_lefts, WIDE)))
 
 
-def _blurred(wide: NDArray[np.complex64]) -> Image:
+def _inner(wide: NDArray[np.complex64]) -> Image:
     """Tiles (n, TILE, TILE) of spectra (n, WIDE, WIDE / 2 + 1)."""
-    return np.asarray(fft.irfft2(wide, (WIDE, WIDE))[:, INNER, INNER])
+    rows = fft.ifft(wide, axis=1)[:, INNER]
+    return np.asarray(fft.irfft(rows, WIDE, axis=2)[:, :, INNER])
 
 
 def _brought(view: NeighbourView, second: Image, times: int, apart: Array | None = None) -> Image:
