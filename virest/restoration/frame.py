@@ -265,7 +265,7 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     found = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
     joined = joined_neighbours(found, luma_model)
-    longest_px = max((longest_px, *(one.longest_px for one in joined.pictures)))
+    longest_px = max((longest_px, *(one.longest_px for one in joined.places)))
     if joined.pictures:
         promised_db = luma_model.joint_gain_db(joined.passed)
     blurred = replace(blurred, spread=spread, neighbours=joined.pictures, longest_px=longest_px)
@@ -283,11 +283,11 @@ def _deblurred(
         part = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
         part, measured = part * _share_map(blurred, share), measured_share(blurred)
         part = part if measured is None else part * measured
-        still = still_part(joined.pictures)
+        still = still_part(joined.places)
         if still is not None and still.min() < 1:
             part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
         if confirmed is not None:
-            part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.pictures)))
+            part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.places)))
     restored = _mixed(sharp, recorded, part)
     ideal = luma_model.ideal_error(joined.passed)
     alone = luma_model.ideal_error(np.zeros_like(joined.passed))
@@ -305,7 +305,7 @@ def _deblurred(
         "expected_gain_std_db": gain_db[1],
         "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
-        "neighbours": [{"frame": one.number, "weight": one.weight} for one in joined.pictures],
+        "neighbours": [{"frame": one.number, "weight": one.weight} for one in joined.places],
         "neighbours_gain_db": 10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,

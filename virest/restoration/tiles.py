@@ -28,8 +28,6 @@ SETTLING_ITERATIONS, SETTLING_RELAXATION = 4, 1.7
 """About as good as seven plain steps of Richardson-Lucy's."""
 LAMP_DOUBT = 0.02
 """Highlight level, in units of the recorded range, at which the blend is half Richardson–Lucy."""
-EVEN_TRUST = 0.5
-"""x"""
 LEAST_TRUSTED = 0.3
 """Part of a tile that must be trusted for it to be joined: less is not worth its transforms."""
 Filter = Callable[[Image], Image]
@@ -44,8 +42,8 @@ class FurtherPicture:
     """(height, width) each."""
     kernels: Image
     """(tiles, k, k)."""
-    sharpness: Image
-    """What its uncertain place leaves of it on average, a packed real factor s."""
+    sharpness: Sequence[Image]
+    """What its uncertain place leaves of it on average in each tile, a packed real factor s."""
     trust: Image
     """(height, width) 0 to 1."""
 
@@ -137,8 +135,8 @@ class TileDeconvolution:
 
         What an uncertain place makes wrong, (1 − s²) |K|² of the signal, is noise of its own beside that of a frame,
         N / S ``ratio``, and the further picture weighs as much less; the power |K|² stays, as in any expected data
-        term.  Where it is trusted little there stands in its place what the linear filter finds in the tile's own
-        picture, blurred as the other is, which says nothing new.
+        term.  A tile that it is trusted in all over weighs by the mean.  Where it is left out there stands in its place
+        what the linear filter finds in the tile's own picture, blurred as the other is, which says nothing new.
 
         What the others add counts as the noise that they may share allows, since a coder repeats a still scene with its
         noise.  Noise N common to all is projected back to |Σ w K|² N, where independent noise makes Σ w |K|² N: that is
@@ -159,7 +157,7 @@ class TileDeconvolution:
             if not telling:
                 continue
             known: list[Image] = []
-            if not all(other.even[number] for other in telling):
+            if not all(other.whole[number] for other in telling):
                 divisor = cv2.add(power, ratio)
                 known = [self._rest[number]] if number in self._rest else [cv2.divide(b, divisor) for b in projected]
             sums[:] = self.kernels[number]
@@ -287,7 +285,7 @@ class _Joining:
     """A further picture while it is joined to tiles."""
 
     def __init__(self, tiles: TileDeconvolution, picture: FurtherPicture) -> None:
-        self._tiles, self._sharpness, self._lost = tiles, picture.sharpness, 1 - picture.sharpness**2
+        self._tiles, self._sharpness = tiles, picture.sharpness
         self._padded, self._trusted = [tiles.padded(c) for c in picture.channels], tiles.padded(picture.trust)
         self._corners, patch = list(tiles.grid.corners()), tiles.patch
         parts = [self._trusted[top : top + patch, left : left + patch] for top, left in self._corners]
@@ -295,9 +293,9 @@ class _Joining:
         means = [cv2.mean(part)[0] for part in parts]
         self.used = [mean > LEAST_TRUSTED for mean in means]
         """Tiles that it is joined to."""
-        self.even = [least >= EVEN_TRUST * most for least, most in bounds]
-        """Those that it is trusted in about alike."""
-        self._weight = [m if e else b[1] for m, e, b in zip(means, self.even, bounds, strict=True)]
+        self.whole = [least > 0 for least, _ in bounds]
+        """Those without a place where it is left out."""
+        self._weight = [mean if whole else most for mean, whole, (_, most) in zip(means, self.whole, bounds, strict=True)]
         chosen = picture.kernels[np.array(self.used, bool)]
         self._spectra = _kernel_spectra(chosen, tiles.size, repeat(np.empty_like(tiles.powers[0])))
 
@@ -311,14 +309,16 @@ class _Joining:
         one, sums, weight, factor, back = buffers
         kernel = next(self._spectra)
         _whole_power(kernel, one)
-        cv2.multiply(self._lost, one, weight)
+        sharpness = self._sharpness[number]
+        np.multiply(sharpness, sharpness, out=weight)
+        cv2.multiply(cv2.subtract(1.0, weight, weight), one, weight)
         cv2.add(cv2.add(weight, ratio, weight), LEAST_RATIO, weight)
         cv2.divide(ratio, weight, weight, self._weight[number])
-        cv2.multiply(self._sharpness, weight, factor)
+        cv2.multiply(sharpness, weight, factor)
         cv2.accumulateProduct(one, weight, power)
         cv2.accumulateProduct(kernel, factor, sums)
         tiles, corner, share = self._tiles, self._corners[number], None
-        if not self.even[number]:
+        if not self.whole[number]:
             share = cv2.multiply(tiles.periodic(self._trusted, *corner), 1 / self._weight[number])
             forward = cv2.multiply(kernel, _conjugating(tiles.size))
         for channel, (plane, joined) in enumerate(zip(self._padded, projected, strict=True)):

@@ -57,7 +57,6 @@ def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:
         np.ones(len(shift)),
         spectra,
         there,
-        np.full(len(shift), 0.09),
         1.0,
         1.0,
         np.zeros((height, width), bool),

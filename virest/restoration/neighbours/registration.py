@@ -170,8 +170,6 @@ class TileAgreement:
     """(n, WIDE, WIDE / 2 + 1) spectra of the frame's tiles, blurred, in light over its mean."""
     there: Image
     """(n, TILE, TILE) the neighbour's, blurred, in light over its mean."""
-    signal: Array
-    """(n,) mean square of what both show."""
     gain: float
     """The neighbour's light over the frame's."""
     light: float
@@ -235,15 +233,14 @@ def tile_agreement(
     here, there_blurred = _inner(wide), _inner(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
     a, b = _spectra(here), _spectra(there_blurred)
     shift, precision = _tile_shifts(a, b, np.zeros(2))
-    means = [np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
+    per_mean = [1 / np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
     return TileAgreement(
         tiles.tops_lefts,
         tiles.centres_px,
         shift * tiles.times,
         precision,
-        wide / means[0],
-        there_blurred / means[1],
-        (there_blurred / means[1]).var(axis=(1, 2)),
+        wide * per_mean[0],
+        there_blurred * per_mean[1],
         float(np.median(_cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
         cv2.dilate(lamps, np.ones((4 * blur_px + 1, 4 * blur_px + 1), np.uint8)) > 0,
@@ -328,9 +325,9 @@ def _kernel_spectra(
     radius = kernels.radius_px
     if 2 * radius + 1 > TILE // 2:
         return None
-    padded = np.zeros((len(tops_lefts), WIDE, WIDE), np.float32)
-    padded[:, : 2 * radius + 1, : 2 * radius + 1] = kernels.arrays()
-    return np.asarray(np.conj(fft.rfft2(np.roll(padded, (-radius, -radius), (1, 2)))))
+    along, down = (np.exp(2j * np.pi * radius * f).astype(np.complex64) for f in _axes(WIDE))
+    rows = fft.rfft(kernels.arrays()[:, ::-1, ::-1], WIDE, axis=2) * along  # the transpose, its middle at 0
+    return np.asarray(fft.fft(rows, WIDE, axis=1) * down[:, None])
 
 
 def _cut(picture: Image, tops_lefts: NDArray[np.intp], side: int = TILE) -> Image:
