@@ -153,15 +153,16 @@ class TileDeconvolution:
             power, projected = self.powers[number], [joined[number] for joined in self._joined]
             for plane, back in zip(padded, projected, strict=True):
                 _product(self._recorded(plane, number, corner), self.kernels[number], back)
-            telling = [other for other in others if other.used[number]]
+            telling = sorted((other for other in others if other.used[number]), key=lambda other: not other.whole[number])
             if not telling:
                 continue
-            known: list[Image] = []
-            if not all(other.whole[number] for other in telling):
-                divisor = cv2.add(power, ratio)
-                known = [self._rest[number]] if number in self._rest else [cv2.divide(b, divisor) for b in projected]
             sums[:] = self.kernels[number]
             for other in telling:
+                known: list[Image] = []
+                if not other.whole[number]:
+                    divisor = cv2.add(power, ratio)
+                    rest = self._rest.get(number)
+                    known = [cv2.divide(b, divisor) for b in projected] if rest is None else [rest]
                 other.add(number, known, ratio, power, projected, buffers)
             _whole_power(sums, one)
             evidence = cv2.divide(power, cv2.max(cv2.max(one, power), LEAST_RATIO), one)
@@ -295,7 +296,7 @@ class _Joining:
         """Tiles that it is joined to."""
         self.whole = [least > 0 for least, _ in bounds]
         """Those without a place where it is left out."""
-        self._weight = [mean if whole else most for mean, whole, (_, most) in zip(means, self.whole, bounds, strict=True)]
+        self._weights, self._most = means, [most for _, most in bounds]
         chosen = picture.kernels[np.array(self.used, bool)]
         self._spectra = _kernel_spectra(chosen, tiles.size, repeat(np.empty_like(tiles.powers[0])))
 
@@ -313,13 +314,13 @@ class _Joining:
         np.multiply(sharpness, sharpness, out=weight)
         cv2.multiply(cv2.subtract(1.0, weight, weight), one, weight)
         cv2.add(cv2.add(weight, ratio, weight), LEAST_RATIO, weight)
-        cv2.divide(ratio, weight, weight, self._weight[number])
+        cv2.divide(ratio, weight, weight, self._weights[number])
         cv2.multiply(sharpness, weight, factor)
         cv2.accumulateProduct(one, weight, power)
         cv2.accumulateProduct(kernel, factor, sums)
         tiles, corner, share = self._tiles, self._corners[number], None
         if not self.whole[number]:
-            share = cv2.multiply(tiles.periodic(self._trusted, *corner), 1 / self._weight[number])
+            share = cv2.multiply(tiles.periodic(self._trusted, *corner), 1 / self._most[number])
             forward = cv2.multiply(kernel, _conjugating(tiles.size))
         for channel, (plane, joined) in enumerate(zip(self._padded, projected, strict=True)):
             tile = tiles.periodic(plane, *corner)

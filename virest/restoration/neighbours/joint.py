@@ -32,12 +32,15 @@ MOST_DIFFERENT = 4.0
 seen to differ by 0.05 to 0.9 times that (3 at 0.08 bits a pixel), pictures of other places by 5 to 1500."""
 LEAST_TRUST = 0.25
 """Where a neighbour weighs less it is not used."""
-ORDINARY = 16.0
+MOVING = 16.0
 """Difference around a place, over noise's, that is nothing else: edges of a chessboard reach it (at 8 its frames lose
 up to 1 dB); things that move differ by 10 to 400 times and lose nothing by 16."""
+ORDINARY = 6.0
+"""The same close by, for what a neighbour is to weigh."""
+AROUND, CLOSE_BY = 17, 7
+"""Sides of what lies around a place and close by, in reduced pixels: things, and their rims."""
 LEAST_ALIKE = 0.5
 """Part of a picture that a neighbour must show in its place to tell what moves."""
-USE_MISPLACED = 1
 SPARSE = 4
 """What lies around places changes so little from one to the next that medians need only every fourth."""
 LEAST_SHIFTS = 6
@@ -69,6 +72,8 @@ class NeighbourPlace:
     """(n, 2) of the tiles in which it was compared."""
     trust: Image
     """Noise of the frame over that of the neighbour, 0 to 1, of a picture that is smaller than the frame."""
+    alike: Image
+    """How surely it shows what the frame shows, 0 to 1, of the same size."""
     seen: NDArray[np.bool_]
     """Of the same size: where it has a picture."""
     std_px: Array
@@ -136,13 +141,13 @@ def neighbour_place(
     std_px = np.full(len(used), lasting_px)
     std_px[used] = _left_of_shifts_px(off_px, lasting_px, noise_px)
     std_px = np.hypot(std_px, noise_px * np.sqrt(LEAST_SHIFTS / len(off_px)))
-    trust = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
+    trust, alike = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
     height, width = trust.shape
     places = view.map_px(lambda points_px: points_px - _at(affine, points_px), agreement.times)[:height, :width]
     inside = cv2.inRange(places, (-0.5, -0.5), (width - 0.5, height - 0.5)) > 0
     seen = inside & ~agreement.clipped[:height, :width]
     return NeighbourPlace(
-        number, view, affine, agreement.gain, field, agreement.centres_px, trust * seen, seen, std_px
+        number, view, affine, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px
     )
 
 
@@ -156,31 +161,50 @@ def neighbour_picture(place: NeighbourPlace, light: Image, half_light: Image) ->
     return NeighbourPicture(place, brought, brought_half)
 
 
-def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float) -> Image:
-    """Noise of a frame over that of its neighbour, by how they differ around each place of the reduced picture.
+def _trust(
+    agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float
+) -> tuple[Image, Image]:
+    """Noise of a frame over that of its neighbour, and how surely both show the same, 0 to 1, of the reduced picture.
 
-    Of the difference's power, noise of both making E, half is the frame's.  Rings take overtones of edges for noise,
-    which is no more than what half of all places differ by; it scatters, and E is ORDINARY times as much.  What a tile
-    differs by only because its own shift is not the field's is another matter: it bends the picture near relief, and
-    none of it is ordinary.  Of a tile's own shift counts what the noise of shifts, noise_px on each axis, does not
-    explain (James & Stein 1961).
+    Of the difference's power around a place, noise of both making E, half is the frame's.  Rings take overtones of
+    edges for noise, which is no more than what half of all places differ by; it scatters, and E is some times as much:
+    less for what a neighbour is to weigh, which rims that hide other things in either frame make wrong, than for
+    telling that something moves.  What a tile differs by only because its own shift is not the field's is another
+    matter: it bends the picture near relief, and none of it is ordinary.  Of a tile's own shift counts what the noise
+    of shifts, noise_px on each axis, does not explain (James & Stein 1961).
     """
-    tiles, both = agreement.differences(shift_px), agreement.power_around(agreement.shown())
-    left = agreement.power_around(tiles)
+    tiles = agreement.differences(shift_px)
+    different, shown = agreement.side_by_side(tiles), agreement.side_by_side(agreement.shown())
+    left, both = (_power_around(one, AROUND) for one in (different, shown))
     some = np.s_[::SPARSE, ::SPARSE]
     if np.median(left[some] / (OWN_ERROR * both[some] + np.float32(independent_error))) > MOST_DIFFERENT:
-        return np.zeros_like(left)
-    noise = min(independent_error, float(np.median(left[some])))
-    expected = OWN_ERROR * both + np.float32(noise)
-    trust = np.float32(0.5) / cv2.max(left / (np.float32(ORDINARY) * expected) - np.float32(0.5), 0.5)
+        return np.zeros_like(left), np.zeros_like(left)
+    noise = np.float32(min(independent_error, float(np.median(left[some]))))
+    expected = OWN_ERROR * both + noise
+    alike = _explained(left, MOVING * expected)
+    near, shown_near = (_power_around(one, CLOSE_BY) for one in (different, shown))
+    trust = _explained(near, ORDINARY * (OWN_ERROR * shown_near + noise))
     off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
     sure = np.maximum(1 - 2 * noise_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
-    if not USE_MISPLACED: return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
     own = np.flatnonzero(sure)
     tiles[own] = agreement.differences(shift_px[own] + sure[own, None] * off_px[own], own)
-    misplaced = left - agreement.power_around(tiles)
+    misplaced = left - _power_around(agreement.side_by_side(tiles), AROUND)
     trust *= expected / (expected + 2 * cv2.max(misplaced, 0.0))
+    return _not_less(trust), _not_less(alike)
+
+
+def _explained(power: Image, most: Image) -> Image:
+    """1 where a difference's power is at most what is expected, and as much less as half of it is the neighbour's."""
+    return np.float32(0.5) / cv2.max(power / most - np.float32(0.5), 0.5)
+
+
+def _not_less(trust: Image) -> Image:
     return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
+
+
+def _power_around(picture: Image, side: int) -> Image:
+    """Mean square over squares about each place."""
+    return cv2.sqrBoxFilter(picture, cv2.CV_32F, (side, side))
 
 
 def still_part(found: Sequence[NeighbourPlace]) -> Image | None:
@@ -189,10 +213,10 @@ def still_part(found: Sequence[NeighbourPlace]) -> Image | None:
     What no neighbour shows in its place moves, and its blur is not the camera's.  Where none has a picture nothing
     speaks against it.  Those that show something else nearly everywhere tell nothing; None: no other.
     """
-    telling = [one for one in found if one.trust[one.seen].mean() > LEAST_ALIKE]
+    telling = [one for one in found if one.alike[one.seen].mean() > LEAST_ALIKE]
     if not telling:
         return None
-    best = np.maximum.reduce([one.trust for one in telling])
+    best = np.maximum.reduce([one.alike for one in telling])
     return np.where(np.logical_or.reduce([one.seen for one in telling]), best, np.float32(1))
 
 

@@ -31,8 +31,6 @@ AROUND = TILE // 4
 """What a tile is blurred together with on each side: half of the longest path that is compared."""
 WIDE = TILE + 2 * AROUND
 INNER = slice(AROUND, AROUND + TILE)
-NEARBY = 17
-"""Side of what lies around a place, in reduced pixels."""
 MOST_TILES = 16
 LEAST_TILES = 4
 """A turn has three unknowns and a tile's shift tells two; fewer tiles leave nothing to check it by."""
@@ -194,8 +192,8 @@ class TileAgreement:
         """What both show, (n, TILE, TILE), in light over its mean."""
         return self.there - 1
 
-    def power_around(self, tiles: Image) -> Image:
-        """Mean square of tiles (n, TILE, TILE) around each place, in a picture (height, width) of the reduced size.
+    def side_by_side(self, tiles: Image) -> Image:
+        """Tiles (n, TILE, TILE) as a picture (height, width) of the reduced size.
 
         Nearer to its edges than the blur reaches, where what lies beyond decides, stands what is next to that.
         """
@@ -204,8 +202,7 @@ class TileAgreement:
         for (top, left), tile in zip(self.tops_lefts.tolist(), tiles, strict=True):
             whole[top : top + TILE, left : left + TILE] = tile
         inner = whole[self.blur_px : height - self.blur_px, self.blur_px : width - self.blur_px]
-        whole = cv2.copyMakeBorder(inner, *(self.blur_px,) * 4, cv2.BORDER_REFLECT)
-        return cv2.sqrBoxFilter(whole, cv2.CV_32F, (NEARBY, NEARBY))
+        return cv2.copyMakeBorder(inner, *(self.blur_px,) * 4, cv2.BORDER_REFLECT)
 
     def expected_error(self, frequency: Array, noise: Array, slope: float) -> float:
         """The mean square difference that independent noise makes, in light over its mean.
