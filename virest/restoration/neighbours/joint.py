@@ -35,8 +35,8 @@ LEAST_TRUST = 0.25
 MOVING = 16.0
 """Difference around a place, over noise's, that is nothing else: edges of a chessboard reach it (at 8 its frames lose
 up to 1 dB); things that move differ by 10 to 400 times and lose nothing by 16."""
-ORDINARY = 6.0
-"""The same close by, for what a neighbour is to weigh."""
+RIM_PX = 0.2
+"""Shift of tiles side by side"""
 AROUND, CLOSE_BY = 17, 7
 """Sides of what lies around a place and close by, in reduced pixels: things, and their rims."""
 LEAST_ALIKE = 0.5
@@ -143,9 +143,7 @@ def neighbour_place(
     std_px = np.hypot(std_px, noise_px * np.sqrt(LEAST_SHIFTS / len(off_px)))
     trust, alike = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
     height, width = trust.shape
-    places = view.map_px(lambda points_px: points_px - _at(affine, points_px), agreement.times)[:height, :width]
-    inside = cv2.inRange(places, (-0.5, -0.5), (width - 0.5, height - 0.5)) > 0
-    seen = inside & ~agreement.clipped[:height, :width]
+    seen = (agreement.inside & ~agreement.clipped)[:height, :width]
     return NeighbourPlace(
         number, view, affine, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px
     )
@@ -182,10 +180,12 @@ def _trust(
     noise = np.float32(min(independent_error, float(np.median(left[some]))))
     expected = OWN_ERROR * both + noise
     alike = _explained(left, MOVING * expected)
-    near, shown_near = (_power_around(one, CLOSE_BY) for one in (different, shown))
-    trust = _explained(near, ORDINARY * (OWN_ERROR * shown_near + noise))
     off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
     sure = np.maximum(1 - 2 * noise_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
+    near, shown_near = (_power_around(one, CLOSE_BY) for one in (different, shown))
+    relief_px = agreement.over_picture(agreement.wholly_seen * sure * np.linalg.norm(off_px, axis=1))
+    ordinary = MOVING / (1 + (relief_px / np.float32(RIM_PX)) ** 2)
+    trust = _explained(near, cv2.max(ordinary, 1.0) * (OWN_ERROR * shown_near + noise))
     own = np.flatnonzero(sure)
     tiles[own] = agreement.differences(shift_px[own] + sure[own, None] * off_px[own], own)
     misplaced = left - _power_around(agreement.side_by_side(tiles), AROUND)

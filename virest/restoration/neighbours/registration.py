@@ -172,6 +172,8 @@ class TileAgreement:
     """The neighbour's light over the frame's."""
     light: float
     """The frame's light, median of the tiles."""
+    inside: NDArray[np.bool_]
+    """Of the reduced picture: where the neighbour has one."""
     clipped: NDArray[np.bool_]
     """Of the reduced picture: where light that was too bright to be measured may reach, in either frame."""
     blur_px: int
@@ -204,6 +206,18 @@ class TileAgreement:
         inner = whole[self.blur_px : height - self.blur_px, self.blur_px : width - self.blur_px]
         return cv2.copyMakeBorder(inner, *(self.blur_px,) * 4, cv2.BORDER_REFLECT)
 
+    @property
+    def wholly_seen(self) -> NDArray[np.bool_]:
+        """(n,) whether the neighbour shows all of a tile."""
+        return np.asarray(_cut(self.inside, self.tops_lefts).all(axis=(1, 2)))
+
+    def over_picture(self, values: Array) -> Image:
+        """The largest of tiles (n,) and those beside them, at all places (height, width) of the reduced size."""
+        rows = len(np.unique(self.tops_lefts[:, 0]))
+        height, width = self.tops_lefts.max(axis=0) + TILE
+        largest = cv2.dilate(values.reshape(rows, -1).astype(np.float32), np.ones((3, 3), np.uint8))
+        return cv2.resize(largest, (int(width), int(height)), interpolation=cv2.INTER_LINEAR)
+
     def expected_error(self, frequency: Array, noise: Array, slope: float) -> float:
         """The mean square difference that independent noise makes, in light over its mean.
 
@@ -224,7 +238,8 @@ def tile_agreement(
     kernels = _kernel_spectra(field, tiles.tops_lefts, tiles.times)
     if kernels is None:
         return None
-    there = _brought(view, second, tiles.times)
+    source = view.map_px(times=tiles.times)
+    there = cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles), TILE // 4)
     lamps = (cv2.max(tiles.light, there) > CLIPPED_LIGHT).astype(np.uint8)
     here, there_blurred = _inner(wide), _inner(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
@@ -240,6 +255,7 @@ def tile_agreement(
         there_blurred * per_mean[1],
         float(np.median(_cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
+        cv2.inRange(source, (-0.5, -0.5), (second.shape[1] - 0.5, second.shape[0] - 0.5)) > 0,
         cv2.dilate(lamps, np.ones((4 * blur_px + 1, 4 * blur_px + 1), np.uint8)) > 0,
         blur_px,
         np.asarray(_power(tiles.kernels).mean(axis=0) + _power(kernels).mean(axis=0)),
