@@ -129,7 +129,8 @@ def join_neighbours(
     for neighbour in blurred.neighbours:
         one = neighbour.place
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
-        kept = [_kept_sharpness(round(std_px / STD_STEP_PX) * STD_STEP_PX / scale, deconvolution.size) for std_px in one.std_at_px(centres_px)]
+        stds_px = STD_STEP_PX * np.round(one.std_at_px(centres_px) / STD_STEP_PX)
+        kept = [_kept_sharpness(std_px / scale, deconvolution.size) for std_px in stds_px.tolist()]
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
         if lamps is not None:
             trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0

@@ -135,8 +135,9 @@ class TileDeconvolution:
 
         What an uncertain place makes wrong, (1 − s²) |K|² of the signal, is noise of its own beside that of a frame,
         N / S ``ratio``, and the further picture weighs as much less; the power |K|² stays, as in any expected data
-        term.  A tile that it is trusted in all over weighs by the mean.  Where it is left out there stands in its place
-        what the linear filter finds in the tile's own picture, blurred as the other is, which says nothing new.
+        term.  A tile weighs by its mean trust.  Where it is left out there stands in its place what the linear filter
+        finds in the tile without it, blurred as the other is, which says nothing new: pictures that are trusted all
+        over a tile come first.
 
         What the others add counts as the noise that they may share allows, since a coder repeats a still scene with its
         noise.  Noise N common to all is projected back to |Σ w K|² N, where independent noise makes Σ w |K|² N: that is
@@ -153,7 +154,9 @@ class TileDeconvolution:
             power, projected = self.powers[number], [joined[number] for joined in self._joined]
             for plane, back in zip(padded, projected, strict=True):
                 _product(self._recorded(plane, number, corner), self.kernels[number], back)
-            telling = sorted((other for other in others if other.used[number]), key=lambda other: not other.whole[number])
+            telling = sorted(
+                (other for other in others if other.used[number]), key=lambda other: not other.whole[number]
+            )
             if not telling:
                 continue
             sums[:] = self.kernels[number]
@@ -301,7 +304,13 @@ class _Joining:
         self._spectra = _kernel_spectra(chosen, tiles.size, repeat(np.empty_like(tiles.powers[0])))
 
     def add(
-        self, number: int, known: Sequence[Image], ratio: Image, power: Image, projected: Sequence[Image], buffers: Image
+        self,
+        number: int,
+        known: Sequence[Image],
+        ratio: Image,
+        power: Image,
+        projected: Sequence[Image],
+        buffers: Image,
     ) -> None:
         """Add it to a tile's power and projected channels, and w K to the second of the buffers; tiles in order.
 
@@ -320,7 +329,10 @@ class _Joining:
         cv2.accumulateProduct(kernel, factor, sums)
         tiles, corner, share = self._tiles, self._corners[number], None
         if not self.whole[number]:
-            share = cv2.multiply(tiles.periodic(self._trusted, *corner), 1 / self._most[number])
+            share = np.zeros_like(one)  # a bridge is no measurement
+            top, left = corner
+            part = self._trusted[top : top + tiles.patch, left : left + tiles.patch]
+            cv2.multiply(part, 1 / self._most[number], share[: tiles.patch, : tiles.patch])
             forward = cv2.multiply(kernel, _conjugating(tiles.size))
         for channel, (plane, joined) in enumerate(zip(self._padded, projected, strict=True)):
             tile = tiles.periodic(plane, *corner)

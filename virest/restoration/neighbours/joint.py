@@ -36,7 +36,9 @@ MOVING = 16.0
 """Difference around a place, over noise's, that is nothing else: edges of a chessboard reach it (at 8 its frames lose
 up to 1 dB); things that move differ by 10 to 400 times and lose nothing by 16."""
 RIM_PX = 0.2
-"""Shift of tiles side by side"""
+"""Shift of a tile against the field at which half as much is ordinary, there and beside it: what lies nearer hides in
+one frame what the other shows, rims as wide as the shift, which counts for less than a sixth of a chessboard's edges.
+Chosen on relief at 1 and 0.7 m, two walks, a chessboard and a shake; 0.1 loses 0.1 dB on these."""
 AROUND, CLOSE_BY = 17, 7
 """Sides of what lies around a place and close by, in reduced pixels: things, and their rims."""
 LEAST_ALIKE = 0.5
@@ -159,9 +161,7 @@ def neighbour_picture(place: NeighbourPlace, light: Image, half_light: Image) ->
     return NeighbourPicture(place, brought, brought_half)
 
 
-def _trust(
-    agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float
-) -> tuple[Image, Image]:
+def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float) -> tuple[Image, Image]:
     """Noise of a frame over that of its neighbour, and how surely both show the same, 0 to 1, of the reduced picture.
 
     Of the difference's power around a place, noise of both making E, half is the frame's.  Rings take overtones of

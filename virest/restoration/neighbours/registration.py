@@ -209,7 +209,8 @@ class TileAgreement:
     @property
     def wholly_seen(self) -> NDArray[np.bool_]:
         """(n,) whether the neighbour shows all of a tile."""
-        return np.asarray(_cut(self.inside, self.tops_lefts).all(axis=(1, 2)))
+        seen = self.inside.astype(np.float32)
+        return np.asarray(_cut(seen, self.tops_lefts).min(axis=(1, 2)) > 0)
 
     def over_picture(self, values: Array) -> Image:
         """The largest of tiles (n,) and those beside them, at all places (height, width) of the reduced size."""
