@@ -149,7 +149,7 @@ def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
     return cv2.dilate(blurred.holes, np.ones((side, side), np.uint8))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)
 def _kept_sharpness(shift_std_px: float, size: int) -> Image:
     """What is left on average of a picture that lies this far off, each axis, on a packed spectrum."""
     return np.exp(-0.5 * (2 * np.pi * shift_std_px * packed_frequency(size)) ** 2)
