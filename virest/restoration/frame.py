@@ -46,8 +46,6 @@ LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
 FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
 """Gradients of this many times the noise survive the prior; above this gain their loss does not matter."""
-JOINED_ITERATIONS = 5
-"""Neighbours leave less to the prior; four steps lose 0.3 dB on a chessboard and nothing elsewhere."""
 PART_STEP_PX = 80
 """Grid spacing of the minimum-blur test."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
@@ -275,7 +273,7 @@ def _deblurred(
     if light is not None:
         recorded = encode_picture([as_kept(plane, blurred) for plane in blurred.light], curve)
     if joined.pictures:
-        settings = replace(settings, iterations=min(settings.iterations, JOINED_ITERATIONS))
+        settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
     sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
     part: NDArray[np.float32] | np.float32 = np.float32(1.0)
     if anchor == 0.5:
