@@ -78,6 +78,16 @@ def test_phones_are_measured_in_both_sections_and_their_profile_is_the_nominal_o
     assert len(honesty_workloads(Scale(quick=True))) == 4
 
 
+def test_the_quality_table_of_one_kind_measures_that_kind_alone() -> None:
+    """The six shaken scenes are not among the quick ones, but a look at their kind measures four frames of each."""
+    assert not [w for w in quality_workloads(Scale(quick=True)) if w.kind == "shaken"]
+    for scale, frames in ((Scale(kinds=("shaken",)), 8), (Scale(quick=True, kinds=("shaken",)), 4)):
+        chosen = quality_workloads(scale)
+        assert [w.kind for w in chosen] == ["shaken"] * 6
+        assert {w.options["frames"] for w in chosen} == {frames}
+    assert len(quality_workloads(Scale())) == len({w.name for w in quality_workloads(Scale())})
+
+
 def test_a_kept_capture_is_used_again_only_if_it_is_the_same(tmp_path: Path) -> None:
     """The same options: not touched; others: made anew under its name."""
     options = {"width": 64, "height": 48, "frames": 2, "exposure_ms": 4.0}

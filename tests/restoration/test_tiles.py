@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from virest.image_formation.blur import Image, fast_size, tile_grid
 from virest.restoration.statistics.on_tiles import packed_frequency
 from virest.restoration.tiles import (
-    SharpTiles,
+    FurtherPicture,
     TileDeconvolution,
     _ends,
     _ends_product,
@@ -289,17 +289,22 @@ def _stroke(across: bool) -> NDArray[np.float32]:
 
 
 def _joined(
-    picture: Image, kernel: Image, further: Image, its_kernel: Image, sharpness: float = 1.0, ratio: float = 1e-3
+    picture: Image,
+    kernel: Image,
+    further: Image,
+    its_kernel: Image,
+    sharpness: float = 1.0,
+    ratio: float = 1e-3,
+    trust: Image | None = None,
 ) -> TileDeconvolution:
-    """Tiles of a picture to which a further one was joined that is trusted everywhere."""
+    """Tiles of a picture to which a further one was joined; trust: None: everywhere."""
     grid = tile_grid(*picture.shape, 64, 16)
     count = len(grid.centres_px)
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], count, 0), 16)
     sharp, noise = (np.full((deconvolution.size,) * 2, value, np.float32) for value in (sharpness, ratio))
-    nowhere = SharpTiles(lambda *_: pytest.fail("a picture that is trusted everywhere needs no other"))
-    kernels = np.repeat(its_kernel[None], count, 0)
-    deconvolution.join([further], kernels, sharp, noise, np.ones_like(picture), nowhere)
-    deconvolution.share_noise()
+    trust = np.ones_like(picture) if trust is None else trust
+    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), [sharp] * count, trust)
+    deconvolution.join([picture], [other], noise)
     return deconvolution
 
 
@@ -340,3 +345,20 @@ def test_a_neighbour_whose_place_is_uncertain_weighs_less() -> None:
     alone = TileDeconvolution(tile_grid(100, 150, 64, 16), np.repeat(across[None], len(known), 0), 16).powers
     gain_known, gain_uncertain = (float((powers - alone).clip(0).sum()) for powers in (known, uncertain))
     assert 0 < gain_uncertain < 0.2 * gain_known
+
+
+def test_a_picture_that_shows_something_else_in_a_place_changes_nothing_there() -> None:
+    """Where it is left out its content does not matter, and the rest of the tile still gains by it."""
+    rng = np.random.default_rng(4)
+    sharp = texture(140, 200).astype(np.float32)
+    across, down = _stroke(True), _stroke(False)
+    first, second = (
+        cv2.filter2D(sharp, cv2.CV_32F, kernel) + rng.normal(0, 0.01, sharp.shape).astype(np.float32)
+        for kernel in (across, down)
+    )
+    trust, foreign = np.ones_like(sharp), second.copy()
+    trust[50:90, 70:120], foreign[50:90, 70:120] = 0, 1
+    left_out = [_joined(first, across, other, down, trust=trust).back_projected(first) for other in (second, foreign)]
+    np.testing.assert_allclose(*left_out, atol=1e-4 * np.abs(left_out[0]).max())
+    wrong = _joined(first, across, foreign, down).back_projected(first)
+    assert np.abs(wrong - left_out[0]).max() > 0.01 * np.abs(left_out[0]).max()

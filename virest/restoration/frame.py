@@ -46,8 +46,6 @@ LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
 FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
 """Gradients of this many times the noise survive the prior; above this gain their loss does not matter."""
-JOINED_ITERATIONS = 5
-"""Neighbours leave less to the prior; four steps lose 0.3 dB on a chessboard and nothing elsewhere."""
 PART_STEP_PX = 80
 """Grid spacing of the minimum-blur test."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
@@ -265,7 +263,7 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     found = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
     joined = joined_neighbours(found, luma_model)
-    longest_px = max((longest_px, *(one.longest_px for one in joined.pictures)))
+    longest_px = max((longest_px, *(one.longest_px for one in joined.places)))
     if joined.pictures:
         promised_db = luma_model.joint_gain_db(joined.passed)
     blurred = replace(blurred, spread=spread, neighbours=joined.pictures, longest_px=longest_px)
@@ -275,7 +273,7 @@ def _deblurred(
     if light is not None:
         recorded = encode_picture([as_kept(plane, blurred) for plane in blurred.light], curve)
     if joined.pictures:
-        settings = replace(settings, iterations=min(settings.iterations, JOINED_ITERATIONS))
+        settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
     sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
     part: NDArray[np.float32] | np.float32 = np.float32(1.0)
     if anchor == 0.5:
@@ -283,11 +281,11 @@ def _deblurred(
         part = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
         part, measured = part * _share_map(blurred, share), measured_share(blurred)
         part = part if measured is None else part * measured
-        still = still_part(joined.pictures)
+        still = still_part(joined.places)
         if still is not None and still.min() < 1:
             part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
         if confirmed is not None:
-            part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.pictures)))
+            part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.places)))
     restored = _mixed(sharp, recorded, part)
     ideal = luma_model.ideal_error(joined.passed)
     alone = luma_model.ideal_error(np.zeros_like(joined.passed))
@@ -305,7 +303,7 @@ def _deblurred(
         "expected_gain_std_db": gain_db[1],
         "promised_gain_db": promised_db,
         "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
-        "neighbours": [{"frame": one.number, "weight": one.weight} for one in joined.pictures],
+        "neighbours": [{"frame": one.number, "weight": one.weight} for one in joined.places],
         "neighbours_gain_db": 10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,

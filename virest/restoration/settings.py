@@ -34,6 +34,8 @@ class RestorationSettings:
     """Time of the restored picture: exposure start of the first row read, or the frame's middle."""
     iterations: int = 4
     """Of the iterative methods."""
+    joined_iterations: int = 5
+    """At most so many where a frame is restored with neighbours, which leave less to the prior."""
     inner_iterations: int = 4
     """Of the whole-picture method: conjugate-gradient steps in each iteration."""
     tile_px: int = 128
@@ -55,7 +57,14 @@ class RestorationSettings:
 PRESETS: dict[str, RestorationSettings] = {
     "fast": RestorationSettings("fast", "hyper-laplacian", iterations=2, tile_px=176, strength=0.8),
     "balanced": RestorationSettings(
-        "balanced", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3, most_joined=2
+        "balanced",
+        "hyper-laplacian",
+        iterations=6,
+        joined_iterations=4,
+        tile_px=104,
+        strength=1.0,
+        neighbours=3,
+        most_joined=2,
     ),
     "best": RestorationSettings(
         "best", "hyper-laplacian", iterations=6, tile_px=104, strength=1.0, neighbours=3, most_joined=3

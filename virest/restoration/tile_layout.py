@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -36,6 +37,10 @@ BORDER_NOISE_TO_SIGNAL = 0.003
 UNEVEN_NOISE_TO_SIGNAL = 0.03
 """Least N / S of a picture whose power lies at few places: an error of the kernel there, or of what a tile sees around
 itself, is proportional to the power, and exceeds the noise."""
+
+
+STD_STEP_PX = 0.05
+"""Steps in which the deviation of a neighbour's place counts."""
 
 
 def luma_tiles(
@@ -120,15 +125,17 @@ def join_neighbours(
     if not blurred.neighbours:
         return
     centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
-    size, alone, lamps = own[0].shape[::-1], deconvolution.alone(own, ratio), _lit_by_lamps(blurred)
-    for one in blurred.neighbours:
+    size, lamps, further = own[0].shape[::-1], _lit_by_lamps(blurred), []
+    for neighbour in blurred.neighbours:
+        one = neighbour.place
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
-        kept = _kept_sharpness(one.shift_std_px / scale, deconvolution.size)
+        stds_px = STD_STEP_PX * np.round(one.std_at_px(centres_px) / STD_STEP_PX)
+        kept = [_kept_sharpness(std_px / scale, deconvolution.size) for std_px in stds_px.tolist()]
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
         if lamps is not None:
             trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
-        deconvolution.join(channels(one), kernels, kept, ratio, trust, alone)
-    deconvolution.share_noise()
+        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust))
+    deconvolution.join(own, further, ratio)
 
 
 def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
@@ -142,6 +149,7 @@ def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
     return cv2.dilate(blurred.holes, np.ones((side, side), np.uint8))
 
 
+@lru_cache(maxsize=128)
 def _kept_sharpness(shift_std_px: float, size: int) -> Image:
     """What is left on average of a picture that lies this far off, each axis, on a packed spectrum."""
     return np.exp(-0.5 * (2 * np.pi * shift_std_px * packed_frequency(size)) ** 2)

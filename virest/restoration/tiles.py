@@ -8,6 +8,7 @@ side, so real filters are plain products.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import repeat
 
@@ -33,22 +34,21 @@ Filter = Callable[[Image], Image]
 """Turns a kernel's power spectrum |K|² (packed, real parts doubled) into the real factor that follows conj(K)."""
 
 
-class SharpTiles:
-    """Spectra of sharp tiles, each made once, when it is asked for."""
+@dataclass(frozen=True, slots=True)
+class FurtherPicture:
+    """Another picture of the scene that some tiles show, brought to their picture's pixels."""
 
-    def __init__(self, make: Callable[[int, int], Image]) -> None:
-        """make: by the channel's number and the tile's."""
-        self._make = make
-        self._made: dict[tuple[int, int], Image] = {}
-
-    def spectrum(self, channel: int, number: int) -> Image:
-        """Of one tile, (size, size), packed."""
-        if (channel, number) not in self._made:
-            self._made[channel, number] = self._make(channel, number)
-        return self._made[channel, number]
+    channels: Sequence[Image]
+    """(height, width) each."""
+    kernels: Image
+    """(tiles, k, k)."""
+    sharpness: Sequence[Image]
+    """What its uncertain place leaves of it on average in each tile, a packed real factor s."""
+    trust: Image
+    """(height, width) 0 to 1."""
 
 
-LEAST_RATIO = np.float32(1e-12)
+LEAST_RATIO = 1e-12
 """Added to N / S, which is 0 for a mean."""
 
 
@@ -94,11 +94,7 @@ class TileDeconvolution:
         if variance is not None:
             self.powers += variance(self.size)
         self._joined: list[Image] = []
-        """Σ w K_kᵀ g_k of further pictures, (tiles, size, size) spectra of each channel."""
-        self._kernel_sums: Image | None = None
-        """Σ w K_k with the picture's own, (tiles, size, size), while pictures are being joined."""
-        self._evidence: Image | None = None
-        """Weight of the data term, (tiles, size, size) real factors; None: 1."""
+        """Σ w K_kᵀ g_k of all pictures, (tiles, size, size) spectra of each channel; none: there are no others."""
         self._without_highlights: dict[int, Image] = {}
         """Spectra of tiles as they were recorded but for their lamps, by number."""
         self._rest: dict[int, Image] = {}
@@ -114,106 +110,67 @@ class TileDeconvolution:
     def back_projected(self, channel: Image, number_joined: int = 0) -> Image:
         """Spectra of Kᵀ g, (tiles, size, size); channel (height, width) is extended, never wrapped.
 
-        number_joined: which of the channels that were joined goes with it.
+        number_joined: which of the channels that were joined it is: what was summed up then is returned.
         Of tamed tiles, g is what they would have recorded without their lamps.
         """
+        if self._joined:
+            return self._joined[number_joined]
         padded, projected = self.padded(channel), np.empty_like(self.kernels)
         ends = np.empty((*self.kernels.shape[:2], 2), np.float32)
-        for number, (top, left) in enumerate(self.grid.corners()):
-            spectrum = self._without_highlights.get(number)
-            if spectrum is None:
-                spectrum = transforms.forward(self.periodic(padded, top, left), self._spectrum)
+        for number, corner in enumerate(self.grid.corners()):
+            spectrum = self._recorded(padded, number, corner)
             inner = _inner_numbers(projected[number])
             np.multiply(_inner_numbers(spectrum), _inner_numbers(self.kernels[number]), out=inner)
             ends[number] = _ends(spectrum)
         _ends(projected)[:] = _ends_product(ends, _ends(self.kernels))
-        if self._evidence is not None:
-            projected *= self._evidence
-        if self._joined:
-            projected += self._joined[number_joined]
         return projected
 
-    def join(
-        self,
-        channels: Sequence[Image],
-        kernels: Image,
-        sharpness: Image,
-        ratio: Image,
-        trust: Image,
-        alone: SharpTiles,
-    ) -> None:
-        """Take a further picture of the same scene into account, channels (height, width).
+    def _recorded(self, padded: Image, number: int, corner: tuple[int, int]) -> Image:
+        """Spectrum of what a tile recorded, or would have without its lamps; good until the next."""
+        spectrum = self._without_highlights.get(number)
+        return transforms.forward(self.periodic(padded, *corner), self._spectrum) if spectrum is None else spectrum
 
-        kernels: (tiles, k, k).  sharpness: what its uncertain place leaves of it on average, a packed real factor s;
-        the power |K|² stays, as in any expected data term.  What the place makes wrong, (1 − s²) |K|² of the signal, is
-        noise of its own beside that of a frame, N / S ``ratio``, and it weighs as much less.  trust: (height, width)
-        0 to 1; where it is little there stands in place of the picture what ``alone`` would be in it, which says
-        nothing new.
+    def join(self, channels: Sequence[Image], further: Sequence[FurtherPicture], ratio: Image) -> None:
+        """Take further pictures of the same scene into account; channels (height, width) of the tiles' own picture.
+
+        What an uncertain place makes wrong, (1 − s²) |K|² of the signal, is noise of its own beside that of a frame,
+        N / S ``ratio``, and the further picture weighs as much less; the power |K|² stays, as in any expected data
+        term.  A tile weighs by its mean trust.  Where it is left out there stands in its place what the linear filter
+        finds in the tile without it, blurred as the other is, which says nothing new: pictures that are trusted all
+        over a tile come first.
+
+        What the others add counts as the noise that they may share allows, since a coder repeats a still scene with its
+        noise.  Noise N common to all is projected back to |Σ w K|² N, where independent noise makes Σ w |K|² N: that is
+        no less along different paths, and along one path nothing is gained.  The data term weighs by the ratio of both,
+        at most 1.
+
+        Tile by tile, so that what is worked on stays in the cache.
         """
-        if self._kernel_sums is None:
-            self._joined = [np.zeros_like(self.kernels) for _ in channels]
-            self._kernel_sums = self.kernels.copy()
-        padded, trusted = [self.padded(channel) for channel in channels], self.padded(trust)
-        corners, patch = list(self.grid.corners()), self.patch
-        parts = [trusted[top : top + patch, left : left + patch] for top, left in corners]
-        least = [cv2.minMaxLoc(part)[0] for part in parts]
-        used = [k for k, part in enumerate(parts) if least[k] == 1 or cv2.mean(part)[0] > LEAST_TRUSTED]
-        one, weight, factor, back = np.empty((4, self.size, self.size), np.float32)
-        lost = 1 - sharpness**2
-        for number, kernel in zip(used, _kernel_spectra(kernels[used], self.size), strict=True):
-            _power_inside(kernel, one)
-            _power_at_ends(kernel[None], one[None])
-            cv2.divide(ratio, cv2.add(cv2.multiply(lost, one), ratio + LEAST_RATIO), weight)
-            cv2.multiply(sharpness, weight, factor)
-            share = self.periodic(trusted, *corners[number]).copy() if least[number] < 1 else None
-            for channel, (plane, joined) in enumerate(zip(padded, self._joined, strict=True)):
-                tile = self.periodic(plane, *corners[number])
-                if share is not None:
-                    tile = tile.copy()
-                    known = alone.spectrum(channel, number)
-                    predicted = transforms.inverse(cv2.mulSpectrums(known, kernel, 0, conjB=True))
-                    tile = cv2.add(predicted, cv2.multiply(share, cv2.subtract(tile, predicted)))
-                spectrum = transforms.forward(tile, self._spectrum)
-                np.multiply(_inner_numbers(spectrum), _inner_numbers(kernel), out=_inner_numbers(back))
-                _ends(back)[:] = _ends_product(np.array(_ends(spectrum)), np.array(_ends(kernel)))
-                cv2.accumulateProduct(back, factor, joined[number])
-            cv2.accumulateProduct(one, weight, self.powers[number])
-            cv2.accumulateProduct(kernel, factor, self._kernel_sums[number])
-
-    def share_noise(self) -> None:
-        """Once all are joined: what neighbours add counts as the noise that they may share allows.
-
-        A coder repeats a still scene with its noise.  Noise N common to all is projected back to |Σ w K|² N, where
-        independent noise makes Σ w |K|² N: that is no less along different paths, and along one path nothing is gained.
-        The data term weighs by the ratio of both, at most 1.
-        """
-        if self._kernel_sums is None:
-            return
-        common, self._evidence, self._kernel_sums = np.empty_like(self._tile), self._kernel_sums, None
-        for number, (total, power) in enumerate(zip(self._evidence, self.powers, strict=True)):
-            _power_inside(total, common)
-            _power_at_ends(total[None], common[None])
-            weight = np.divide(power, np.maximum(cv2.max(common, power), LEAST_RATIO), out=total)
-            for spectra in (self.powers, *self._joined):
-                spectra[number] *= weight
-
-    def alone(self, channels: Sequence[Image], ratio: Image) -> SharpTiles:
-        """The tiles of the picture by itself, made sharp by the linear filter with N / S ``ratio``, as asked for.
-
-        Beside lamps, once they were removed, as they were found.
-        """
-        padded, corners = [self.padded(channel) for channel in channels], list(self.grid.corners())
-
-        def sharp(channel: int, number: int) -> Image:
-            if number in self._rest:
-                return self._rest[number]
-            spectrum = transforms.forward(self.periodic(padded[channel], *corners[number]))
-            kernel, power = self.kernels[number], np.empty_like(ratio)
-            _power_inside(kernel, power)
-            _power_at_ends(kernel[None], power[None])
-            return cv2.divide(cv2.mulSpectrums(spectrum, kernel, 0), cv2.add(power, ratio))
-
-        return SharpTiles(sharp)
+        padded = [self.padded(channel) for channel in channels]
+        others = [_Joining(self, one) for one in further]
+        self._joined = [np.empty_like(self.kernels) for _ in channels]
+        one, sums, *_ = buffers = np.empty((5, self.size, self.size), np.float32)
+        for number, corner in enumerate(self.grid.corners()):
+            power, projected = self.powers[number], [joined[number] for joined in self._joined]
+            for plane, back in zip(padded, projected, strict=True):
+                _product(self._recorded(plane, number, corner), self.kernels[number], back)
+            telling = sorted(
+                (other for other in others if other.used[number]), key=lambda other: not other.whole[number]
+            )
+            if not telling:
+                continue
+            sums[:] = self.kernels[number]
+            for other in telling:
+                known: list[Image] = []
+                if not other.whole[number]:
+                    divisor = cv2.add(power, ratio)
+                    rest = self._rest.get(number)
+                    known = [cv2.divide(b, divisor) for b in projected] if rest is None else [rest]
+                other.add(number, known, ratio, power, projected, buffers)
+            _whole_power(sums, one)
+            evidence = cv2.divide(power, cv2.max(cv2.max(one, power), LEAST_RATIO), one)
+            for spectrum in (power, *projected):
+                cv2.multiply(spectrum, evidence, spectrum)
 
     def touched(self, mask: Image) -> list[int]:
         """Numbers of the tiles that see anything of a mask (height, width)."""
@@ -328,6 +285,65 @@ class TileDeconvolution:
         return tile
 
 
+class _Joining:
+    """A further picture while it is joined to tiles."""
+
+    def __init__(self, tiles: TileDeconvolution, picture: FurtherPicture) -> None:
+        self._tiles, self._sharpness = tiles, picture.sharpness
+        self._padded, self._trusted = [tiles.padded(c) for c in picture.channels], tiles.padded(picture.trust)
+        self._corners, patch = list(tiles.grid.corners()), tiles.patch
+        parts = [self._trusted[top : top + patch, left : left + patch] for top, left in self._corners]
+        bounds = [cv2.minMaxLoc(part)[:2] for part in parts]
+        means = [cv2.mean(part)[0] for part in parts]
+        self.used = [mean > LEAST_TRUSTED for mean in means]
+        """Tiles that it is joined to."""
+        self.whole = [least > 0 for least, _ in bounds]
+        """Those without a place where it is left out."""
+        self._weights, self._most = means, [most for _, most in bounds]
+        chosen = picture.kernels[np.array(self.used, bool)]
+        self._spectra = _kernel_spectra(chosen, tiles.size, repeat(np.empty_like(tiles.powers[0])))
+
+    def add(
+        self,
+        number: int,
+        known: Sequence[Image],
+        ratio: Image,
+        power: Image,
+        projected: Sequence[Image],
+        buffers: Image,
+    ) -> None:
+        """Add it to a tile's power and projected channels, and w K to the second of the buffers; tiles in order.
+
+        known: what is known of the sharp channels without it.
+        """
+        one, sums, weight, factor, back = buffers
+        kernel = next(self._spectra)
+        _whole_power(kernel, one)
+        sharpness = self._sharpness[number]
+        np.multiply(sharpness, sharpness, out=weight)
+        cv2.multiply(cv2.subtract(1.0, weight, weight), one, weight)
+        cv2.add(cv2.add(weight, ratio, weight), LEAST_RATIO, weight)
+        cv2.divide(ratio, weight, weight, self._weights[number])
+        cv2.multiply(sharpness, weight, factor)
+        cv2.accumulateProduct(one, weight, power)
+        cv2.accumulateProduct(kernel, factor, sums)
+        tiles, corner, share = self._tiles, self._corners[number], None
+        if not self.whole[number]:
+            share = np.zeros_like(one)  # a bridge is no measurement
+            top, left = corner
+            part = self._trusted[top : top + tiles.patch, left : left + tiles.patch]
+            cv2.multiply(part, 1 / self._most[number], share[: tiles.patch, : tiles.patch])
+            forward = cv2.multiply(kernel, _conjugating(tiles.size))
+        for channel, (plane, joined) in enumerate(zip(self._padded, projected, strict=True)):
+            tile = tiles.periodic(plane, *corner)
+            if share is not None:
+                _product(known[channel], forward, back)
+                predicted = transforms.inverse(back, one)
+                tile = cv2.add(cv2.multiply(share, cv2.subtract(tile, predicted, back), back), predicted, back)
+            _product(transforms.forward(tile, one), kernel, back)
+            cv2.accumulateProduct(back, factor, joined)
+
+
 def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
     """Richardson-Lucy over a periodic tile."""
 
@@ -416,6 +432,28 @@ def _inner_numbers(packed: Image) -> NDArray[np.complex64]:
 def _ends(packed: Image) -> Image:
     """The first and the last column of packed spectra, where the parts of a number lie in alternate rows; a view."""
     return packed[..., :: packed.shape[-1] - 1]
+
+
+def _product(first: Image, second: Image, into: Image) -> None:
+    """Write the product of two packed spectra."""
+    np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(into))
+    _ends(into)[:] = _ends_product(np.array(_ends(first)), np.array(_ends(second)))
+
+
+def _whole_power(spectrum: Image, power: Image) -> None:
+    """Write |K|², as a real factor for packed spectra."""
+    _power_inside(spectrum, power)
+    _power_at_ends(spectrum[None], power[None])
+
+
+@lru_cache(maxsize=8)
+def _conjugating(size: int) -> Image:
+    """Signs by which a packed spectrum becomes its conjugate, (size, size)."""
+    signs = np.ones((size, size), np.float32)
+    signs[:, 2:-1:2] = -1
+    signs[:, :: size - 1] = 1
+    signs[2:-1:2, :: size - 1] = -1
+    return signs
 
 
 def _ends_product(first: Image, second: Image) -> Image:

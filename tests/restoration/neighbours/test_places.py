@@ -57,9 +57,9 @@ def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:
         np.ones(len(shift)),
         spectra,
         there,
-        np.full(len(shift), 0.09),
         1.0,
         1.0,
+        np.ones((height, width), bool),
         np.zeros((height, width), bool),
         4,
         np.ones((WIDE, WIDE // 2 + 1)),
@@ -70,7 +70,7 @@ def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:
 def test_relief_that_lies_elsewhere_weighs_little(rng: np.random.Generator) -> None:
     """A tile that fits only where its own shift puts it bends the picture: it weighs little, the rest as before."""
     agreement = _agreement(1.0, rng)
-    trust = _trust(agreement, np.zeros_like(agreement.shift_px), 0.02, 1e-4)
+    trust, _ = _trust(agreement, np.zeros_like(agreement.shift_px), 0.02, 1e-4)
     near = trust[TILE + 16 : 2 * TILE - 16, TILE + 16 : 2 * TILE - 16]
     far = trust[:, 3 * TILE + 16 : -16]
     assert far.mean() > 0.9
@@ -81,7 +81,7 @@ def test_a_shift_that_noise_explains_costs_no_weight(rng: np.random.Generator) -
     """Where shifts scatter as much anyway, a tile's own is no sign of relief."""
     agreement = _agreement(0.05, rng)
     field = np.zeros_like(agreement.shift_px)
-    uncertain, certain = (_trust(agreement, field, noise_px, 1e-4) for noise_px in (0.1, 0.0))
+    uncertain, certain = (_trust(agreement, field, noise_px, 1e-4)[0] for noise_px in (0.1, 0.0))
     near = np.s_[TILE + 16 : 2 * TILE - 16, TILE + 16 : 2 * TILE - 16]
     assert uncertain[near].mean() > certain[near].mean()
     assert uncertain[near].mean() > 0.9

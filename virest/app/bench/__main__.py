@@ -1,6 +1,7 @@
 """Print the tables and write bench-out/bench.json, or compare two of those.
 
 $ python -m virest.app.bench --only quality --quick
+$ python -m virest.app.bench --only quality --kind shaken
 $ python -m virest.app.bench --only honesty --quick --preset balanced --keep captures
 $ python -m virest.app.bench --only fits --keep captures
 $ python -m virest.app.bench --only calibration --seeds 100
@@ -34,7 +35,7 @@ from virest.app.bench.fits import fits_section
 from virest.app.bench.growth import growth_section
 from virest.app.bench.honesty import honesty_section
 from virest.app.bench.memory import memory_section
-from virest.app.bench.quality import quality_section
+from virest.app.bench.quality import KIND_TITLES, quality_section
 from virest.app.bench.real import real_section
 from virest.app.bench.shutter import shutter_section
 from virest.app.bench.soak import soak_section
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         emit(compare_text(old, new, options.noise))
         return
     presets = tuple(options.preset or PRESETS)
-    scale = Scale(quick=options.quick, full=options.full, presets=presets, seeds=options.seeds, figures=options.out)
+    scale = Scale(options.quick, options.full, presets, tuple(options.kind or ()), options.seeds, options.out)
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {"virest_bench": 1, "versions": _versions(), "scale": scale.name}
     work = options.keep or Path(tempfile.mkdtemp(prefix="work-", dir=options.out))
@@ -97,6 +98,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     size.add_argument("--quick", action="store_true", help="a few frames: a look, no measurement")
     size.add_argument("--full", action="store_true", help="memory up to 3000 frames")
     parser.add_argument("--preset", action="append", choices=PRESETS, help="of honesty; may be repeated [all]")
+    parser.add_argument("--kind", action="append", choices=tuple(KIND_TITLES), help="of quality; may be repeated [all]")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and runs here, use captures again")
     parser.add_argument("--seeds", type=int, default=100, help="captures of --only calibration [100]")
     parser.add_argument("--out", type=Path, default=Path("bench-out"), help="folder of bench.json [bench-out]")

@@ -31,6 +31,7 @@ KIND_TITLES = {
     "fine": "the same at 1 bit/px",
     "long": "long blur, strong noise: 15-45 px",
     "bright": "bright clipped areas: 5-20 px",
+    "shaken": "shaken: 5-45 px, near plane, noise, lamps",
     "phone": "as phones film, nominal profile",
 }
 

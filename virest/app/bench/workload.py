@@ -42,6 +42,8 @@ class Scale:
     full: bool = False
     presets: tuple[str, ...] = PRESETS
     """Those that ``honesty`` measures."""
+    kinds: tuple[str, ...] = ()
+    """Captures that ``quality`` measures, by their kind; none: all."""
     seeds: int = 100
     """Captures that calibrations are compared with truth on."""
     figures: Path | None = None
@@ -59,7 +61,7 @@ class Workload:
 
     name: str
     kind: str
-    """``ordinary``, ``photographs``, ``fine``, ``long``, ``bright``, ``phone`` or ``defocused``."""
+    """``ordinary``, ``photographs``, ``fine``, ``long``, ``bright``, ``shaken``, ``phone`` or ``defocused``."""
     blur_range_px: tuple[float, float]
     """Frames whose blur at the centre lies in here count in the means; all count in the minimum."""
     options: dict[str, Any] = field(default_factory=dict)
@@ -138,10 +140,27 @@ PHONES = (
 )  # fmt: skip
 
 
+def _shaken(name: str, scene: str, exposure_ms: float, rate: float, noise: float, **more: Any) -> Workload:
+    plain = _workload(f"shaken-{name}", "shaken", (0.0, np.inf), scene, exposure_ms, rate, noise)
+    return dataclasses.replace(plain, options={**plain.options, **more})
+
+
+SHAKEN = (
+    _shaken("short", "photographs", 10.0, 1.4, 1.5),
+    _shaken("middle", "leaves", 18.0, 1.8, 2.0),
+    _shaken("far", "photographs", 28.0, 2.2, 2.0),
+    _shaken("plane", "leaves", 16.0, 0.9, 1.5, depth_m=1.6, sway_m=0.03),
+    _shaken("noise", "photographs", 14.0, 1.6, 8.0),
+    _shaken("lamps", "bright", 14.0, 1.4, 2.0),
+)
+"""Blur of 5 to 45 px, a plane near by, strong noise and lamps; restored by the gyroscope alone, with neighbours."""
+
+
 def quality_workloads(scale: Scale) -> list[Workload]:
     """Choose the captures of the quality table; with --quick a few small ones of four frames."""
-    if not scale.quick:
-        return [*WORKLOADS, *PHONES]
+    every = [w for w in (*WORKLOADS, *SHAKEN, *PHONES) if w.kind in scale.kinds or not scale.kinds]
+    if scale.kinds or not scale.quick:
+        return [_shortened(w, 4) for w in every] if scale.quick else every
     return [_shortened(w, 4) for w in (*WORKLOADS, *PHONES) if w.name in QUICK or w in PHONES]
 
 

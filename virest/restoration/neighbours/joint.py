@@ -32,13 +32,19 @@ MOST_DIFFERENT = 4.0
 seen to differ by 0.05 to 0.9 times that (3 at 0.08 bits a pixel), pictures of other places by 5 to 1500."""
 LEAST_TRUST = 0.25
 """Where a neighbour weighs less it is not used."""
-ORDINARY = 16.0
+MOVING = 16.0
 """Difference around a place, over noise's, that is nothing else: edges of a chessboard reach it (at 8 its frames lose
 up to 1 dB); things that move differ by 10 to 400 times and lose nothing by 16."""
+RIM_PX = 0.2
+"""Shift of a tile against the field at which half as much is ordinary, there and beside it: what lies nearer hides in
+one frame what the other shows, rims as wide as the shift, which counts for less than a sixth of a chessboard's edges.
+Chosen on relief at 1 and 0.7 m, two walks, a chessboard and a shake; 0.1 loses 0.1 dB on these."""
+AROUND, CLOSE_BY = 17, 7
+"""Sides of what lies around a place and close by, in reduced pixels: things, and their rims."""
 LEAST_ALIKE = 0.5
 """Part of a picture that a neighbour must show in its place to tell what moves."""
-AROUND = 17
-"""Side of what lies around a place, in reduced pixels."""
+SPARSE = 4
+"""What lies around places changes so little from one to the next that medians need only every fourth."""
 LEAST_SHIFTS = 6
 """An affine field of shifts has six unknowns; as many tiles again must bear it out."""
 LOOKED_AT = 6
@@ -51,25 +57,29 @@ HALF = 2
 
 
 @dataclass(frozen=True, slots=True)
-class NeighbourPicture:
-    """One neighbour, brought to the frame's pixels."""
+class NeighbourPlace:
+    """Where a neighbour's picture lies in the frame, and how far that and what it shows are to be trusted."""
 
     number: int
     """Index in the movie."""
-    light: Image
-    """(height, width) luma of its light, as bright as the frame's."""
-    half_light: Image
-    """(height / 2, width / 2, 3), rounded up: its light in colour, as bright as the frame's."""
+    view: NeighbourView
+    """As predicted."""
+    affine: Array
+    """(3, 2) coefficients of 1, x, y: how far on the neighbour shows what was predicted at a place."""
+    gain: float
+    """Its light over the frame's."""
     field: Callable[[Array], KernelField]
     """Its kernels at centres in the frame."""
     centres_px: Array
     """(n, 2) of the tiles in which it was compared."""
     trust: Image
     """Noise of the frame over that of the neighbour, 0 to 1, of a picture that is smaller than the frame."""
+    alike: Image
+    """How surely it shows what the frame shows, 0 to 1, of the same size."""
     seen: NDArray[np.bool_]
     """Of the same size: where it has a picture."""
-    shift_std_px: float
-    """How well it is known where it lies, each axis."""
+    std_px: Array
+    """(n,) how well it is known where it lies in those tiles, each axis."""
 
     @property
     def longest_px(self) -> float:
@@ -87,22 +97,37 @@ class NeighbourPicture:
         frequency: (RINGS,) cycles per pixel.
         """
         some = np.linspace(0, len(self.centres_px) - 1, min(len(self.centres_px), LOOKED_AT)).round().astype(int)
-        sharpness = np.exp(-((2 * np.pi * self.shift_std_px * frequency) ** 2))
+        sharpness = np.exp(-((2 * np.pi * self.std_px[:, None] * frequency) ** 2)).mean(axis=0)
         return np.asarray(self.weight * sharpness * rings_passed(self.field(self.centres_px[some])))
 
+    def std_at_px(self, centres_px: Array) -> Array:
+        """(m,) how well it is known where it lies around places (m, 2): that of the nearest four tiles."""
+        x, y = (np.unique(along) for along in self.centres_px.T)
+        power = np.square(self.std_px).reshape(len(y), len(x)).astype(np.float32)
+        at = [np.interp(c, k, np.arange(len(k))).astype(np.float32) for c, k in zip(centres_px.T, (x, y), strict=True)]
+        found = cv2.remap(power, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.sqrt(found.ravel().astype(float))
 
-def neighbour_picture(
+
+@dataclass(frozen=True, slots=True)
+class NeighbourPicture:
+    """One neighbour, brought to the frame's pixels."""
+
+    place: NeighbourPlace
+    light: Image
+    """(height, width) luma of its light, as bright as the frame's."""
+    half_light: Image
+    """(height / 2, width / 2, 3), rounded up: its light in colour, as bright as the frame's."""
+
+
+def neighbour_place(
     view: NeighbourView,
     field: Callable[[Array], KernelField],
     number: int,
-    light: Image,
-    half_light: Image,
     agreement: TileAgreement,
     independent_error: float,
-) -> NeighbourPicture | None:
-    """Bring a neighbour's luma of light (height, width), and its light at half that size, to the frame's pixels.
-
-    None where it does not fit.
+) -> NeighbourPlace | None:
+    """Where a neighbour's picture lies; None where it does not fit.
 
     field: of its kernels, from the view.  independent_error: what noise of their own makes them differ by.
 
@@ -115,60 +140,83 @@ def neighbour_picture(
     off_px = agreement.shift_px[used] - _at(affine, agreement.centres_px[used])
     lasting_px = _lasting_px(agreement.centres_px[used], off_px, typical_px, TILE * agreement.times)
     noise_px = np.sqrt(max(typical_px**2 - lasting_px**2, 0.0))
-    std_px = float(np.hypot(lasting_px, noise_px * np.sqrt(LEAST_SHIFTS / len(off_px))))
-    source = view.map_px(lambda points_px: points_px - _at(affine, points_px))
-    brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    trust = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
-    height, width = light.shape
-    places = source[agreement.times // 2 :: agreement.times, agreement.times // 2 :: agreement.times]
-    inside = cv2.inRange(places, (0, 0), (width - 1, height - 1)) > 0
-    seen = inside[: trust.shape[0], : trust.shape[1]] & ~agreement.clipped
-    return NeighbourPicture(
-        number,
-        brought / np.float32(agreement.gain),
-        brought_half / np.float32(agreement.gain),
-        field,
-        agreement.centres_px,
-        trust * seen,
-        seen,
-        std_px,
+    std_px = np.full(len(used), lasting_px)
+    std_px[used] = _left_of_shifts_px(off_px, lasting_px, noise_px)
+    std_px = np.hypot(std_px, noise_px * np.sqrt(LEAST_SHIFTS / len(off_px)))
+    trust, alike = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
+    height, width = trust.shape
+    seen = (agreement.inside & ~agreement.clipped)[:height, :width]
+    return NeighbourPlace(
+        number, view, affine, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px
     )
 
 
-def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float) -> Image:
-    """Noise of a frame over that of its neighbour, by how they differ around each place of the reduced picture.
+def neighbour_picture(place: NeighbourPlace, light: Image, half_light: Image) -> NeighbourPicture:
+    """Bring a neighbour's luma of light (height, width), and its light at half that size, to the frame's pixels."""
+    source = place.view.map_px(lambda points_px: points_px - _at(place.affine, points_px))
+    brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    for one in (brought, brought_half):
+        one *= np.float32(1 / place.gain)
+    return NeighbourPicture(place, brought, brought_half)
 
-    Of the difference's power, noise of both making E, half is the frame's.  Rings take overtones of edges for noise,
-    which is no more than what half of all places differ by; it scatters, and E is ORDINARY times as much.  What a tile
-    differs by only because its own shift is not the field's is another matter: it bends the picture near relief, and
-    none of it is ordinary.  Of a tile's own shift counts what the noise of shifts, noise_px on each axis, does not
-    explain (James & Stein 1961).
+
+def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float) -> tuple[Image, Image]:
+    """Noise of a frame over that of its neighbour, and how surely both show the same, 0 to 1, of the reduced picture.
+
+    Of the difference's power around a place, noise of both making E, half is the frame's.  Rings take overtones of
+    edges for noise, which is no more than what half of all places differ by; it scatters, and E is some times as much:
+    less for what a neighbour is to weigh, which rims that hide other things in either frame make wrong, than for
+    telling that something moves.  What a tile differs by only because its own shift is not the field's is another
+    matter: it bends the picture near relief, and none of it is ordinary.  Of a tile's own shift counts what the noise
+    of shifts, noise_px on each axis, does not explain (James & Stein 1961).
     """
-    left, both = (cv2.sqrBoxFilter(one, cv2.CV_32F, (AROUND, AROUND)) for one in agreement.differences(shift_px))
-    if np.median(left / (OWN_ERROR * both + np.float32(independent_error))) > MOST_DIFFERENT:
-        return np.zeros_like(left)
-    noise = min(independent_error, float(np.median(left)))
-    expected = OWN_ERROR * both + np.float32(noise)
-    trust = np.float32(0.5) / cv2.max(left / (np.float32(ORDINARY) * expected) - np.float32(0.5), 0.5)
+    tiles = agreement.differences(shift_px)
+    different, shown = agreement.side_by_side(tiles), agreement.side_by_side(agreement.shown())
+    left, both = (_power_around(one, AROUND) for one in (different, shown))
+    some = np.s_[::SPARSE, ::SPARSE]
+    if np.median(left[some] / (OWN_ERROR * both[some] + np.float32(independent_error))) > MOST_DIFFERENT:
+        return np.zeros_like(left), np.zeros_like(left)
+    noise = np.float32(min(independent_error, float(np.median(left[some]))))
+    expected = OWN_ERROR * both + noise
+    alike = _explained(left, MOVING * expected)
     off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
     sure = np.maximum(1 - 2 * noise_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
-    own_px = shift_px + sure[:, None] * off_px
-    misplaced = left - cv2.sqrBoxFilter(agreement.differences(own_px)[0], cv2.CV_32F, (AROUND, AROUND))
+    near, shown_near = (_power_around(one, CLOSE_BY) for one in (different, shown))
+    relief_px = agreement.over_picture(agreement.wholly_seen * sure * np.linalg.norm(off_px, axis=1))
+    ordinary = MOVING / (1 + (relief_px / np.float32(RIM_PX)) ** 2)
+    trust = _explained(near, cv2.max(ordinary, 1.0) * (OWN_ERROR * shown_near + noise))
+    own = np.flatnonzero(sure)
+    tiles[own] = agreement.differences(shift_px[own] + sure[own, None] * off_px[own], own)
+    misplaced = left - _power_around(agreement.side_by_side(tiles), AROUND)
     trust *= expected / (expected + 2 * cv2.max(misplaced, 0.0))
+    return _not_less(trust), _not_less(alike)
+
+
+def _explained(power: Image, most: Image) -> Image:
+    """1 where a difference's power is at most what is expected, and as much less as half of it is the neighbour's."""
+    return np.float32(0.5) / cv2.max(power / most - np.float32(0.5), 0.5)
+
+
+def _not_less(trust: Image) -> Image:
     return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
 
 
-def still_part(found: Sequence[NeighbourPicture]) -> Image | None:
+def _power_around(picture: Image, side: int) -> Image:
+    """Mean square over squares about each place."""
+    return cv2.sqrBoxFilter(picture, cv2.CV_32F, (side, side))
+
+
+def still_part(found: Sequence[NeighbourPlace]) -> Image | None:
     """How sure it is that the frame shows there what stands still, 0 to 1, by the neighbour that agrees best.
 
     What no neighbour shows in its place moves, and its blur is not the camera's.  Where none has a picture nothing
     speaks against it.  Those that show something else nearly everywhere tell nothing; None: no other.
     """
-    telling = [one for one in found if one.trust[one.seen].mean() > LEAST_ALIKE]
+    telling = [one for one in found if one.alike[one.seen].mean() > LEAST_ALIKE]
     if not telling:
         return None
-    best = np.maximum.reduce([one.trust for one in telling])
+    best = np.maximum.reduce([one.alike for one in telling])
     return np.where(np.logical_or.reduce([one.seen for one in telling]), best, np.float32(1))
 
 
@@ -180,10 +228,16 @@ class JoinedNeighbours:
     passed: Array
     """(RINGS,) sum of their |K|², weighted."""
 
+    @property
+    def places(self) -> tuple[NeighbourPlace, ...]:
+        """Where they lie."""
+        return tuple(one.place for one in self.pictures)
+
 
 def joined_neighbours(found: Sequence[NeighbourPicture], luma: PictureStatistics) -> JoinedNeighbours:
     """What some neighbours bring together; luma: measured on the frame."""
-    return JoinedNeighbours(tuple(found), np.sum([np.zeros(RINGS), *(one.passed(luma.frequency) for one in found)], 0))
+    passed = [one.place.passed(luma.frequency) for one in found]
+    return JoinedNeighbours(tuple(found), np.sum([np.zeros(RINGS), *passed], 0))
 
 
 def most_telling(passed: Sequence[Array], taken: Array, luma: PictureStatistics) -> int:
@@ -241,6 +295,16 @@ def _lasting_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px:
     beside = (apart > 0) & (apart <= BESIDE * spacing_px)
     products = (held @ held.T)[beside]
     return float(np.sqrt(max(products.mean() / 2, 0.0))) if len(products) else typical_px
+
+
+def _left_of_shifts_px(off_px: Array, lasting_px: float, noise_px: float) -> Array:
+    """(n,) root mean square, each axis, of what tiles (n, 2) off the field lie off, by what is known of both parts.
+
+    Normal priors: of a measured shift the part share = lasting² / (lasting² + noise²) is expected, with the variance
+    share · noise².
+    """
+    share = lasting_px**2 / max(lasting_px**2 + noise_px**2, 1e-12)
+    return np.asarray(np.sqrt(share**2 * (off_px**2).sum(axis=1) / 2 + share * noise_px**2))
 
 
 def _at(affine: Array, points_px: Array) -> Array:

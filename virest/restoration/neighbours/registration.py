@@ -140,10 +140,10 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
     there = _kernel_spectra(view.field(), tops_lefts, times)
     if there is None:
         return None
-    a, apart = _spectra(_blurred(tiles.spectra * there)), np.zeros(2)
+    a, apart = _spectra(_inner(tiles.spectra * there)), np.zeros(2)
     for _ in range(2):
         b = _wide_spectra(_brought(view, second, times, apart), tops_lefts)
-        b = _spectra(_blurred(b * tiles.kernels))
+        b = _spectra(_inner(b * tiles.kernels))
         common = _common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
             break
@@ -168,12 +168,12 @@ class TileAgreement:
     """(n, WIDE, WIDE / 2 + 1) spectra of the frame's tiles, blurred, in light over its mean."""
     there: Image
     """(n, TILE, TILE) the neighbour's, blurred, in light over its mean."""
-    signal: Array
-    """(n,) mean square of what both show."""
     gain: float
     """The neighbour's light over the frame's."""
     light: float
     """The frame's light, median of the tiles."""
+    inside: NDArray[np.bool_]
+    """Of the reduced picture: where the neighbour has one."""
     clipped: NDArray[np.bool_]
     """Of the reduced picture: where light that was too bright to be measured may reach, in either frame."""
     blur_px: int
@@ -183,22 +183,41 @@ class TileAgreement:
     times: int
     """How many times smaller the compared pictures are."""
 
-    def differences(self, shift_px: Array) -> tuple[Image, Image]:
-        """What the frame, so far (n, 2) on, has less than the neighbour, and what both have, in light over its mean.
+    def differences(self, shift_px: Array, numbers: NDArray[np.intp] | slice = slice(None)) -> Image:
+        """What the frame's tiles, so far (n, 2) on, have less than the neighbour's: (n, TILE, TILE), light over mean.
 
-        Of the reduced picture, (height, width) each.  Nearer to its edges than the blur reaches, where what lies beyond
-        decides, stands what is next to that.
+        numbers: of those tiles.
         """
-        here = fft.irfft2(_shifted(self.here, shift_px / self.times), (WIDE, WIDE))[:, INNER, INNER]
+        return np.asarray(self.there[numbers] - _inner(_shifted(self.here[numbers], shift_px / self.times)))
+
+    def shown(self) -> Image:
+        """What both show, (n, TILE, TILE), in light over its mean."""
+        return self.there - 1
+
+    def side_by_side(self, tiles: Image) -> Image:
+        """Tiles (n, TILE, TILE) as a picture (height, width) of the reduced size.
+
+        Nearer to its edges than the blur reaches, where what lies beyond decides, stands what is next to that.
+        """
         height, width = self.tops_lefts.max(axis=0) + TILE
-        left, both = np.zeros((2, height, width), np.float32)
-        for (top, start), one, other in zip(self.tops_lefts.tolist(), here, self.there, strict=True):
-            left[top : top + TILE, start : start + TILE] = other - one
-            both[top : top + TILE, start : start + TILE] = other - 1
-        inner = slice(self.blur_px, height - self.blur_px), slice(self.blur_px, width - self.blur_px)
-        edge = (self.blur_px,) * 4
-        left, both = (cv2.copyMakeBorder(one[inner], *edge, cv2.BORDER_REFLECT) for one in (left, both))
-        return left, both
+        whole = np.zeros((height, width), np.float32)
+        for (top, left), tile in zip(self.tops_lefts.tolist(), tiles, strict=True):
+            whole[top : top + TILE, left : left + TILE] = tile
+        inner = whole[self.blur_px : height - self.blur_px, self.blur_px : width - self.blur_px]
+        return cv2.copyMakeBorder(inner, *(self.blur_px,) * 4, cv2.BORDER_REFLECT)
+
+    @property
+    def wholly_seen(self) -> NDArray[np.bool_]:
+        """(n,) whether the neighbour shows all of a tile."""
+        seen = self.inside.astype(np.float32)
+        return np.asarray(_cut(seen, self.tops_lefts).min(axis=(1, 2)) > 0)
+
+    def over_picture(self, values: Array) -> Image:
+        """The largest of tiles (n,) and those beside them, at all places (height, width) of the reduced size."""
+        rows = len(np.unique(self.tops_lefts[:, 0]))
+        height, width = self.tops_lefts.max(axis=0) + TILE
+        largest = cv2.dilate(values.reshape(rows, -1).astype(np.float32), np.ones((3, 3), np.uint8))
+        return cv2.resize(largest, (int(width), int(height)), interpolation=cv2.INTER_LINEAR)
 
     def expected_error(self, frequency: Array, noise: Array, slope: float) -> float:
         """The mean square difference that independent noise makes, in light over its mean.
@@ -220,23 +239,24 @@ def tile_agreement(
     kernels = _kernel_spectra(field, tiles.tops_lefts, tiles.times)
     if kernels is None:
         return None
-    there = _brought(view, second, tiles.times)
+    source = view.map_px(times=tiles.times)
+    there = cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles), TILE // 4)
     lamps = (cv2.max(tiles.light, there) > CLIPPED_LIGHT).astype(np.uint8)
-    here, there_blurred = _blurred(wide), _blurred(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
+    here, there_blurred = _inner(wide), _inner(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
     a, b = _spectra(here), _spectra(there_blurred)
     shift, precision = _tile_shifts(a, b, np.zeros(2))
-    means = [np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
+    per_mean = [1 / np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
     return TileAgreement(
         tiles.tops_lefts,
         tiles.centres_px,
         shift * tiles.times,
         precision,
-        wide / means[0],
-        there_blurred / means[1],
-        (there_blurred / means[1]).var(axis=(1, 2)),
+        wide * per_mean[0],
+        there_blurred * per_mean[1],
         float(np.median(_cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
+        cv2.inRange(source, (-0.5, -0.5), (second.shape[1] - 0.5, second.shape[0] - 0.5)) > 0,
         cv2.dilate(lamps, np.ones((4 * blur_px + 1, 4 * blur_px + 1), np.uint8)) > 0,
         blur_px,
         np.asarray(_power(tiles.kernels).mean(axis=0) + _power(kernels).mean(axis=0)),
@@ -266,7 +286,7 @@ def judged_change(
         return None
     there = _cut(_brought(view, second, times), tops_lefts)
     b = _spectra(there)
-    onto = [_spectra(_blurred(_wide_spectra(picture, tops_lefts) * kernels)) for picture in (recorded, restored)]
+    onto = [_spectra(_inner(_wide_spectra(picture, tops_lefts) * kernels)) for picture in (recorded, restored)]
     shift, precision = _tile_shifts(onto[0] + onto[1], b, np.zeros(2))
     onto = [_shifted(a, shift) for a in onto]
     used = (precision > 0) & (np.maximum(_cut(recorded, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT)
@@ -319,9 +339,9 @@ def _kernel_spectra(
     radius = kernels.radius_px
     if 2 * radius + 1 > TILE // 2:
         return None
-    padded = np.zeros((len(tops_lefts), WIDE, WIDE), np.float32)
-    padded[:, : 2 * radius + 1, : 2 * radius + 1] = kernels.arrays()
-    return np.asarray(np.conj(fft.rfft2(np.roll(padded, (-radius, -radius), (1, 2)))))
+    along, down = (np.exp(2j * np.pi * radius * f).astype(np.complex64) for f in _axes(WIDE))
+    rows = fft.rfft(kernels.arrays()[:, ::-1, ::-1], WIDE, axis=2) * along  # the transpose, its middle at 0
+    return np.asarray(fft.fft(rows, WIDE, axis=1) * down[:, None])
 
 
 def _cut(picture: Image, tops_lefts: NDArray[np.intp], side: int = TILE) -> Image:
@@ -334,9 +354,10 @@ def _wide_spectra(picture: Image, tops_lefts: NDArray[np.intp]) -> NDArray[np.co
     return np.asarray(fft.rfft2(_cut(padded, tops_lefts, WIDE)))
 
 
-def _blurred(wide: NDArray[np.complex64]) -> Image:
+def _inner(wide: NDArray[np.complex64]) -> Image:
     """Tiles (n, TILE, TILE) of spectra (n, WIDE, WIDE / 2 + 1)."""
-    return np.asarray(fft.irfft2(wide, (WIDE, WIDE))[:, INNER, INNER])
+    rows = fft.ifft(wide, axis=1)[:, INNER]
+    return np.asarray(fft.irfft(rows, WIDE, axis=2)[:, :, INNER])
 
 
 def _brought(view: NeighbourView, second: Image, times: int, apart: Array | None = None) -> Image:

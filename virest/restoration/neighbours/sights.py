@@ -22,9 +22,11 @@ from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.joint import (
     NeighbourPicture,
+    NeighbourPlace,
     half_size,
     most_telling,
     neighbour_picture,
+    neighbour_place,
     rings_passed,
 )
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
@@ -119,28 +121,44 @@ class FrameNeighbours:
     ) -> tuple[NeighbourPicture, ...]:
         """At most ``most`` of a frame's neighbours, those with the most telling blur, brought to its pixels.
 
-        In the place of one that shows something else the next is taken.
+        A neighbour is predicted to weigh as is usual so far from a frame.  One that was looked at counts by what was
+        measured, and those at least as far from the frame are then expected to be no better than it was: before relief
+        near ones lie closer, and they are taken instead.
 
         luma: what was measured on the frame's.  field: of its kernels.
         """
         assert here.motion is not None
         tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
-        left = [other for other in around if other.usable and other.frame.index != here.frame.index]
-        found: list[NeighbourPicture] = []
-        taken = np.zeros(RINGS)
-        while tiles is not None and left and len(found) < most:
-            passed = [self._passed_of(other, here) for other in left]
-            number = most_telling(passed, taken, luma)
-            one = self._picture(here, left.pop(number), refined, tiles, luma)
-            if one is not None and one.weight > 0:
-                found.append(one)
-                taken = taken + passed[number]
-        return tuple(sorted(found, key=lambda one: one.number))
+        left = {other.frame.index: other for other in around if other.usable and other.frame.index != here.frame.index}
+        found: dict[int, NeighbourPlace] = {}
+        taken: list[int] = []
+        sights = dict(left)
+        passed = {number: self._passed_of(other, here) for number, other in left.items()}
+        while tiles is not None and left and len(taken) < most:
+            sum_taken = np.sum([np.zeros(RINGS), *(passed[number] for number in taken)], axis=0)
+            number = list(left)[most_telling([passed[n] for n in left], sum_taken, luma)]
+            if number in found:
+                taken.append(number)
+                del left[number]
+                continue
+            place = self._place(here, left[number], refined, tiles, luma)
+            if place is None or place.weight == 0:
+                del left[number]
+                continue
+            found[number] = place
+            measured = place.passed(luma.frequency)
+            share = np.minimum(measured / np.maximum(passed[number], 1e-12), 1.0)
+            apart = abs(number - here.frame.index)
+            for other in left:
+                if other not in found and abs(other - here.frame.index) >= apart:
+                    passed[other] = passed[other] * share
+            passed[number] = measured
+        return tuple(neighbour_picture(found[n], *self._full_of(sights[n])) for n in sorted(taken))
 
-    def _picture(
+    def _place(
         self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
-    ) -> NeighbourPicture | None:
-        """A neighbour brought to the frame's pixels; None where it shows something else."""
+    ) -> NeighbourPlace | None:
+        """Where a neighbour lies in the frame; None where it shows something else."""
         assert here.motion is not None
         assert other.motion is not None
         curve, further = here.motion.profile.response or ResponseCurve("srgb"), refined.further if refined else None
@@ -152,7 +170,7 @@ class FrameNeighbours:
         level = 255 * float(curve.encode(np.array(agreement.light)))
         slope = float(np.interp(level, np.arange(256), curve.slope_table()))
         error = agreement.expected_error(luma.frequency, luma.noise, slope)
-        return neighbour_picture(view, along, other.frame.index, *self._full_of(other), agreement, error)
+        return neighbour_place(view, along, other.frame.index, agreement, error)
 
     def knowing(self, missing: MissingTurn | None) -> FrameNeighbours:
         """The same, and what was found already, with what the capture lacks."""
