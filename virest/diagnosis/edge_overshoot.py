@@ -30,7 +30,7 @@ from virest.diagnosis.local_blur_model import across, path_tensors
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader
 from virest.inference.chance import normal_tail
 from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
-from virest.inference.unsharp_mask import AMOUNT, AMOUNT_SPREAD, PROFILE_STD, RADIUS_PX, RADIUS_SPREAD
+from virest.inference.unsharp_mask import PROFILE_STD
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -49,6 +49,10 @@ SHARPEST = 0.4
 """Part of the edges that is used, the sharpest: a soft step overshoots less."""
 MIN_USED = 60
 GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
+RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
+"""Of phones' unsharp masks, and how far it varies (in the logarithm): 0.8 to 2 px."""
+AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
+"""Of phones' unsharp masks, and how far it varies."""
 BARE_OVERSHOOT, BARE_STD = 0.006, 0.007
 """Of decoded movies that nobody sharpened, mean and spread: coding, interpolation, and the choice of sharp edges."""
 BARE_RADII_PX = (0.6, 2.2)

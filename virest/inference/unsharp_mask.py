@@ -31,9 +31,9 @@ from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
-"""Of phones' unsharp masks, and how far it varies (in the logarithm): 0.8 to 2 px."""
-AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
+RADIUS_PX, RADIUS_SPREAD = 1.2, 0.3
+"""Of phones' unsharp masks, and how far it varies (in the logarithm): 0.9 to 1.6 px."""
+AMOUNT, AMOUNT_SPREAD = 0.6, 0.4
 """Of phones' unsharp masks, and how far it varies."""
 PROFILE_STD = 0.003
 """Misfit of a mean profile, as part of the step; neighbours within a pixel share it."""
@@ -50,6 +50,10 @@ SHARPEST = 0.4
 """Part of the edges that is used, by the width of their other half: a soft step overshoots less."""
 LEAST_EDGES = 40
 """Of these; the median of fewer is moved by a few odd ones."""
+ALIKE = 4
+"""Edges that count as one: several lie on one contour, and one place is seen in several frames."""
+MEDIAN_STD = 1.2533
+"""Of the median over the mean's, for normal deviates."""
 ALONG_PX = np.arange(-9.0, 9.0 + 1e-9, 0.5)
 FLAT_FROM_PX, MAX_FLAT_RMS = 4.0, 0.04
 """Where the plateau begins, and its greatest rms as part of the step."""
@@ -59,6 +63,8 @@ MAX_OFF_PX = 1.5
 """Between a crest of the slope and the middle of its edge."""
 GRID_PX = np.arange(-4.0, 6.0 + 1e-9, 0.25)
 FITTED = GRID_PX >= -1.0
+LEFT = 0.02
+"""Part of the mask's change that may remain: at an edge of 100 levels a tenth of a level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,17 +83,16 @@ def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | No
     """
     each = [_profiles(picture, motion) for picture, motion in pictures]
     profiles = np.concatenate([np.zeros((0, len(GRID_PX))), *each])
-    frame = np.repeat(np.arange(len(each)), [len(one) for one in each])
     width = _inner_width(profiles)
-    sharp = width <= np.quantile(width, SHARPEST) if len(width) else np.zeros(0, bool)
-    profiles, frame = profiles[sharp], frame[sharp]
-    numbers = np.unique(frame)
-    if len(profiles) < LEAST_EDGES or len(numbers) < 2:
+    sharp = width <= np.quantile(width, SHARPEST, method="lower") if len(width) else np.zeros(0, bool)
+    profiles = profiles[sharp]
+    if len(profiles) < LEAST_EDGES:
         return None
     mean = np.median(profiles, axis=0)
-    without = [_overshoot(np.median(profiles[frame != n], axis=0)) for n in numbers]
-    scatter = np.sqrt((len(numbers) - 1) * np.var(without))
-    z = (_overshoot(mean) - BARE_OVERSHOOT) / np.hypot(scatter, BARE_STD)
+    at = int(np.argmax(np.where(GRID_PX > 0, mean, 0.0)))
+    typical = 1.4826 * np.median(np.abs(profiles[:, at] - mean[at]))
+    noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / ALIKE)
+    z = (mean[at] - 1 - BARE_OVERSHOOT) / np.hypot(noise, BARE_STD)
     if normal_tail(float(z)) > FALSE_ALARM:
         return None
     _, amount, log_radius, *_ = _fitted(mean)
@@ -110,10 +115,6 @@ def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:
     if picture.ndim == 3:
         change = cv2.merge([change] * 3)
     return np.asarray(cv2.add(picture, change, dtype=cv2.CV_8U), np.uint8)
-
-
-LEFT = 0.02
-"""Part of the mask's change that may remain: at an edge of 100 levels a tenth of a level."""
 
 
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -169,11 +170,6 @@ def _inner_width(profiles: Array) -> Array:
     above, below = inside[rows, after - 1], inside[rows, after]
     width = (after - (0.16 - below) / np.maximum(above - below, 1e-9)) * (GRID_PX[1] - GRID_PX[0])
     return np.where(after > 0, width, np.inf)
-
-
-def _overshoot(mean: Array) -> float:
-    """Above the plateau, as part of the step."""
-    return float(mean[GRID_PX > 0].max()) - 1
 
 
 def _fitted(mean: Array) -> Array:
