@@ -39,17 +39,19 @@ PROFILE_STD = 0.003
 """Misfit of a mean profile, as part of the step; neighbours within a pixel share it."""
 FALSE_ALARM = 1e-3
 """Probability that pictures that nobody sharpened are taken for sharpened ones."""
-BARE_OVERSHOOT, BARE_STD = 0.001, 0.003
-"""Of movies that nobody sharpened, as part of the step, and how far it may vary: 0.000 to 0.002 on ten simulated ones
-of five scenes, of which the deviation is three times as much."""
+BARE_OVERSHOOT, BARE_STD = 0.001, 0.002
+"""Of all edges of a movie that nobody sharpened, as part of the step, and how far it may vary: 0.000 to 0.002 on 29
+simulated ones of five scenes, of whose deviation this is four times."""
 EDGES = EdgeSettings(edges_per_frame=600, cell_px=16, min_slope_levels=6.0)
 MOST_FRAMES = 6
 STILL_PX = 0.6
 """Edges across which the blur path's standard deviation is below this are used."""
 SHARPEST = 0.4
-"""Part of the edges that is used, by the width of their other half: a soft step overshoots less."""
+"""Part of the edges that the mask is fitted to, by the width of their other half: a soft step overshoots less.
+
+Whether there is a mask all tell: among textures the steepest slopes are those that overshoot."""
 LEAST_EDGES = 40
-"""Of these; the median of fewer is moved by a few odd ones."""
+"""The median of fewer is moved by a few odd ones."""
 ALIKE = 4
 """Edges that count as one: several lie on one contour, and one place is seen in several frames."""
 MEDIAN_STD = 1.2533
@@ -81,21 +83,13 @@ def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | No
 
     pictures: grey (h, w), and the motion over the frame.
     """
-    each = [_profiles(picture, motion) for picture, motion in pictures]
-    profiles = np.concatenate([np.zeros((0, len(GRID_PX))), *each])
+    found = [np.zeros((0, len(GRID_PX))), *(_profiles(picture, motion) for picture, motion in pictures)]
+    profiles = np.concatenate(found)
+    if len(profiles) < LEAST_EDGES or normal_tail(_significance(profiles)) > FALSE_ALARM:
+        return None
     width = _inner_width(profiles)
-    sharp = width <= np.quantile(width, SHARPEST, method="lower") if len(width) else np.zeros(0, bool)
-    profiles = profiles[sharp]
-    if len(profiles) < LEAST_EDGES:
-        return None
-    mean = np.median(profiles, axis=0)
-    at = int(np.argmax(np.where(GRID_PX > 0, mean, 0.0)))
-    typical = 1.4826 * np.median(np.abs(profiles[:, at] - mean[at]))
-    noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / ALIKE)
-    z = (mean[at] - 1 - BARE_OVERSHOOT) / np.hypot(noise, BARE_STD)
-    if normal_tail(float(z)) > FALSE_ALARM:
-        return None
-    _, amount, log_radius, *_ = _fitted(mean)
+    sharp = width <= np.quantile(width, SHARPEST, method="lower")
+    _, amount, log_radius, *_ = _fitted(np.median(profiles[sharp], axis=0))
     return UnsharpMask(float(amount), float(np.exp(log_radius))) if amount > 0 else None
 
 
@@ -170,6 +164,15 @@ def _inner_width(profiles: Array) -> Array:
     above, below = inside[rows, after - 1], inside[rows, after]
     width = (after - (0.16 - below) / np.maximum(above - below, 1e-9)) * (GRID_PX[1] - GRID_PX[0])
     return np.where(after > 0, width, np.inf)
+
+
+def _significance(profiles: Array) -> float:
+    """How far they stand above their plateaus, less what bare movies do, in deviations."""
+    mean = np.median(profiles, axis=0)
+    at = int(np.argmax(np.where(GRID_PX > 0, mean, 0.0)))
+    typical = 1.4826 * np.median(np.abs(profiles[:, at] - mean[at]))
+    noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / ALIKE)
+    return float((mean[at] - 1 - BARE_OVERSHOOT) / np.hypot(noise, BARE_STD))
 
 
 def _fitted(mean: Array) -> Array:
