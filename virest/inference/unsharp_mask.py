@@ -61,6 +61,7 @@ FLAT_FROM_PX, MAX_FLAT_RMS = 4.0, 0.04
 """Where the plateau begins, and its greatest rms as part of the step."""
 MIN_STEP_LEVELS = 30.0
 UNCLIPPED_LEVELS = (6.0, 249.0)
+"""Of a plateau.  What stands above it may be clipped: the mask is then taken for less than it is."""
 MAX_OFF_PX = 1.5
 """Between a crest of the slope and the middle of its edge."""
 GRID_PX = np.arange(-4.0, 6.0 + 1e-9, 0.25)
@@ -125,8 +126,6 @@ def _profiles(picture: Picture, motion: RowMotion) -> Array:
     path_px = np.abs((blur_chords(motion, points) * normals).sum(axis=1)) / np.sqrt(12)
     still = path_px < STILL_PX
     levels = parallel_profiles(picture, points[still], normals[still], ALONG_PX)
-    low, high = UNCLIPPED_LEVELS
-    levels = levels[(levels.min(axis=1, initial=255) > low) & (levels.max(axis=1, initial=0) < high)]
     return np.concatenate([_beside_plateau(levels), _beside_plateau(-levels[:, ::-1])])
 
 
@@ -137,7 +136,9 @@ def _beside_plateau(levels: Array) -> Array:
     step = np.maximum(plateau - lowest, 1e-3)
     part = (levels - lowest[:, None]) / step[:, None]
     rms = np.sqrt(np.mean((part[:, flat] - 1) ** 2, axis=1))
-    part = part[(plateau - lowest > MIN_STEP_LEVELS) & (rms < MAX_FLAT_RMS)]
+    low, high = UNCLIPPED_LEVELS
+    unclipped = (np.abs(plateau) > low) & (np.abs(plateau) < high)
+    part = part[(plateau - lowest > MIN_STEP_LEVELS) & (rms < MAX_FLAT_RMS) & unclipped]
     below = part < 0.5
     last = len(ALONG_PX) - 1 - np.argmax(below[:, ::-1], axis=1)
     part, last = part[last < len(ALONG_PX) - 1], last[last < len(ALONG_PX) - 1]
