@@ -43,7 +43,7 @@ BARE_OVERSHOOT, BARE_STD = 0.001, 0.002
 """Of all edges of a movie that nobody sharpened, as part of the step, and how far it may vary: 0.000 to 0.002 on 29
 simulated ones of five scenes, of whose deviation this is four times."""
 EDGES = EdgeSettings(edges_per_frame=600, cell_px=16, min_slope_levels=6.0)
-MOST_FRAMES = 6
+MOST_FRAMES = 4
 STILL_PX = 0.6
 """Edges across which the blur path's standard deviation is below this are used."""
 SHARPEST = 0.4
