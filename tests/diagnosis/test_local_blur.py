@@ -19,11 +19,12 @@ from virest.capture.records import Frame
 from virest.capture.video import GrayReader, probe_movie, read_gray
 from virest.diagnosis import local_blur
 from virest.diagnosis.local_blur import BlurObservations, frames_to_read, look_for_blur, observe_blur, residuals
-from virest.diagnosis.local_blur_edges import EdgeSettings, fit_steps, measure_widths, observe_picture
+from virest.diagnosis.local_blur_edges import fit_steps, measure_widths, observe_picture
 from virest.diagnosis.local_blur_fit import Defocus, ExposureTime, fit, held_out
 from virest.diagnosis.local_blur_model import fitted_width, node_tensors
 from virest.image_formation.kernels import kernel_field
 from virest.image_formation.row_motion import row_motion
+from virest.inference.edges import EdgeSettings
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 

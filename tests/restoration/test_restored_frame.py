@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.image_formation.row_motion import FrameTranslation, row_motion
+from virest.inference.unsharp_mask import UnsharpMask, without_mask
 from virest.restoration.frame import (
     RestoredFrame,
     copied_frame,
@@ -22,6 +23,7 @@ from virest.restoration.frame import (
 from virest.restoration.parameters import degradation_parameters
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 from virest.restoration.statistics.of_picture import most_blurred
+from virest.simulation.phone_pictures import sharpen
 
 BALANCED = RestorationSettings()
 METHODS = [m for m in DEBLUR_METHODS if m != "none"]
@@ -355,3 +357,22 @@ def test_what_is_censored_all_around_stays_as_it_was(preset: str, level: int) ->
     settings = replace(PRESETS[preset], shutter="none", reference="frame-middle")
     restored = _picture(_restore(turning, picture, settings))
     np.testing.assert_array_equal(restored[85:155, 115:225], level)
+
+
+def test_a_mask_that_is_undone_is_no_part_of_the_result() -> None:
+    """Deblurred without the mask it is what comes of a picture that had none; left alone it stays as recorded."""
+    turning = camera(reference="frame-middle")
+    recorded = record(turning)
+    mask = UnsharpMask(0.8, 1.2)
+    shown = np.rint(255 * sharpen(recorded.picture.astype(np.float32) / 255, mask.amount, mask.radius_px))
+    shown = np.clip(shown, 0, 255).astype(np.uint8)
+    settings, unmasked = replace(BALANCED, reference="frame-middle"), without_mask(shown, mask)
+    arguments = (FRAME, shown, turning.motion, turning.trajectory, settings)
+    undone, kept = (_picture(restore_frame(*arguments, unmasked=without)) for without in (unmasked, None))
+    plain = _picture(_restore(turning, recorded.picture, settings))
+    assert psnr_db(undone, plain, 30) > psnr_db(kept, plain, 30) + 6
+    assert psnr_db(undone, recorded.truth, 30) > psnr_db(kept, recorded.truth, 30)
+    resting = camera((0.0, 0.0, 0.0), reference="frame-middle")
+    copied = restore_frame(FRAME, shown, resting.motion, resting.trajectory, settings, unmasked=unmasked)
+    assert copied.status == "copied"
+    np.testing.assert_array_equal(_picture(copied), shown)

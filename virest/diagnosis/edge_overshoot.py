@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -27,10 +26,11 @@ from virest.capture.records import Capture, Frame
 from virest.diagnosis.catalogue import MAX_P
 from virest.diagnosis.findings import EDGES, Finding, HeldOutGain, ParameterChange, Rung
 from virest.diagnosis.local_blur import STILL_PX, frames_to_read, time_blocks
-from virest.diagnosis.local_blur_edges import TANGENT_PX, EdgeSettings, find_edges
 from virest.diagnosis.local_blur_model import across, path_tensors
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader
 from virest.inference.chance import normal_tail
+from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
+from virest.inference.unsharp_mask import PROFILE_STD
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -53,8 +53,6 @@ RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
 """Of phones' unsharp masks, and how far it varies (in the logarithm): 0.8 to 2 px."""
 AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
 """Of phones' unsharp masks, and how far it varies."""
-PROFILE_STD = 0.003
-"""Misfit of the mean profile, as part of the step; neighbours within a pixel share it."""
 BARE_OVERSHOOT, BARE_STD = 0.006, 0.007
 """Of decoded movies that nobody sharpened, mean and spread: coding, interpolation, and the choice of sharp edges."""
 BARE_RADII_PX = (0.6, 2.2)
@@ -134,7 +132,7 @@ def observe_profiles(
         count = np.ones(len(points))
         tensors = path_tensors(frame.time_s * count, frame.exposure_s * count, points, profile, trajectory)
         still = np.sqrt(across(tensors, normals)) < STILL_PX
-        found.append(_isolated(_sampled(picture, points[still], normals[still])))
+        found.append(_isolated(parallel_profiles(picture, points[still], normals[still], _ALONG_PX)))
         stamps.append(np.full(len(found[-1]), frame.time_s))
     return _measured(np.concatenate(found), np.concatenate(stamps))
 
@@ -179,22 +177,6 @@ def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
 
 
 _ALONG_PX = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-
-
-def _sampled(picture: NDArray[np.uint8], points: Array, normals: Array) -> Array:
-    """Mean of parallel profiles (n, m), grey levels.
-
-    Lanczos over 8 pixels: OpenCV's cubic sharpens by itself, and doubles the overshoot of a bare movie.
-    """
-    tangents = np.stack([-normals[:, 1], normals[:, 0]], -1)
-    total = np.zeros((len(points), len(_ALONG_PX)))
-    if not len(points):
-        return total
-    for beside in TANGENT_PX:
-        where = (points + beside * tangents)[:, None] + _ALONG_PX[:, None] * normals[:, None]
-        x, y = where[..., 0].astype(np.float32), where[..., 1].astype(np.float32)
-        total += cv2.remap(picture.astype(np.float32), x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)
-    return total / len(TANGENT_PX)
 
 
 def _isolated(levels: Array) -> Array:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
-from virest.diagnosis.local_blur_edges import EdgeSettings, EdgeWidths, join_edges, observe_picture
+from virest.diagnosis.local_blur_edges import EdgeWidths, join_edges, observe_picture
 from virest.diagnosis.local_blur_model import (
     across,
     covariates,
@@ -40,6 +40,7 @@ from virest.diagnosis.local_blur_spectra import (
     observe_pair,
     ring_of_bin,
 )
+from virest.inference.edges import EdgeSettings
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 

@@ -291,7 +291,7 @@ def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: Rest
                 yield index, picture
 
     plan = plan_restoration(capture, profile, settings, decodable)
-    return dataclasses.replace(plan, refusal=None, contradicted=None, missing_turn=None, confirmed=None)
+    return dataclasses.replace(plan, refusal=None, contradicted=None, missing_turn=None, mask=None, confirmed=None)
 
 
 def _tracked(

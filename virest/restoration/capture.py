@@ -14,6 +14,7 @@ from virest.capture.folder import Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s, outside_reason
 from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
+from virest.inference.unsharp_mask import UnsharpMask, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.trajectory import Trajectory
@@ -59,6 +60,9 @@ class RestorationPlan:
 
     missing_turn: MissingTurn | None = None
     """What neighbouring frames show that the predicted turns lack; None: nothing, or it could not be measured."""
+
+    mask: UnsharpMask | None = None
+    """The phone's sharpening, which is undone before the blur is; None: none that the pictures show."""
 
     confirmed: ConfirmedGain | None = None
     """How much of a promised gain neighbouring frames confirm; None: they could not tell."""
@@ -136,11 +140,15 @@ def restore_frames(
             trajectory, lens, frame, plan.settings.reference, translations.get(frame.index), profile
         )
         outside = outside_reason(motion.start_s, motion.end_s, imu.time_s, plan.imu_gaps_s)
-        return Sight(frame, picture, motion, outside[1] if outside else "")
+        why = outside[1] if outside else ""
+        if plan.mask is None or plan.copy_reason is not None:
+            return Sight(frame, picture, motion, why)
+        return Sight(frame, without_mask(picture, plan.mask), motion, why, picture)
 
     sights = (sight(frame, picture) for frame, picture in frames if picture is not None)
     for before, here, after in with_neighbours(sights, plan.reach):
-        frame, picture, motion = here.frame, here.picture, here.motion
+        frame, motion = here.frame, here.motion
+        picture = here.picture if here.recorded is None else here.recorded
         if only is not None and frame.index not in only:
             continue
         if motion is None or trajectory is None:
@@ -164,7 +172,10 @@ def restore_frames(
             pictures = partial(
                 neighbours.pictures, plan.joined(before, after), here, refined, plan.settings.most_joined
             )
-        yield restore_frame(frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures)
+        unmasked = None if here.recorded is None else here.picture
+        yield restore_frame(
+            frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures, unmasked
+        )
 
 
 def untrusted_reason(motion: RowMotion) -> str | None:

@@ -32,6 +32,7 @@ from virest.inference.synchronisation import (
     refine_time_offset,
 )
 from virest.inference.tracking import TrackPair, track_pairs
+from virest.inference.unsharp_mask import MOST_FRAMES
 from virest.inference.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
@@ -99,7 +100,8 @@ def _planned(
     surveyed, lumas = survey_runs(path_px, path_px), dict[int, NDArray[np.uint8]]()
     wanted = sorted(chosen.union(runs))
     guide = find_guide(capture, profile, read_gray, wanted)
-    pictures = kept_lumas(read_gray(wanted), {n for run in surveyed for n in run}, lumas)
+    kept = {n for run in surveyed for n in run}.union(sorted(path_px, key=path_px.__getitem__)[:MOST_FRAMES])
+    pictures = kept_lumas(read_gray(wanted), kept, lumas)
     all_pairs = track_pairs(kept_powers(pictures, looked_at, curve, powers), guide=guide)
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:

@@ -94,13 +94,15 @@ def restore_frame(
     refined: RefinedMotion | None = None,
     confirmed: ConfirmedGain | None = None,
     neighbours: NeighbourFinder | None = None,
+    unmasked: NDArray[np.uint8] | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
     picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
     pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
     is then taken.  confirmed: how much of a promised gain neighbours confirm.  neighbours:
-    brings those to the frame that it is restored with.
+    brings those to the frame that it is restored with.  unmasked: the picture without the phone's sharpening, which is
+    what is deblurred; None: ``picture`` itself.
     """
     clock = _Clock()
     if refined is not None:
@@ -124,7 +126,7 @@ def restore_frame(
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
         restored, parameters["deblur"], why_not = _deblurred(
-            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed, neighbours
+            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed, neighbours, unmasked
         )
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
@@ -242,8 +244,10 @@ def _deblurred(
     covariance_px2: NDArray[np.float64],
     confirmed: ConfirmedGain | None,
     neighbours: NeighbourFinder | None = None,
+    unmasked: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
+    as_shown, picture = picture, picture if unmasked is None else unmasked
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     centres_px = most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
@@ -259,7 +263,7 @@ def _deblurred(
         expected_db = confirmed.expected_db(replace(luma_model, places=None).expected_gain_db)
     why_not = too_little_to_gain(luma_model, expected_db)
     if why_not:
-        return picture, {"method": "none"}, (why_not,)
+        return as_shown, {"method": "none"}, (why_not,)
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
     found = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
     joined = joined_neighbours(found, luma_model)

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from virest.capture.folder import Capture
 from virest.capture.join import outside_reason
 from virest.image_formation.blur import Image
+from virest.image_formation.kernels import blur_chords
 from virest.image_formation.row_motion import RowMotion
+from virest.inference.unsharp_mask import MOST_FRAMES, seen_mask, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame
@@ -40,6 +42,7 @@ def with_neighbours_asked(
         motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
         outside = outside_reason(motion.start_s, motion.end_s, capture.imu.time_s, capture.imu_gaps_s)
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
+    plan, sights = _unmasked(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing = survey_turns(runs, sights, neighbours)
     if missing is not None:
@@ -58,3 +61,25 @@ def with_neighbours_asked(
         return tried(luma, motion, quick, refined)
 
     return replace(plan, confirmed=survey_gain(runs, sights, neighbours.knowing(missing), trajectory, lens, quickly))
+
+
+def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[RestorationPlan, dict[int, Sight]]:
+    """With the phone's sharpening, where edges show one, and what the frames are without it."""
+    if plan.settings.deblur == "none":
+        return plan, dict(sights)
+    usable = [(one.picture, one.motion) for one in sights.values() if one.usable and one.motion is not None]
+    mask = seen_mask(sorted(usable, key=lambda one: float(np.linalg.norm(_path_px(one[1]))))[:MOST_FRAMES])
+    if mask is None:
+        return plan, dict(sights)
+    said = (
+        f"edges overshoot: the phone sharpened its pictures, by an unsharp mask of {mask.amount:.2g} with a radius of "
+        f"{mask.radius_px:.2g} px; it is undone before the blur"
+    )
+    plan = replace(plan, mask=mask, notes=(*plan.notes, said))
+    return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}
+
+
+def _path_px(motion: RowMotion) -> NDArray[np.float64]:
+    """(2,) blur path in the picture's middle."""
+    middle_px = 0.5 * np.array([[motion.profile.width, motion.profile.height]])
+    return np.asarray(blur_chords(motion, middle_px)[0])

@@ -57,6 +57,8 @@ class Sight:
     """None: no focal length."""
     outside: str = ""
     """Why its motion is not known, where it reaches beyond the inertial data."""
+    recorded: NDArray[np.uint8] | None = None
+    """As it was recorded, where ``picture`` is without the phone's sharpening; None: ``picture`` is."""
 
     @property
     def usable(self) -> bool:

@@ -1,0 +1,109 @@
+"""A phone's unsharp mask is seen beside edges, told from what else shapes them, and undone."""
+
+import cv2
+import numpy as np
+import pytest
+from laws import TurningCamera, phone
+from scipy.special import ndtr
+
+from virest.inference.unsharp_mask import UnsharpMask, seen_mask, without_mask
+from virest.simulation.phone_pictures import sharpen
+
+SIZE = 280
+AT_REST = TurningCamera(phone(SIZE, SIZE, 300.0), (1e-4, 0.0, 0.0)).motion
+
+
+def strokes(rng, width_px=0.75, stroke_px=3.0, bright=200.0, dark=60.0):
+    """Dark strokes of print in all directions on bright paper, softened by a lens, grey levels."""
+    y, x = np.mgrid[:SIZE, :SIZE].astype(float)
+    ink = np.zeros((SIZE, SIZE))
+    near = 17  # beyond it nothing is left of a stroke
+    for top in range(24, SIZE - 20, 34):
+        for left in range(24, SIZE - 20, 34):
+            angle, half = rng.uniform(0, np.pi), rng.uniform(7, 9)
+            here = np.s_[top - near : top + near, left - near : left + near]
+            along = (x - left)[here] * np.cos(angle) + (y - top)[here] * np.sin(angle)
+            beside = (y - top)[here] * np.cos(angle) - (x - left)[here] * np.sin(angle)
+            line, ends = (
+                ndtr((at + reach) / width_px) - ndtr((at - reach) / width_px)
+                for at, reach in ((beside, stroke_px / 2), (along, half))
+            )
+            ink[here] = np.maximum(ink[here], line * ends)
+    return bright + (dark - bright) * ink
+
+
+def discs(rng):
+    """Discs of even light that lie over each other: steps of all heights, both sides of which are flat."""
+    fine = np.full((2 * SIZE, 2 * SIZE), 128, np.uint8)
+    for _ in range(250):
+        x, y, radius_px = (int(v) for v in rng.uniform(0, [2 * SIZE, 2 * SIZE, 70]))
+        cv2.circle(fine, (x, y), radius_px, int(rng.uniform(40, 215)), -1, cv2.LINE_AA)
+    return cv2.GaussianBlur(cv2.resize(fine, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.7)
+
+
+def masked(grey, amount, radius_px):
+    """A grey picture, or a colour one, with the mask."""
+    colour = (grey if grey.ndim == 3 else np.repeat(grey[..., None], 3, axis=-1)) / 255
+    shown = 255 * sharpen(colour.astype(np.float32), amount, radius_px)
+    return shown if grey.ndim == 3 else shown[..., 0]
+
+
+def recorded(rng, grey, amount=0.0, radius_px=1.0):
+    """8 bits, the mask on them, with a grey level of noise."""
+    shown = masked(grey, amount, radius_px) if amount else grey
+    return np.clip(np.rint(shown + rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
+
+
+def seen(rng, scene, **mask):
+    """What three frames of a camera at rest show."""
+    grey = scene(rng)
+    return seen_mask([(recorded(rng, grey, **mask), AT_REST) for _ in range(3)])
+
+
+@pytest.mark.parametrize("scene", [strokes, discs])
+@pytest.mark.parametrize(("amount", "radius_px"), [(0.4, 1.0), (0.7, 1.3), (1.0, 1.1)])
+def test_a_mask_is_seen(rng, scene, amount, radius_px):
+    """At the frequencies at which pictures have detail its gain comes back to a third."""
+    mask = seen(rng, scene, amount=amount, radius_px=radius_px)
+    assert mask is not None
+    for frequency in (0.15, 0.3):
+        found, truth = (
+            a * (1 - np.exp(-2 * (np.pi * r * frequency) ** 2))
+            for a, r in ((mask.amount, mask.radius_px), (amount, radius_px))
+        )
+        assert found == pytest.approx(truth, rel=0.34), frequency
+
+
+@pytest.mark.parametrize("scene", [strokes, discs])
+def test_what_nobody_sharpened_has_none(rng, scene):
+    """Print and plain surfaces, in focus and out of focus."""
+    assert seen(rng, scene) is None
+    assert seen(rng, lambda r: cv2.GaussianBlur(scene(r), (0, 0), 1.2)) is None
+
+
+def test_a_response_curve_is_no_mask(rng):
+    """A curve bends the two sides of an edge differently, and takes it beyond neither plateau."""
+    assert seen(rng, lambda r: 255 * (strokes(r) / 255) ** 0.5) is None
+
+
+def test_few_edges_show_nothing(rng):
+    """An even picture has none."""
+    assert seen(rng, lambda r: np.full((SIZE, SIZE), 128.0), amount=0.7) is None
+    assert seen_mask([]) is None
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(("amount", "radius_px"), [(0.5, 1.0), (1.4, 0.8), (1.0, 2.0)])
+def test_a_mask_is_undone(rng, channels, amount, radius_px):
+    """To within rounding, and a colour's differences from luma stay."""
+    grey = strokes(rng, bright=170.0, dark=90.0)
+    colour = np.stack([grey, grey - 20, grey + 15], -1)
+    if channels == 1:
+        colour = colour @ np.array([0.299, 0.587, 0.114])
+    shown = np.rint(masked(colour, amount, radius_px))
+    assert 0 < shown.min() < shown.max() < 255
+    undone = without_mask(shown.astype(np.uint8), UnsharpMask(amount, radius_px)).astype(float)
+    inner = np.s_[20:-20, 20:-20]
+    assert np.abs(shown - colour)[inner].max() > 10
+    assert np.abs(undone - colour)[inner].max() < 4
+    assert np.sqrt(np.mean((undone - colour)[inner] ** 2)) < 0.6
