@@ -16,11 +16,11 @@ from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import with_fields
-from virest.diagnosis.field.stretches import doubtful_stretches
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.inference.doubtful_log import doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
 from virest.inference.track_fit import Term
 

@@ -355,7 +355,8 @@ def _notes(
     if profile.intrinsics is None:
         notes.append("the focal length is unknown: no camera calibration is written; give --config, or calibrate")
     if rates := {field.covariates[0]: 1 for field in profile.fields if field.kind == "rate"}:
-        notes.append(f"the readings of the gyroscope are written with the fields of its rate over {', '.join(rates)} added")
+        over = ", ".join(rates)
+        notes.append(f"the readings of the gyroscope are written with the fields of its rate over {over} added")
     if unbridged := profile.unbridged_s:
         spans = ", ".join(f"{begin:.2f} to {end:.2f} s" for begin, end in unbridged[:3])
         more = f" and {len(unbridged) - 3} more" if len(unbridged) > 3 else ""

@@ -200,7 +200,7 @@ def format_camchain(
 
 
 def field_notes(profile: CameraProfile, off_px: float) -> list[str]:
-    """Sentences on fields that formats of other tools cannot hold; off_px: largest error of the lens that is written."""
+    """Sentences on fields that other tools' files cannot hold; off_px: largest error of the lens that is written."""
     said = []
     lens, uneven = profile.intrinsics, profile.shutter.uneven
     if lens is not None and lens.displaced is not None:
