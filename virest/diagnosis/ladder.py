@@ -23,7 +23,12 @@ from virest.diagnosis.ambiguities import (
 )
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
-from virest.diagnosis.field.brightness import light_field, with_light_field
+from virest.diagnosis.field.brightness import (
+    instead_of_flicker,
+    light_field,
+    with_light_field,
+    without_flicker,
+)
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
@@ -252,9 +257,14 @@ class DiagnosisSession:
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         extended, light = self.curve.profile, self.light
-        if light.observations is not None and (found := light_field(light.observations, extended)) is not None:
-            extended, fields = with_light_field(extended, found), [*fields, found.finding]
-            light = replace(light, profile=with_light_field(light.profile, found))
+        if (patches := light.observations) is not None:
+            instead = instead_of_flicker(patches, extended)
+            if instead is not None:
+                extended, light = without_flicker(extended), replace(light, profile=without_flicker(light.profile))
+                findings = [finding for finding in findings if finding.name != "flicker"]
+            if (found := instead or light_field(patches, extended)) is not None:
+                extended, fields = with_light_field(extended, found), [*fields, found.finding]
+                light = replace(light, profile=with_light_field(light.profile, found))
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]
