@@ -36,7 +36,7 @@ def counted_from(profile: CameraProfile, later_s: float, stamp_ns: int | None) -
         imu_untrusted_stamp_0_ns=None if profile.imu_untrusted_stamp_0_ns is None else stamp_ns,
     )
     owned = [replace(f, stamp_0_ns=stamp_ns) if f.belongs_to_one_capture else f for f in profile.fields]
-    return changed.with_fields([field.later(later_s) for field in owned])
+    return changed.with_fields([_of_longer(field.later(later_s), 1 + drift * later_s) for field in owned])
 
 
 def on_camera_clock(profile: CameraProfile) -> CameraProfile:
@@ -66,7 +66,15 @@ def on_camera_clock(profile: CameraProfile) -> CameraProfile:
         imu_untrusted_s=tuple((camera_s(begin), camera_s(end)) for begin, end in profile.imu_untrusted_s),
     )
     kept = [f for f in profile.fields if (f.kind, f.covariates) != ("delay", ("time",))]
-    return changed.with_fields([_retimed(f, camera_s) if f.kind in TIMED_BY_IMU else f for f in kept])
+    timed = [_retimed(f, camera_s) if f.kind in TIMED_BY_IMU else f for f in kept]
+    return changed.with_fields([_of_longer(field, 1 + drift * offset_s) for field in timed])
+
+
+def _of_longer(field: Field, scale: float) -> Field:
+    """A field of the focal length, as a part of a length that is longer by this factor; other fields as they are."""
+    if field.kind != "scale" or scale == 1.0:
+        return field
+    return field.with_values(np.array(field.values) / scale, np.array(field.std) / scale if field.std else None)
 
 
 def _retimed(field: Field, clock: Callable[[float], float]) -> Field:
