@@ -124,6 +124,7 @@ def test_a_lens_off_centre_is_a_map_of_second_order() -> None:
     assert seen[1] == pytest.approx(truth, rel=0.15)
 
 
+@pytest.mark.scenario
 def test_two_causes_that_only_compensate_for_a_lens_leave_together() -> None:
     """A turned sensor and another principal point hide most of a strong tangential lens; beside the field both go."""
     phone = StrangePhone(replace(HAND, seed=83, frames=41), Strange(tangential=(0.012, -0.016)))

@@ -23,7 +23,9 @@ from virest.diagnosis.photometry import PhotometricObservations, Prediction, pre
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-KNOTS = 4
+KNOTS, FINE_KNOTS = 4, 7
+FINER_LEFT = 0.98
+"""A finer map must leave less than this part of what the coarser one leaves on blocks that neither was fitted to."""
 FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
 MOST_OBSERVATIONS = 15_000
 MIN_SIZE = 0.06
@@ -94,17 +96,31 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile) -
     size = float(np.sqrt(max(scored.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))
     if min(t_ratio(scored.gain), t_ratio(scored.parts_gain)) < MIN_T or size < MIN_SIZE:
         return None
+    best: LightField | None = None
+    for count in (KNOTS, FINE_KNOTS):
+        found = _fitted(seen, profile, at, tangent, weight, block, count, scored.p_value)
+        if best is None or found.held_out.after < FINER_LEFT * best.held_out.after:
+            best = found
+    return best
+
+
+def _fitted(
+    seen: PhotometricObservations, profile: CameraProfile, at: Prediction, tangent: Array, weight: Array, block: Index,
+    count: int, p_value: float,
+) -> LightField:  # fmt: skip
+    """The map with this many knots along each side."""
+    zero, basis = _form(profile, count)
     if not profile.extensions.vignetting_corner_loss:
         # what a centred vignetting would say is no one else's then
         basis, tangent = null_space(_middle(zero, profile)[None]), tangent[:, 1:]
-        design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
+    left, design = at.residual / seen.noise, -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
     columns = np.concatenate([design, tangent], axis=1)
     numbers, covariance = _solved(columns, left, weight, block, design.shape[1])
     values = basis @ numbers
     std = np.sqrt(np.maximum(np.einsum("vk,kl,vl->v", basis, covariance, basis), 0.0))
     factor = np.exp(values)
     field = zero.with_values((factor - 1)[:, None], (factor * std)[:, None])
-    return LightField(field, scored.p_value, _held_out(columns, design.shape[1], left, weight, block, seen))
+    return LightField(field, p_value, _held_out(columns, design.shape[1], left, weight, block, seen))
 
 
 def instead_of_flicker(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
@@ -161,12 +177,12 @@ def _thinned(observations: PhotometricObservations) -> PhotometricObservations:
     return seen.subset(np.bincount(seen.patch)[seen.patch] >= 2)
 
 
-def _form(profile: CameraProfile) -> tuple[Field, Array]:
+def _form(profile: CameraProfile, count: int = KNOTS) -> tuple[Field, Array]:
     """A map of nought, and its free numbers: nought in the middle (each patch's own light), no vignetting in it."""
-    knots = tuple(tuple(np.linspace(0.0, side - 1, KNOTS).tolist()) for side in (profile.width, profile.height))
+    knots = tuple(tuple(np.linspace(0.0, side - 1, count).tolist()) for side in (profile.width, profile.height))
     x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
     radius2 = (x - 0.5 * (profile.width - 1)) ** 2 + (y - 0.5 * (profile.height - 1)) ** 2
-    field = Field("gain", ("x", "y"), knots, ((0.0,),) * KNOTS**2)
+    field = Field("gain", ("x", "y"), knots, ((0.0,),) * count**2)
     return field, null_space(np.stack([_middle(field, profile), radius2 / np.linalg.norm(radius2)]))
 
 
