@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.image_formation.point_model import IntegratedMotion, ground, predict
+from virest.image_formation.row_clock import RowClock
 from virest.inference.doubtful_log import doubtful_stretches
 from virest.inference.observed_tracks import frame_times, track_table
 from virest.inference.tracking import Picture, TrackPair
@@ -138,8 +139,9 @@ def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure
     """Frames (frames,) from whose first row to the next frame's last a stretch of the log is in doubt and unbridged."""
     doubtful = [(stretch.from_s, stretch.to_s) for stretch in doubtful_stretches(capture.imu)]
     doubtful = [span for span in doubtful if not profile.bridges(*span)]
-    begin_s = np.asarray(profile.imu_time_s(stamp_s))
-    until_s = begin_s + np.nanmedian(np.diff(stamp_s)) + profile.shutter.readout_time_s + exposure_s
+    clock, period_s = RowClock(profile), float(np.nanmedian(np.diff(stamp_s)))
+    begin_s = np.asarray(clock.time_s(stamp_s, exposure_s))
+    until_s = np.asarray(clock.end_s(stamp_s + period_s, exposure_s))
     found = np.zeros(len(stamp_s), bool)
     for from_s, to_s in (*doubtful, *profile.unbridged_s):
         found |= (begin_s < to_s) & (until_s > from_s)
