@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from virest.app import cli
+from virest.app.criticise import read_columns
 from virest.diagnosis.field.residual_table import criticise
 
 Table = dict[str, np.ndarray[Any, Any]]
@@ -90,11 +91,55 @@ def test_a_missing_column_is_named_with_what_may_be_meant(
     assert "rename 'dx_px' for 'dx'?" in said
 
 
-@pytest.mark.parametrize("content", ["", "x,y,dx,dy\n1,2,3,4\n", "x,y,dx,dy\na,b,c,d\n", "x,x,dx,dy\n1,1,1,1\n"])
+FORMS = {
+    "semicolons": lambda text: text.replace(",", ";"),
+    "decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
+    "tabs": lambda text: text.replace(",", "\t"),
+    "vnlog": lambda text: "#! a tool\n## its notes\n# " + text.replace(",", " "),
+    "a byte order mark": lambda text: "\ufeff" + text,
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_table_reads_the_same_in_every_form(tmp_path: Path, form: str) -> None:
+    """Semicolons, tabs, blanks behind a vnlog legend: the same columns and values."""
+    text = "x,y,dx,dy,temp\n1.5,2.0,-0.25,0.5,30.0\n3.5,4.0,0.75,-1e-2,31.5\n"
+    path = tmp_path / "residuals.csv"
+    path.write_text(FORMS[form](text), encoding="utf-8")
+    columns = read_columns(path)
+    assert list(columns) == ["x", "y", "dx", "dy", "temp"]
+    np.testing.assert_allclose(columns["dy"], (0.5, -0.01))
+    np.testing.assert_allclose(columns["temp"], (30.0, 31.5))
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "said"), [("dx", 1e300, "1e+300 px in column dx"), ("dx", 0.0, "all residuals are 0")]
+)
+def test_values_that_are_no_residuals_are_refused(
+    written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str], column: str, value: float, said: str
+) -> None:
+    """Overflowing ones, and nothing but noughts."""
+    table = residuals(4)
+    table[column] = np.full_like(table[column], value)
+    table["dy"] = np.zeros_like(table["dy"])
+    assert cli.run(["criticise", str(written(table))]) == 4
+    assert said in capsys.readouterr().err
+
+
+def test_points_on_one_line_have_no_map() -> None:
+    """A constant x is asked along nothing, and is no error."""
+    table = residuals(5)
+    table["x"] = np.full_like(table["x"], 100.0)
+    assert "displacement over x, y" not in criticise(table).forms
+
+
+@pytest.mark.parametrize(
+    "content", ["", "x,y,dx,dy\n1,2,3,4\n", "x,y,dx,dy\na,b,c,d\n", "x,x,dx,dy\n1,1,1,1\n", "1,2,3,4\n5,6,7,8\n"]
+)
 def test_a_file_that_is_no_table_ends_in_one_line(
     tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Empty, one row, words, a column twice."""
+    """Empty, one row, words, a column twice, no names."""
     path = tmp_path / "residuals.csv"
     path.write_text(content, encoding="utf-8")
     assert cli.run(["criticise", str(path)]) == 4

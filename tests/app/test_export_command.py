@@ -14,8 +14,9 @@ import yaml
 from virest.app.export import ExportOptions, plan_export, run_export
 from virest.app.process import ProcessOptions, process_captures
 from virest.app.simulate import simulate_command
+from virest.camera.field import Field
 from virest.camera.kalibr import is_kalibr, parse_camchain, parse_imu
-from virest.camera.profile import read_profile
+from virest.camera.profile import format_profile, read_profile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_frames
 from virest.errors import CaptureError, OutputError
@@ -218,3 +219,31 @@ def test_the_program_exports_and_processes_what_it_exported(walk, tmp_path, vire
     assert again.stderr.count("error:") == 1
     assert virest("export", walk, "--format", "bag", "--out", tmp_path).returncode == 2
     assert virest("export", tmp_path / "none", "--out", tmp_path).returncode == 4
+
+
+def test_fields_are_followed_or_said(walk, tmp_path):
+    """A displacement becomes distortion in each format, a rate goes into the samples, times count from the export."""
+    profile = read_profile(walk / "camera.yaml")
+    start_ns = read_capture(walk).stamp_0_ns
+    across, down = (0.0, 87.5, 175.0), (0.0, 63.5, 127.0)
+    bent = tuple((2e-4 * (y - 63.5) ** 2, 0.0) for _ in across for y in down)
+    fields = [
+        Field("displacement", ("x", "y"), (across, down), bent),
+        Field("rate", ("time",), ((0.1, 0.2, 0.3),), ((0.0,) * 3, (0.3, 0.0, -0.2), (0.0,) * 3), (), start_ns),
+        Field("scale", ("time",), ((0.0, 1.0),), ((0.0,), (0.02,)), (), start_ns),
+    ]
+    (tmp_path / "extended.yaml").write_text(format_profile(profile.with_fields(fields)))
+    config = tmp_path / "extended.yaml"
+    for form in ("colmap", "nerfstudio", "gyroflow"):
+        export(walk, tmp_path / form, format=form, config=config)
+    folder, facts = export(walk, tmp_path, format="euroc", config=config, frames=slice(2, None))
+    assert [note for note in facts["notes"] if "is written as distortion, within" in note]
+    assert [note for note in facts["notes"] if "the field of scale over time is left out" in note]
+    before, after = read_capture(walk), read_capture(folder)
+    added = after.imu.gyro_rad_s - before.imu.gyro_rad_s
+    np.testing.assert_allclose(added[np.argmin(np.abs(before.imu.time_s - 0.2))], (0.3, 0.0, -0.2), atol=0.01)
+    own, _ = resolve_profile(after)
+    assert [field.kind for field in own.fields] == ["displacement", "scale"]
+    first_s = (after.stamp_0_ns - start_ns) / 1e9
+    (scale,) = own.extensions.field
+    np.testing.assert_allclose(scale.at_time(0.3)[0], 0.02 * profile.imu_time_s(first_s + 0.3), atol=1e-5)

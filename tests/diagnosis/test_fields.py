@@ -11,16 +11,18 @@ from diagnosis.strange_phone import Strange, StrangePhone
 from motion.synthetic_tracks import Setup
 from numpy.typing import NDArray
 
+from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import with_fields
-from virest.diagnosis.field.stretches import doubtful_stretches
+from virest.diagnosis.field.stretches import bridging_form, rate_walk
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
 from virest.inference.track_fit import Term
 
@@ -122,6 +124,16 @@ def test_a_lens_off_centre_is_a_map_of_second_order() -> None:
     assert seen[1] == pytest.approx(truth, rel=0.15)
 
 
+@pytest.mark.scenario
+def test_two_causes_that_only_compensate_for_a_lens_leave_together() -> None:
+    """A turned sensor and another principal point hide most of a strong tangential lens; beside the field both go."""
+    phone = StrangePhone(replace(HAND, seed=83, frames=41), Strange(tangential=(0.012, -0.016)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert field.shape == "growing with its square"
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.15)
+
+
 def test_a_focal_length_that_settles_is_a_scale_over_time() -> None:
     """It levels off, which a constant drift does not."""
     phone = StrangePhone(replace(HAND, seed=74), Strange(longer=warming))
@@ -183,11 +195,39 @@ def test_a_gyroscope_that_clips_is_found_at_its_limit() -> None:
     assert field.held_out.after < field.held_out.before
 
 
+def test_what_no_row_sees_of_a_stretch_is_straight_and_in_doubt() -> None:
+    """Of a bridge without points nothing but its ends is known; a hand's turns give the deviation."""
+    phone = StrangePhone(replace(HAND, seed=84), Strange())
+    stretch = Stretch("straight", 0.5, 0.7, (0, 2))
+    walk = rate_walk(phone.imu)
+    form = bridging_form([stretch], 0, walk)
+    count = form.basis.shape[1]
+    (bridge,) = form.filled(np.zeros(count), np.eye(count))
+    std = np.array(bridge.std)
+    assert not np.any(std[[0, -1]])
+    assert not np.any(std[:, 1])
+    middle = np.array(bridge.knots[0]) - 0.5
+    np.testing.assert_allclose(std[:, 0], walk[0] * np.sqrt(middle * (0.2 - middle) / 0.2), atol=1e-6)
+
+
 def test_two_unknown_effects_at_once_are_two_fields() -> None:
     """Neither hides the other."""
     phone = StrangePhone(replace(HAND, seed=79), Strange(late_s=late_s, tangential=(0.01, 0.008)))
     _, fields = judged(phone, phone.profile)
     assert {field.kind for field in fields} == {"delay", "displacement"}
+
+
+def test_calibrate_follows_rows_that_are_read_unevenly() -> None:
+    """Under a profile with the delay over the row, offset and readout come out, and the field stays."""
+    phone = StrangePhone(replace(HAND, seed=85), Strange(late_s=late_s))
+    rows = Field("delay", ("row",), ((0.0, 0.25, 0.5, 0.75, 1.0),), ((0.0,), (0.0015,), (0.002,), (0.0015,), (0.0,)))
+    given = phone.profile.with_fields([rows])
+    given = replace(given, time_offset_s=phone.setup.time_offset_s - 0.004)
+    found = calibrate_geometry(phone.capture, given, phone.pairs)
+    assert found.profile.shutter.uneven == rows
+    assert found.profile.time_offset_s == pytest.approx(phone.setup.time_offset_s, abs=1e-4)
+    assert found.profile.shutter.readout_time_s == pytest.approx(phone.profile.shutter.readout_time_s, rel=0.01)
+    assert found.residual_px < 1.1 * HAND.noise_px
 
 
 @pytest.mark.parametrize("seed", [81, 82])

@@ -17,7 +17,7 @@ from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
 from virest.capture.video import probe_movie, read_frames
 from virest.diagnosis.curve_from_blur import MixingEvidence, estimate_mixing, judge_mixing, observe_mixing
-from virest.diagnosis.field.brightness import light_field, with_light_field
+from virest.diagnosis.field.brightness import instead_of_flicker, light_field, with_light_field
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
 from virest.diagnosis.photometry_effects import (
@@ -111,6 +111,21 @@ def test_a_shadow_on_one_side_is_a_field_and_a_vignette_is_none(rng: np.random.G
     assert np.abs(bend).max() < 0.03
     assert found.held_out.gain > 0.8
     assert light_field(replace(observed, grey=grey), with_light_field(profile, found)) is None
+
+
+def test_flicker_that_stands_still_is_a_shadow_where_that_explains_more(rng: np.random.Generator) -> None:
+    """A shadow over the rows is not told as a lamp of the frames' rate; a lamp of a multiple of it stays one."""
+    standing = {"flicker_amplitude": 0.03, "flicker_frequency_hz": 29.7, "flicker_phase_rad": 1.0}
+    observed = made_observations(hidden(), rng)
+    factor = 1 - 0.2 * (observed.x_px / 639) ** 3 - 0.1 * (observed.y_px / 479) ** 3
+    linear = NOMINAL.response.linearise(observed.grey / 255) * factor
+    shaded = replace(observed, grey=np.asarray(NOMINAL.response.encode(linear)) * 255)
+    found = instead_of_flicker(shaded, hidden(**standing))
+    assert found is not None
+    assert found.finding.confounded == ("flicker at 29.7 Hz",)
+    lamp = hidden(flicker_amplitude=0.15, flicker_frequency_hz=4 * 29.7, flicker_phase_rad=2.0)
+    assert instead_of_flicker(made_observations(lamp, rng), lamp) is None
+    assert instead_of_flicker(shaded, hidden(**standing | {"flicker_frequency_hz": 31.0})) is None
 
 
 def test_each_effect_comes_back_within_its_deviation(rng: np.random.Generator) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from virest.errors import CaptureError
 Json = dict[str, Any]
 SCHEMA = "virest/criticism/1"
 MAX_BYTES = 1 << 30
+NAMES = ",".join(NEEDED)
+SEPARATORS = (";", "\t", ",")
 
 
 def criticise_file(path: Path) -> tuple[Json, str]:
@@ -24,27 +27,64 @@ def criticise_file(path: Path) -> tuple[Json, str]:
     try:
         found = criticise(columns)
     except CaptureError as error:
-        raise CaptureError(f"{path.name}: {error.message}", hint=_nearest(columns) or error.hint) from None
+        raise CaptureError(f"{path.name}: {error.message}", hint=error.hint) from None
     return as_json(path, found), describe(path, found)
 
 
 def read_columns(path: Path) -> dict[str, Any]:
-    """The numeric columns of a CSV file by their names, in lower case; `#` begins a comment."""
+    """The numeric columns of a table by their names, in lower case.
+
+    Columns are separated by commas, semicolons, tabs or blanks, with a decimal comma where that separates nothing.  `#`
+    begins a comment; the names may stand behind one, as vnlog (mrcal) has them.
+    """
     if not path.is_file():
         raise CaptureError(f"{path}: no such file", hint="pass a CSV file with the columns x, y, dx, dy")
     if path.stat().st_size > MAX_BYTES:
         raise CaptureError(f"{path.name}: larger than {MAX_BYTES >> 20} MB", hint="thin the rows")
     try:
-        table = pd.read_csv(path, skipinitialspace=True, comment="#", encoding="utf-8")
+        legend, skipped, first = _beginning(path)
+        separator = next((mark for mark in SEPARATORS if mark in legend), r"\s+")
+        names = [name.strip(' "').lower() for name in re.split(separator, legend.strip())]
+        if all(map(_is_number, names)):
+            raise CaptureError(f"{path.name}: its first line holds numbers", hint=f"name the columns: {NAMES}, ...")
+        if len(set(names)) < len(names):
+            raise CaptureError(f"{path.name}: a column stands twice", hint="name each column once")
+        decimal = "," if separator in ";\t" and re.search(r"\d,\d", first) else "."
+        table = pd.read_csv(
+            path, sep=separator, names=names, skiprows=skipped, decimal=decimal, skipinitialspace=separator == ",",
+            comment="#", encoding="utf-8-sig", index_col=False,
+        )  # fmt: skip
     except (ValueError, UnicodeDecodeError, OSError) as error:
-        raise CaptureError(
-            f"{path.name}: is no CSV table: {str(error).splitlines()[0][:120]}", hint="first line: x,y,dx,dy"
-        ) from None
-    table.columns = [str(name).strip().lower() for name in table.columns]
-    if table.columns.has_duplicates:
-        raise CaptureError(f"{path.name}: a column stands twice", hint="name each column once")
+        reason = (str(error).splitlines() or ["empty"])[0][:120]
+        raise CaptureError(f"{path.name}: is no CSV table: {reason}", hint=f"first line: {NAMES}") from None
     numeric = {name: pd.to_numeric(table[name], errors="coerce").to_numpy(float) for name in table.columns}
-    return {name: values for name, values in numeric.items() if np.isfinite(values).any()}
+    columns = {name: values for name, values in numeric.items() if np.isfinite(values).any()}
+    if missing := [name for name in NEEDED if name not in columns]:
+        found = ", ".join(name for name in columns if name.isprintable())[:80] or "no column with numbers"
+        raise CaptureError(
+            f"{path.name}: no column {', '.join(missing)}; it has {found}",
+            hint=_nearest(columns) or f"needed are {', '.join(NEEDED)}, in pixels",
+        )
+    return columns
+
+
+def _beginning(path: Path) -> tuple[str, int, str]:
+    """The line of names, how many lines end with it, and the line after it. Raises ValueError for an empty file."""
+    with path.open(encoding="utf-8-sig") as lines:
+        for number, line in enumerate(lines, start=1):
+            words = line.lstrip("# \t").rstrip()
+            is_legend = set(NEEDED) <= set(re.split(r"[\s,;]+", words.lower()))
+            if words and (is_legend or not line.startswith("#")):
+                return words, number, next(lines, "")
+    raise ValueError("no line of names")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 def _nearest(columns: dict[str, Any]) -> str:

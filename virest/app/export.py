@@ -90,7 +90,7 @@ def _write_lens_profile(plan: ExportPlan, part: Path) -> tuple[Json, str]:
     if plan.profile.intrinsics is None:
         raise CaptureError(f"{plan.capture.name}: the focal length is unknown", hint="virest calibrate --with focal")
     rate_hz = _rate_hz([frame.time_ns for frame in plan.frames])
-    text, error_px = gyroflow_profile(plan.camera, rate_hz)
+    text, error_px = gyroflow_profile(replace(plan.camera, intrinsics=plan.standard.intrinsics), rate_hz)
     _write(part / "lens.json", text)
     facts = _facts(plan, list(plan.frames)) | {"frames": 0, "lens_error_px": error_px}
     _write(part / RECORD, json.dumps(plain(facts), allow_nan=False, indent=2) + "\n")
@@ -177,7 +177,7 @@ def _write_tables(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> No
     times = [frame.time_ns for frame in frames]
     imu = plan.capture.imu
     accel = _without_holes(imu.time_s, imu.accel_m_s2)
-    rows = format_imu_rows(plan.imu_time_ns, imu.gyro_rad_s, accel)
+    rows = format_imu_rows(plan.imu_time_ns, plan.gyro_rad_s, accel)
     rate_hz = _rate_hz(times)
     if plan.options.format == "euroc":
         _write(part / "mav0/cam0/data.csv", format_picture_list(times))
@@ -202,17 +202,17 @@ def _write_tables(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> No
 
 
 def _write_calibration(plan: ExportPlan, part: Path, rate_hz: float) -> None:
-    lens = plan.profile.intrinsics
+    lens = plan.standard.intrinsics
     if lens is not None and lens.model == "none":
         # what reads camera chains knows radtan and equidistant, and seldom a lens without distortion
         lens = replace(lens, model="radtan", coefficients=(0.0,) * 5)
     known = plan.profile.time_offset_s is not None
-    base = replace(plan.profile, intrinsics=lens, time_offset_s=0.0 if known else None)
+    base = replace(plan.standard, intrinsics=lens, time_offset_s=0.0 if known else None)
     chain = format_camchain(base, command="export", instant_s=plan.instant_s)
     _write(part / "camchain-imucam.yaml", chain)
-    _write(part / "orb_slam3.yaml", format_orb_slam(plan.profile, rate_hz, plan.noise, _said(plan)))
+    _write(part / "orb_slam3.yaml", format_orb_slam(plan.standard, rate_hz, plan.noise, _said(plan)))
     if plan.options.format == "euroc":
-        _write(part / "mav0/cam0/sensor.yaml", format_camera_sensor(plan.profile, rate_hz, _said(plan)))
+        _write(part / "mav0/cam0/sensor.yaml", format_camera_sensor(plan.standard, rate_hz, _said(plan)))
 
 
 def _said(plan: ExportPlan) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,13 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.outputs import RunFolder, capture_name, read_lines
-from virest.camera.kalibr import ImuNoise, measure_imu_noise
-from virest.camera.profile import CameraProfile, Extensions, parse_profile
+from virest.camera.kalibr import ImuNoise, field_notes, measure_imu_noise
+from virest.camera.lens_fit import standard_lens
+from virest.camera.profile import CameraProfile, parse_profile
+from virest.camera.recounting import counted_from, on_camera_clock
 from virest.capture.files import label, scan_text
 from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile
+from virest.capture.profile_source import for_capture, with_logged_focal
 from virest.capture.records import STALL
 from virest.errors import CaptureError, OutputError
 from virest.image_formation.row_clock import RowClock
+from virest.motion.integration import missing_rate_rad_s
 from virest.restoration.capture import at_true_times
 
 if TYPE_CHECKING:
@@ -90,8 +93,12 @@ class ExportPlan:
     """Of the capture, as :attr:`profile` is of what is written."""
     velocities: Mapping[int, list[float]]
     """m/s in camera axes, by frame, where a run knows them."""
-    restored_start: bool = False
+    restored_start: bool
     """Whether restored pictures show the start of the first row's exposure."""
+    standard: CameraProfile
+    """The profile as other tools can hold it: the nearest lens of a standard model, and no fields."""
+    gyro_rad_s: NDArray[np.float64]
+    """(n, 3) readings with what the profile's fields of the rate add to them."""
     poses: GivenPoses | None = None
 
 
@@ -109,6 +116,7 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
         run = RunFolder(options.restored)
         account = _read_account(run, capture)
         profile, source = parse_profile(account["profile"], "run.json"), f"{options.restored.name}/run.json"
+        profile = with_logged_focal(for_capture(profile, capture), capture)
         reference = account.get("settings", {}).get("reference", "exposure-start")
         pictures = _restored_pictures(run, capture, left_out)
         velocities = _velocities(run)
@@ -118,12 +126,13 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
         raise CaptureError(f"{capture.name}: no frame to export: {why}", hint="see `virest inspect`")
     instants_s = _instants_s(chosen, profile, reference)
     frames = _stamped(chosen, capture, instants_s, options, pictures, left_out)
-    notes = _notes(capture, profile, options, instants_s)
+    written, instant_s = _written_profile(profile, instants_s, options)
+    written = _for_frames(written, frames, capture, options)
+    lens, off_px = (None, 0.0) if written.intrinsics is None else standard_lens(written.intrinsics)
+    imu, gyro_rad_s = capture.imu, _corrected_gyro(capture, profile)
+    notes = [*_notes(capture, profile, options, instants_s), *field_notes(written, off_px)]
     for note in notes:
         log.warning("%s: %s", capture.name, note)
-    written, instant_s = _written_profile(profile, instants_s, options)
-    written = replace(written, extensions=_written_extensions(written, frames, capture, options))
-    imu = capture.imu
     noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
     times = _imu_time_ns(capture, profile)
     return ExportPlan(
@@ -141,6 +150,8 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
         profile,
         velocities,
         options.restored is not None and reference == "exposure-start",
+        replace(written, intrinsics=lens).with_fields(()),
+        gyro_rad_s,
         None if options.poses is None else _read_poses(options.poses),
     )
 
@@ -270,50 +281,60 @@ def _written_profile(
 ) -> tuple[CameraProfile, float]:
     """The profile of what is written, and the seconds from a written stamp to the instant of its picture.
 
-    Samples are on the camera's clock, so what was offset and skew is gone.  A restored picture has no rows and no
+    Samples are on the camera's clock, so what was offset, skew or delay over time is gone, and so are fields of the
+    rate, which the samples hold.  A restored picture has no rows and no
     exposure; a raw one keeps both, and where its stamp is moved to its middle, the first row is half a readout before.
     """
     logged = options.stamps == "logged"
     instant_s = float(np.median(instants_s)) if logged else 0.0
     shutter, offset_s = profile.shutter, 0.0
     if options.restored is not None:
-        shutter = replace(shutter, readout_time_s=0.0, timestamp="exposure_start")
+        shutter = replace(shutter, readout_time_s=0.0, timestamp="exposure_start", uneven=None)
         offset_s = instant_s
     elif not logged:
         shutter = replace(shutter, timestamp="exposure_middle")
         offset_s = -0.5 * shutter.readout_time_s
     known = profile.time_offset_s is not None
     estimates = {k: v for k, v in profile.estimates.items() if k not in ("time_offset_s", "clock_skew")}
+    trusted = replace(profile, imu_untrusted_s=profile.unbridged_s)
     written = replace(
-        profile,
+        on_camera_clock(trusted.with_fields([field for field in profile.fields if field.kind != "rate"])),
         shutter=shutter,
         readout_known=profile.readout_known or options.restored is not None,
         time_offset_s=offset_s if known else None,
-        clock_skew=0.0,
         estimates=estimates,
     )
     return written, instant_s
 
 
-def _written_extensions(
+def _for_frames(
     profile: CameraProfile, frames: tuple[ExportFrame, ...], capture: Capture, options: ExportOptions
-) -> Extensions:
-    """What a diagnosis added, for these frames alone: their gains, the lamp's phase at the first of them.
+) -> CameraProfile:
+    """The profile for these frames alone: their gains, and what runs over time counted from the first of them.
 
-    Pulsing light and defocus are gone from a restored picture, and no frame is later than its stamp any more.
+    Pulsing light and defocus are gone from a restored picture, no frame is later than its stamp any more, and stretches
+    of the log that were bridged can be trusted.
     """
-    ext = profile.extensions
-    whole = options.restored is None
     later_s = (frames[0].time_ns - capture.stamp_0_ns) / 1e9
-    return replace(
+    profile = counted_from(profile, later_s, frames[0].time_ns)
+    ext, whole = profile.extensions, options.restored is None
+    extensions = replace(
         ext,
         frame_lag_s=0.0,
         frame_lag_frames=0,
         gain=tuple(ext.gain[frame.index] for frame in frames) if ext.gain else (),
         flicker_amplitude=ext.flicker_amplitude if whole else 0.0,
-        flicker_phase_rad=ext.flicker_phase_rad + 2.0 * math.pi * ext.flicker_frequency_hz * later_s,
         defocus_sigma_px=ext.defocus_sigma_px if whole else 0.0,
     )
+    return replace(profile, extensions=extensions)
+
+
+def _corrected_gyro(capture: Capture, profile: CameraProfile) -> NDArray[np.float64]:
+    """The gyroscope's readings (n, 3) as they would be if it had no error but bias, scale and noise."""
+    missing = missing_rate_rad_s(capture.imu, profile)
+    if missing is None:
+        return capture.imu.gyro_rad_s
+    return np.asarray(capture.imu.gyro_rad_s + np.array(profile.gyro_scale) * missing)
 
 
 def _imu_time_ns(capture: Capture, profile: CameraProfile) -> NDArray[np.int64]:
@@ -333,6 +354,13 @@ def _notes(
         )
     if profile.intrinsics is None:
         notes.append("the focal length is unknown: no camera calibration is written; give --config, or calibrate")
+    if rates := {field.covariates[0]: 1 for field in profile.fields if field.kind == "rate"}:
+        over = ", ".join(rates)
+        notes.append(f"the readings of the gyroscope are written with the fields of its rate over {over} added")
+    if unbridged := profile.unbridged_s:
+        spans = ", ".join(f"{begin:.2f} to {end:.2f} s" for begin, end in unbridged[:3])
+        more = f" and {len(unbridged) - 3} more" if len(unbridged) > 3 else ""
+        notes.append(f"the inertial log cannot be trusted from {spans}{more} after the first stamp: written as logged")
     if not capture.imu.has_accelerometer:
         notes.append("no accelerometer: its columns are nan, and tools can use the camera alone")
     shift_ms = 1e3 * float(np.median(instants_s))

@@ -141,7 +141,7 @@ def _pose(
 
 def transforms_json(plan: ExportPlan, poses: list[FramePose]) -> str:
     """``transforms.json``: intrinsics, and for each frame what is known of its time, motion and pose."""
-    lens = plan.profile.intrinsics
+    lens = plan.standard.intrinsics
     assert lens is not None
     readout_s = 0.0 if plan.options.restored else plan.camera.shutter.readout_time_s
     content: Json = {
@@ -191,7 +191,7 @@ def _nerfstudio_frame(plan: ExportPlan, pose: FramePose, readout_s: float) -> Js
 
 def colmap_files(plan: ExportPlan, poses: list[FramePose]) -> dict[str, str]:
     """The text model ``sparse/0``, and the poses at both ends of the rolling shutter."""
-    lens = plan.profile.intrinsics
+    lens = plan.standard.intrinsics
     assert lens is not None
     model, parameters = _colmap_camera(lens)
     camera = f"1 {model} {lens.width} {lens.height} {' '.join(f'{value:.12g}' for value in parameters)}"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,10 @@ from virest.simulation.auto_exposure import AutoExposure
 from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
 from virest.simulation.hidden import NOTHING, Hidden
 from virest.simulation.phone_isp import OFF, PhoneIsp
-from virest.simulation.recording import RecordingOptions, write_recording
+from virest.simulation.recording import FOCUS_DIOPTRES, RecordingOptions, write_recording
 from virest.simulation.session import Session, SessionSettings, nominal_camera, plan_session
+
+log = logging.getLogger(__name__)
 
 
 def simulate_command(
@@ -89,6 +93,7 @@ def simulate_command(
         distortion=distortion,
         depth_m=np.inf if depth_m is None else depth_m,
     )
+    nominal = _of_new_capture(nominal)
     context = EffectContext(frames, fps, np.random.default_rng([seed, 5]))
     true, applied = hide_effects(nominal, list(effects), context)
     isp = hidden_isp(applied, isp)
@@ -133,6 +138,24 @@ def simulate_command(
         **({"isp": isp.in_force()} if isp.in_force() else {}),
         "effects": [{"name": effect.name, "parameters": effect.parameters} for effect in applied],
     }
+
+
+def _of_new_capture(profile: CameraProfile) -> CameraProfile:
+    """The profile with the fields that hold for a capture to come: not another's, and the focus where it will rest."""
+    others = [field for field in profile.fields if field.belongs_to_one_capture]
+    for field in others:
+        log.warning(
+            "a field of %s over %s belongs to another capture: left out", field.kind, ", ".join(field.covariates)
+        )
+    at_rest = ((0.0, 1.0), (FOCUS_DIOPTRES, FOCUS_DIOPTRES))
+    kept = [
+        replace(field, log=at_rest) if field.covariates == ("focus",) else field
+        for field in profile.fields
+        if field not in others
+    ]
+    if profile.imu_untrusted_stamp_0_ns is not None:
+        profile = replace(profile, imu_untrusted_s=(), imu_untrusted_stamp_0_ns=None)
+    return profile.with_fields(kept)
 
 
 def _auto_exposure(range_ev: float | None, steps: int | None) -> AutoExposure | None:

@@ -165,6 +165,7 @@ def calibrate_geometry(
     asked = [OPTIONAL[name] for name in names if name in OPTIONAL]
     wanted += [term for term in asked if term is terms_of.FOCAL]
     rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, wanted, asked)
+    rough = _with_uneven_rows(rough, start)
     say("readout")
     wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS, *asked]
     left_out = 0.0
@@ -187,7 +188,7 @@ def calibrate_geometry(
         return replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
     found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out, corrected)
     say("joint")
-    found = replace(found, notes=(*found.notes, *held_notes(held, names)))
+    found = replace(found, notes=(*found.notes, *held_notes(held, names), *_uneven_note(found.profile, profile)))
     return found if lag is None else _with_lag(found, lag)
 
 
@@ -298,8 +299,29 @@ def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
     """A global shutter that sees the picture when its middle row was read, ready for a readout of either sense."""
     shutter = profile.shutter
     middle = (profile.time_offset_s or 0.0) + 0.5 * shutter.readout_time_s
-    return replace(
-        profile, time_offset_s=middle, shutter=replace(shutter, readout_time_s=0.0, readout_direction=direction)
+    bare = replace(shutter, readout_time_s=0.0, readout_direction=direction, uneven=None)
+    return replace(profile, time_offset_s=middle, shutter=bare)
+
+
+def _with_uneven_rows(rough: _Rough, given: CameraProfile) -> _Rough:
+    """Put back by how much the profile's rows are late, where the points see the rows run as the profile has them."""
+    uneven, found = given.shutter.uneven, right_way_round(rough.profile)
+    if uneven is None:
+        return rough
+    if not rough.direction_known:
+        found = _with_given_readout(found, given)
+    if found.shutter.readout_direction != given.shutter.readout_direction or not found.shutter.readout_time_s:
+        return rough
+    return replace(rough, profile=replace(found, shutter=replace(found.shutter, uneven=uneven)))
+
+
+def _uneven_note(fitted: CameraProfile, given: CameraProfile) -> tuple[str, ...]:
+    """What is said where the profile's delay over the row could not be kept."""
+    if given.shutter.uneven is None or fitted.shutter.uneven is not None:
+        return ()
+    return (
+        f"the profile's delay over the row belongs to rows read {given.shutter.readout_direction}, which the points "
+        "contradict: it was left out; virest diagnose finds it again",
     )
 
 

@@ -36,6 +36,8 @@ KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
 UNITS = {"row": "1", "x": "px", "y": "px", "time": "s", "focus": "1/m", "focal": "1"}
 """Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``focal``: logged
 focal length over its median."""
+TIMED_BY_IMU = ("scale", "rate")
+"""Kinds whose times are the inertial log's; the others' are the camera's."""
 _FIXED_POINT_STEPS = 5
 """A displacement's slope is a few per cent: each step of its inversion shrinks the error by that factor."""
 

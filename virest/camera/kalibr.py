@@ -8,7 +8,7 @@ written; ``line_delay_nanoseconds`` of its rolling-shutter calibration is the re
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import yaml
 from numpy.typing import NDArray
 
 from virest.camera.intrinsics import COEFFICIENT_NAMES
+from virest.camera.lens_fit import standard_lens
 from virest.camera.profile import CameraProfile, Extensions, parse_profile
 from virest.errors import SettingsError
 
@@ -175,6 +176,7 @@ def format_camchain(
     lens = profile.intrinsics
     if lens is None:
         raise SettingsError("Kalibr's camchain needs a focal length", hint="calibrate with --with focal")
+    lens, off_px = standard_lens(lens)
     model, names = next((kalibr, own) for kalibr, (ours, own) in _DISTORTIONS.items() if ours == lens.model)
     coefficients = dict(zip(COEFFICIENT_NAMES[lens.model], lens.coefficients, strict=True))
     camera: dict[str, Any] = {
@@ -193,8 +195,21 @@ def format_camchain(
         shift_s = _shift_for_kalibr_s(profile, exposure_s) if instant_s is None else instant_s
         camera["timeshift_cam_imu"] = profile.time_offset_s + shift_s
     lost = _not_held(profile, coefficients, names, exposure_s) if instant_s is None else _one_instant(profile)
-    comments = [f"Kalibr camera chain, written by virest {command}", *lost]
+    comments = [f"Kalibr camera chain, written by virest {command}", *lost, *field_notes(profile, off_px)]
     return _commented(comments) + yaml.safe_dump({"cam0": camera}, default_flow_style=None, width=110)
+
+
+def field_notes(profile: CameraProfile, off_px: float) -> list[str]:
+    """Sentences on fields that other tools' files cannot hold; off_px: largest error of the lens that is written."""
+    said = []
+    lens, uneven = profile.intrinsics, profile.shutter.uneven
+    if lens is not None and lens.displaced is not None:
+        said.append(f"the displacement over the picture is written as distortion, within {off_px:.2g} px")
+    if uneven is not None:
+        late_ms = 1e3 * float(np.abs(uneven.values).max())
+        said.append(f"rows that start up to {late_ms:.2g} ms early or late (a field over the row) are left out")
+    kinds = {f"{field.kind} over {', '.join(field.covariates)}": 1 for field in profile.extensions.field}
+    return [*said, *(f"the field of {name} is left out" for name in kinds)]
 
 
 def _one_instant(profile: CameraProfile) -> list[str]:
@@ -283,7 +298,7 @@ def _not_held(
     said += [f"Kalibr has no {key}: {value}" for key, (value, plain) in lost.items() if value != plain]
     if profile.response is not None:
         said.append(f"Kalibr has no exposure curve: {profile.response.kind}")
-    if profile.extensions != Extensions():
+    if replace(profile.extensions, field=()) != Extensions():
         said.append("Kalibr has none of the profile's extensions")
     return said
 

@@ -120,9 +120,12 @@ class CameraProfile:
     @property
     def unbridged_s(self) -> tuple[tuple[float, float], ...]:
         """Untrusted stretches of the inertial log that no field of the rate over their time bridges."""
+        return tuple(span for span in self.imu_untrusted_s if not self.bridges(*span))
+
+    def bridges(self, from_s: float, to_s: float) -> bool:
+        """Whether a field of the rate over time bridges just this stretch of the inertial log."""
         knots = [f.knots[0] for f in self.extensions.field if f.kind == "rate" and f.covariates == ("time",)]
-        bridged = np.array([(k[0], k[-1]) for k in knots]).reshape(-1, 2)
-        return tuple(s for s in self.imu_untrusted_s if not np.any(np.abs(bridged - s).max(axis=1) < BRIDGE_SLACK_S))
+        return any(max(abs(k[0] - from_s), abs(k[-1] - to_s)) < BRIDGE_SLACK_S for k in knots)
 
     def with_fields(self, fields: Sequence[ModelField]) -> CameraProfile:
         """The profile with these fields and no others. Raises SettingsError for two of a kind of which one is held."""

@@ -6,7 +6,7 @@ they should be; then brightness, then blur.  What is left is tested for structur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,7 +22,13 @@ from virest.diagnosis.ambiguities import (
     one_exposure,
 )
 from virest.diagnosis.edge_overshoot import judge_sharpening
-from virest.diagnosis.field.brightness import light_field, with_light_field
+from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
+from virest.diagnosis.field.brightness import (
+    instead_of_flicker,
+    light_field,
+    with_light_field,
+    without_flicker,
+)
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
@@ -43,10 +49,10 @@ from virest.diagnosis.tracking_stage import (
 from virest.errors import CaptureError
 from virest.image_formation.point_model import predict
 from virest.inference.guide_choice import find_guide, track_guided
-from virest.inference.observed_tracks import observe_tracks
+from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.recorder_lag import lag_schedules
-from virest.inference.tracking import TrackPair, track_pairs
+from virest.inference.tracking import track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.scene_motion import InertialMotion
 
@@ -94,7 +100,8 @@ def _tracked(
 ) -> tuple[TrackedPoints, list[str]]:
     """Points of the frames that are followed, those of the start-up too; pairs with a frame kept back are left out."""
     indices = frames_to_follow(capture, profile)
-    observed = observe_tracks(capture, _seen(track_guided(capture, profile, gray, indices, each), kept_back), profile)
+    observed = observe_tracks(capture, track_guided(capture, profile, gray, indices, each), profile)
+    observed = _seen(observed, capture, profile, kept_back)
     start, null_terms, notes, far, follows = with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
@@ -115,8 +122,16 @@ def _tracked(
     return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
 
 
-def _seen(pairs: Sequence[TrackPair], kept_back: frozenset[int]) -> list[TrackPair]:
-    return [pair for pair in pairs if not kept_back & {pair.first, pair.second}]
+def _seen(
+    observed: ObservedTracks, capture: Capture, profile: CameraProfile, kept_back: frozenset[int]
+) -> ObservedTracks:
+    """The pairs without the frames that are kept back, but for those in doubtful stretches of the log.
+
+    These take no part in the ladder, and nothing but their own points can bridge the stretch.
+    """
+    seen = np.array([not kept_back & {pair.first, pair.second} for pair in observed.pairs], bool)
+    hit = doubtful_pairs(observed, capture, profile).hit
+    return observed.chosen(seen | hit if (seen & ~hit).sum() >= LEAST_PAIRS_LEFT else seen)
 
 
 @dataclass(slots=True)
@@ -165,8 +180,8 @@ class DiagnosisSession:
             even = evened(gray, frames, self.light.profile)
             followed = set(frames_to_follow(self.capture, given)) & {frame.index for frame in frames}
             guide = find_guide(self.capture, given, gray, sorted(followed))
-            pairs = _seen(track_pairs(even(sorted(followed)), guide=guide), self.kept_back)
-            again = observe_tracks(self.capture, pairs, given)
+            again = observe_tracks(self.capture, track_pairs(even(sorted(followed)), guide=guide), given)
+            again = _seen(again, self.capture, given, self.kept_back)
             start = self.points.start
             self.points = replace(
                 self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
@@ -242,9 +257,14 @@ class DiagnosisSession:
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         extended, light = self.curve.profile, self.light
-        if light.observations is not None and (found := light_field(light.observations, extended)) is not None:
-            extended, fields = with_light_field(extended, found), [*fields, found.finding]
-            light = replace(light, profile=with_light_field(light.profile, found))
+        if (patches := light.observations) is not None:
+            instead = instead_of_flicker(patches, extended)
+            if instead is not None:
+                extended, light = without_flicker(extended), replace(light, profile=without_flicker(light.profile))
+                findings = [finding for finding in findings if finding.name != "flicker"]
+            if (found := instead or light_field(patches, extended)) is not None:
+                extended, fields = with_light_field(extended, found), [*fields, found.finding]
+                light = replace(light, profile=with_light_field(light.profile, found))
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]

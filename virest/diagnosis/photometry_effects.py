@@ -247,6 +247,7 @@ def scan_flicker(
     stiffness = weight * prediction.slope**2
     thin = max(1, int(np.ceil(len(observations) / _SCAN_OBSERVATIONS)))
     keep = observations.place % thin == 0 if thin > 1 else np.ones(len(observations), bool)
+    keep |= not keep.any()
     exposure = np.asarray(profile.shutter.true_exposure_s(observations.exposure_s), float)
     time_s = observations.row_time_s(profile, ROW_MIDDLE)[keep]
     span = max(float(np.ptp(time_s)), 0.1)

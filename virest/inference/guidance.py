@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.image_formation.point_model import IntegratedMotion, ground, predict
+from virest.image_formation.row_clock import RowClock
+from virest.inference.doubtful_log import doubtful_stretches
 from virest.inference.observed_tracks import frame_times, track_table
 from virest.inference.tracking import Picture, TrackPair
 
@@ -123,10 +125,27 @@ class MapBetween:
 
 
 def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
-    """The guide of a capture at a profile's offset, 0 where it has none; the profile must have a focal length."""
+    """The guide of a capture at a profile's offset, 0 where it has none; the profile must have a focal length.
+
+    Where the log looks filled or clipped it does not guide: it would lead points astray, and those left would agree.
+    """
     stamp_s, exposure_s, _ = frame_times(capture)
     stamp_s[[frame.skip_reason is not None for frame in capture.frames]] = np.nan
+    stamp_s[_in_doubt(capture, profile, stamp_s, exposure_s)] = np.nan
     return GyroGuide(ground(capture.imu, profile, translation=False), stamp_s, exposure_s)
+
+
+def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure_s: Array) -> NDArray[np.bool_]:
+    """Frames (frames,) from whose first row to the next frame's last a stretch of the log is in doubt and unbridged."""
+    doubtful = [(stretch.from_s, stretch.to_s) for stretch in doubtful_stretches(capture.imu)]
+    doubtful = [span for span in doubtful if not profile.bridges(*span)]
+    clock, period_s = RowClock(profile), float(np.nanmedian(np.diff(stamp_s)))
+    begin_s = np.asarray(clock.time_s(stamp_s, exposure_s))
+    until_s = np.asarray(clock.end_s(stamp_s + period_s, exposure_s))
+    found = np.zeros(len(stamp_s), bool)
+    for from_s, to_s in (*doubtful, *profile.unbridged_s):
+        found |= (begin_s < to_s) & (until_s > from_s)
+    return found
 
 
 def map_between(first_of: Callable[[Array], Array], shape: tuple[int, int], factor: int) -> MapBetween:

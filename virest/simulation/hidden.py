@@ -62,7 +62,9 @@ def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any) -> Any:
     scale = 1 + profile.extensions.focal_drift_per_s * time_s
     for field in profile.extensions.field:
         if field.kind == "scale":
-            scale = scale + field.at_time(time_s)[..., 0]
+            # what the camera logs runs on its clock
+            own_s = time_s if field.log is None else profile.camera_time_s(time_s)
+            scale = scale + field.at_time(own_s)[..., 0]
     return scale if hidden.focal_scale is None else scale * hidden.focal_scale(time_s)
 
 

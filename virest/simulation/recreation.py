@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.recounting import counted_from
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.errors import CaptureError, SettingsError
 from virest.simulation.auto_exposure import NOMINAL_ISO, Exposures
 from virest.simulation.exposure import View, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion
-from virest.simulation.hidden import focal_scale
+from virest.simulation.hidden import NOTHING, Hidden, focal_scale
 from virest.simulation.recorded_motion import recorded_motion
 from virest.simulation.scenes import MAX_CHART_PX, Scene
 from virest.simulation.sensor import sensor_light
@@ -90,7 +91,7 @@ def recreate_session(
         nominal, true, settings, _NO_SCENE,
         recorded_motion(sample_s, imu.gyro_rad_s, true, 0.0, imu.accel_m_s2), _NO_VIEW,
         np.rint(stamp_s * TICKS_PER_S).astype(np.int64), np.array([f.timestamp_ns for f in frames], np.int64), shows,
-        (float(sample_s[0]), float(sample_s[-1])), exposures, capture_s, imu,
+        (float(sample_s[0]), float(sample_s[-1])), exposures, capture_s, imu, _logged_focus(frames),
     )  # fmt: skip
     seen_s = session.first_row_start_s(int(shows[slot]))
     motion = recorded_motion(sample_s, imu.gyro_rad_s, true, seen_s, imu.accel_m_s2)
@@ -101,32 +102,15 @@ def recreate_session(
 
 
 def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile:
-    """The profile with its times counted from the first of these frames, and with the scene at infinity.
-
-    ``t_imu − s = (t − s)(1 + skew) + offset`` about another s has the offset ``offset + skew · later``;
-    ``f (1 + drift t)`` about another time has another f and drift, flicker another phase.
-    """
-    later_s, extensions = frames[0].time_s, profile.extensions
-    offset_s = (profile.time_offset_s or 0.0) + profile.clock_skew * later_s
-    drift = extensions.focal_drift_per_s
-    fields = tuple(field.later(later_s) for field in extensions.field)
-    lens = profile.intrinsics
-    if lens is not None and drift:
-        lens = lens.scaled_focal(1 + drift * later_s)
-    index = [frame.index for frame in frames]
+    """The profile with its times counted from the first of these frames, and with the scene at infinity."""
+    changed = counted_from(profile, frames[0].time_s, frames[0].timestamp_ns)
+    extensions, index = changed.extensions, [frame.index for frame in frames]
     lag_s, lag_frames = _lag_left(extensions, index[0])
     gain = tuple(extensions.gain[i] if i < len(extensions.gain) else 1.0 for i in index) if extensions.gain else ()
-    changed = dataclasses.replace(
-        extensions,
-        focal_drift_per_s=drift / (1 + drift * later_s),
-        field=fields,
-        flicker_phase_rad=extensions.flicker_phase_rad
-        + 2 * np.pi * float(np.remainder(extensions.flicker_frequency_hz * later_s, 1.0)),
-        gain=gain,
-        frame_lag_s=lag_s,
-        frame_lag_frames=lag_frames,
+    extensions = dataclasses.replace(extensions, gain=gain, frame_lag_s=lag_s, frame_lag_frames=lag_frames)
+    return dataclasses.replace(
+        changed, time_offset_s=changed.time_offset_s or 0.0, depth_m=np.inf, extensions=extensions
     )
-    return dataclasses.replace(profile, intrinsics=lens, time_offset_s=offset_s, depth_m=np.inf, extensions=changed)
 
 
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -176,6 +160,16 @@ def _cut_imu(capture: Capture, begin_s: float, lasting_s: float, true: CameraPro
     time_ns = capture.stamp_0_ns + np.rint(imu.time_s[rows] * 1e9).astype(np.int64)
     log = ImuLog(time_ns, imu.gyro_rad_s[rows], imu.accel_m_s2[rows])
     return log, imu.time_s[rows] - begin_s
+
+
+def _logged_focus(frames: Sequence[Frame]) -> Hidden:
+    """The focus distances that the recorder logged, to be logged again."""
+    known = [frame for frame in frames if frame.focus_dioptres is not None]
+    if not known:
+        return NOTHING
+    times = np.array([frame.time_s - frames[0].time_s for frame in known])
+    dioptres = np.array([frame.focus_dioptres for frame in known], float)
+    return Hidden(focus_dioptres=lambda time_s: np.interp(time_s, times, dioptres))
 
 
 def _slot_gain(true: CameraProfile, shows: NDArray[np.int64], slot: int) -> float:

@@ -336,9 +336,10 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 def shown(row: Row) -> list[str]:
     """A row of the table."""
     fields = "; ".join(f"{kind} over {over}: {shape}" for kind, over, shape in row["fields"])
+    gains = " ".join("-" if gain is None else f"{gain:.2f}" for gain in row["gain"])
     elsewhere = "" if row["gone_elsewhere"] is None else f"{row['gone_elsewhere']:.2f}"
     return [
         row["hidden"] + ("" if row["right"] else " WRONG"), str(row["seed"]), row["size"], row["verdict"],
-        ", ".join(row["causes"]), fields, " ".join(f"{gain:.2f}" for gain in row["gain"]), elsewhere,
+        ", ".join(row["causes"]), fields, gains, elsewhere,
         f"{row['rms_px']:.3f} / {row['noise_px']:.3f}", f"{row['cpu_s']:.0f}",
     ]  # fmt: skip

@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.diagnosis.field.records import Distrusted
-from virest.diagnosis.field.stretches import Stretch, bridging_form, doubtful_stretches, touching
+from virest.diagnosis.field.stretches import bridging_form, rate_walk, touching
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
 from virest.image_formation.point_model import TrackTable, ground
+from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import start_scene
 from virest.motion.scene_motion import InertialMotion
@@ -29,6 +31,10 @@ MAX_P = 1e-3
 LEFT_PART, LEFT_RATIO = 0.2, 1.5
 """A bridge holds where at most this part of the excess is left, or points are off by at most this many times the
 noise."""
+
+
+MOST_DOUBT_PX = 0.5
+"""A bridge from which a blur path may be wrong by more than this part of a pixel is none: the frames are left alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +91,7 @@ def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Do
     bad = [s for s in doubtful.stretches if s not in good]
     trusted = ~touching(observed, bad, to_imu) if bad else np.ones(len(doubtful.hit), bool)
     if good:
-        _take_over(found, evidence.observed.chosen(trusted), good, model, capture)
+        good = _take_over(found, evidence.observed.chosen(trusted), good, model, capture)
     untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
     profile = replace(found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
     found.model = replace(found.model, profile=profile)
@@ -131,32 +137,47 @@ def _bridged(
     evidence: Evidence, model: Model, table: TrackTable, stretches: Sequence[Stretch], capture: Capture
 ) -> Model:
     """The model with rates in the stretches that the points of a table ask for."""
-    form = bridging_form(stretches, capture.stamp_0_ns)
+    form = bridging_form(stretches, capture.stamp_0_ns, rate_walk(capture.imu))
     fitted = fit_model(evidence.imu, replace(model, scene=model.scene), (form.term,), table)
     return replace(model, profile=fitted.profile)
 
 
 def _take_over(
     found: GeometricVerdict, observed: ObservedTracks, stretches: Sequence[Stretch], model: Model, capture: Capture
-) -> None:
-    """Fit everything once more with the bridges in, to all pairs that can be trusted then."""
+) -> list[Stretch]:
+    """Fit everything once more with the bridges in, to all pairs that can be trusted then; which bridges are sure."""
     evidence = make_evidence(capture.imu, observed)
     to_imu = (1 + model.profile.clock_skew, model.profile.time_offset_s or 0.0)
     table = evidence.table(model, FINAL_POINTS)
     bridged = _bridged(
         evidence, model, table.chosen(touching(observed, stretches, to_imu)[table.pair]), stretches, capture
     )
-    form = bridging_form(stretches, capture.stamp_0_ns)
+    form = bridging_form(stretches, capture.stamp_0_ns, rate_walk(capture.imu))
     whole = replace(_with_scene(evidence, bridged, table), terms=(*found.model.terms, form.term))
     fitted = fit_model(capture.imu, whole, whole.terms, table)
     part = fitted.slices[form.name]
     deviations = form.filled(np.zeros(part.stop - part.start), fitted.covariance[part, part])
-    bridges = {field.knots: field.std for field in deviations}
-    held = [replace(field, std=bridges.get(field.knots, field.std)) for field in fitted.profile.fields]
+    sure = [_blur_doubt_px(fitted.profile, field, evidence.exposure_s) < MOST_DOUBT_PX for field in deviations]
+    bridges = {field.knots: field for field in deviations}
+    unsure = {field.knots for field, holds in zip(deviations, sure, strict=True) if not holds}
+    held = [
+        replace(field, std=bridges[field.knots].std) if field.knots in bridges else field
+        for field in fitted.profile.fields
+        if field.knots not in unsure
+    ]
     found.model = replace(whole, profile=fitted.profile.with_fields(held), scene=fitted.scene)
     found.fit, found.table, found.evidence = fitted, table, evidence
     found.final_rms_px = capped_rms(fitted.distance) * evidence.typical_px
     found.noise_px = evidence.noise_px(fitted)
+    return [stretch for stretch, holds in zip(stretches, sure, strict=True) if holds]
+
+
+def _blur_doubt_px(profile: CameraProfile, bridge: Field, exposure_s: float) -> float:
+    """Standard deviation of the length of a blur path where a bridge is least sure, px."""
+    lens = profile.intrinsics
+    assert lens is not None
+    doubt_rad_s = float(np.linalg.norm(bridge.std, axis=1).max())
+    return doubt_rad_s * float(profile.shutter.true_exposure_s(exposure_s)) * lens.fx_px
 
 
 def _holds(before: Array, after: Array, rest: float, there: Mask) -> bool:
@@ -170,8 +191,11 @@ def _rms(distance: Array) -> float:
 
 
 def _further_off(distance: Array, table: TrackTable, hit: Mask) -> float:
-    """Probability that pairs that are hit lie no further off than the others, by a rank test of their medians."""
+    """Probability that pairs that are hit lie no further off than the others: a t test of their medians' logarithms.
+
+    A few pairs that lie far off among many that do not count by how far, which ranks would forget.
+    """
     numbers = np.unique(table.pair)
     medians = np.array([np.median(distance[table.pair == number]) for number in numbers])
-    there = hit[numbers]
-    return float(stats.mannwhitneyu(medians[there], medians[~there], alternative="greater").pvalue)
+    there, size = hit[numbers], np.log(np.maximum(medians, np.finfo(float).tiny))
+    return float(stats.ttest_ind(size[there], size[~there], alternative="greater").pvalue)

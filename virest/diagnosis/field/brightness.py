@@ -23,15 +23,20 @@ from virest.diagnosis.photometry import PhotometricObservations, Prediction, pre
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-KNOTS = 4
+KNOTS, FINE_KNOTS = 4, 7
+FINER_LEFT = 0.98
+"""A finer map must leave less than this part of what the coarser one leaves on blocks that neither was fitted to."""
 FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
 MOST_OBSERVATIONS = 15_000
-MIN_SIZE = 0.1
-"""Grey levels (rms): on seven captures without such a field textured patches and the encoder left up to 0.03."""
+MIN_SIZE = 0.06
+"""Grey levels (rms): on 19 captures without such a field textured patches and the encoder left up to 0.06, with t
+ratios of at most 1.8."""
 CAUCHY, CAP = 2.5, 5.0
 """Noises at which a residual has half its weight, and beyond which it counts as that many."""
 RIDGE = 1e-3
 CURVE_STEP = 0.02
+MOST_CYCLES = 0.5
+"""By which flicker may run through a capture's frames and still be taken for a shadow."""
 ALIKE = 0.9
 """Part of the map's variance that a shape must explain to name it."""
 REASONS = (
@@ -49,6 +54,9 @@ class LightField:
     p_value: float
     held_out: HeldOutGain
 
+    rivals: tuple[str, ...] = ()
+    """Named causes that the patches cannot tell from it."""
+
     @property
     def finding(self) -> FieldFinding:
         """In words."""
@@ -56,7 +64,7 @@ class LightField:
         shape = map_shape(self.field)
         rms = f"patches {self.held_out.before:.3g} → {self.held_out.after:.3g} grey levels, held out"
         sentence = f"the light differs by up to {100 * size:.3g} % over the picture, {shape}, the same in all frames"
-        confounded = ("gain over row",) if shape == BAND else ()
+        confounded = (*(("gain over row",) if shape == BAND else ()), *self.rivals)
         return FieldFinding(
             ("x", "y"), "gain", shape, f"{sentence} ({rms})", size, "1", std, self.held_out, self.p_value, confounded,
             None, REASONS, NEXT, (self.field,),
@@ -88,17 +96,74 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile) -
     size = float(np.sqrt(max(scored.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))
     if min(t_ratio(scored.gain), t_ratio(scored.parts_gain)) < MIN_T or size < MIN_SIZE:
         return None
+    best: LightField | None = None
+    for count in (KNOTS, FINE_KNOTS):
+        found = _fitted(seen, profile, at, tangent, weight, block, count, scored.p_value)
+        if best is None or found.held_out.after < FINER_LEFT * best.held_out.after:
+            best = found
+    return best
+
+
+def _fitted(
+    seen: PhotometricObservations, profile: CameraProfile, at: Prediction, tangent: Array, weight: Array, block: Index,
+    count: int, p_value: float,
+) -> LightField:  # fmt: skip
+    """The map with this many knots along each side."""
+    zero, basis = _form(profile, count)
     if not profile.extensions.vignetting_corner_loss:
         # what a centred vignetting would say is no one else's then
         basis, tangent = null_space(_middle(zero, profile)[None]), tangent[:, 1:]
-        design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
+    left, design = at.residual / seen.noise, -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
     columns = np.concatenate([design, tangent], axis=1)
     numbers, covariance = _solved(columns, left, weight, block, design.shape[1])
     values = basis @ numbers
     std = np.sqrt(np.maximum(np.einsum("vk,kl,vl->v", basis, covariance, basis), 0.0))
     factor = np.exp(values)
     field = zero.with_values((factor - 1)[:, None], (factor * std)[:, None])
-    return LightField(field, scored.p_value, _held_out(columns, design.shape[1], left, weight, block, seen))
+    return LightField(field, p_value, _held_out(columns, design.shape[1], left, weight, block, seen))
+
+
+def instead_of_flicker(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
+    """The map that explains the patches at least as well as the profile's flicker, where that stands still.
+
+    A lamp that pulses a whole number of times from frame to frame looks like a shadow over the rows.  None where it
+    does not stand still, or explains more.
+    """
+    seen = _thinned(observations)
+    if not _stands_still(seen, profile):
+        return None
+    found = light_field(observations, without_flicker(profile))
+    if found is None or found.held_out.after > _left_by(seen, profile):
+        return None
+    return replace(found, rivals=(f"flicker at {profile.extensions.flicker_frequency_hz:.4g} Hz",))
+
+
+def without_flicker(profile: CameraProfile) -> CameraProfile:
+    """The profile under light that does not pulse."""
+    return replace(profile, extensions=replace(profile.extensions, flicker_amplitude=0.0))
+
+
+def _stands_still(seen: PhotometricObservations, profile: CameraProfile) -> bool:
+    """Whether flicker keeps its phase from frame to frame within half a cycle over all frames."""
+    if not profile.extensions.flicker_amplitude or len(seen) < 2:
+        return False
+    frames, first = np.unique(seen.frame, return_index=True)
+    turned = profile.extensions.flicker_frequency_hz * (seen.stamp_s[first] - seen.stamp_s[first[0]])
+    per_frame = turned[-1] / max(int(frames[-1] - frames[0]), 1)
+    return bool(np.ptp(turned - np.round(per_frame) * (frames - frames[0])) < MOST_CYCLES)
+
+
+def _left_by(seen: PhotometricObservations, profile: CameraProfile) -> float:
+    """Capped rms of what a profile leaves of the patches beside the nuisances, grey levels."""
+    at = predict(seen, profile)
+    left, tangent = at.residual / seen.noise, _tangent(seen, profile, at) / seen.noise[:, None]
+    scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+    weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2) / scale**2
+    block = np.unique(seen.frame // FRAMES_IN_BLOCK, return_inverse=True)[1]
+    for fold in (0, 1):
+        judged = block % 2 == fold
+        left[judged] = _without(tangent[judged], left[judged], weight[judged], block[judged])
+    return float(np.sqrt(np.mean(seen.noise**2))) * _capped_rms(left)
 
 
 def with_light_field(profile: CameraProfile, found: LightField) -> CameraProfile:
@@ -112,12 +177,12 @@ def _thinned(observations: PhotometricObservations) -> PhotometricObservations:
     return seen.subset(np.bincount(seen.patch)[seen.patch] >= 2)
 
 
-def _form(profile: CameraProfile) -> tuple[Field, Array]:
+def _form(profile: CameraProfile, count: int = KNOTS) -> tuple[Field, Array]:
     """A map of nought, and its free numbers: nought in the middle (each patch's own light), no vignetting in it."""
-    knots = tuple(tuple(np.linspace(0.0, side - 1, KNOTS).tolist()) for side in (profile.width, profile.height))
+    knots = tuple(tuple(np.linspace(0.0, side - 1, count).tolist()) for side in (profile.width, profile.height))
     x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
     radius2 = (x - 0.5 * (profile.width - 1)) ** 2 + (y - 0.5 * (profile.height - 1)) ** 2
-    field = Field("gain", ("x", "y"), knots, ((0.0,),) * KNOTS**2)
+    field = Field("gain", ("x", "y"), knots, ((0.0,),) * count**2)
     return field, null_space(np.stack([_middle(field, profile), radius2 / np.linalg.norm(radius2)]))
 
 

@@ -127,6 +127,10 @@ class FieldForm:
             return _drift_form(self.kind, knots, field.stamp_0_ns, self.known)
         return None
 
+    def about(self, profile: CameraProfile) -> FieldForm:
+        """The same kept apart from another profile's lens: a displacement is nought at its principal point."""
+        return _place_form(profile) if self.kind == "displacement" else self
+
     @property
     def term(self) -> Term:
         """The form as a term of the fit of tracked points."""

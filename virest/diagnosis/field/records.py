@@ -9,7 +9,7 @@ import numpy as np
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.forms import FieldForm
-from virest.diagnosis.field.stretches import Stretch
+from virest.inference.doubtful_log import Stretch
 from virest.inference.track_fit import TrackFit
 
 

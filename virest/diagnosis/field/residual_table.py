@@ -26,6 +26,8 @@ MOST_ROWS, LEAST_ROWS = 20_000, 100
 KNOTS, PLACE_KNOTS = 6, 4
 BLOCKS, LEAST_BLOCKS = 40, 8
 MAX_FINDINGS = 6
+MOST_PX = 1e6
+"""No picture is so large."""
 MIN_SIZE_PX = 0.01
 """Smaller structure changes no calibration."""
 CAUCHY = 2.4
@@ -142,9 +144,14 @@ def _cleaned(columns: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
         raise CaptureError(f"no column {', '.join(missing)}", hint=f"needed are {', '.join(NEEDED)}, in pixels")
     table = {name: np.asarray(values, float) for name, values in columns.items()}
     table = {name: values for name, values in table.items() if name in NEEDED or np.isfinite(values).mean() > 0.5}
+    for name in NEEDED:
+        if (largest := float(np.nanmax(np.abs(table[name]), initial=0.0, where=np.isfinite(table[name])))) > MOST_PX:
+            raise CaptureError(f"a value of {largest:.3g} px in column {name}", hint="all values are in pixels")
     keep = np.all([np.isfinite(values) for values in table.values()], axis=0)
     if keep.sum() < LEAST_ROWS:
         raise CaptureError(f"{int(keep.sum())} complete rows, {LEAST_ROWS} are needed", hint="write more residuals")
+    if not any(table[name][keep].any() for name in ("dx", "dy")):
+        raise CaptureError("all residuals are 0", hint="dx and dy are measured minus predicted, in pixels")
     rows = np.flatnonzero(keep)
     keys = [table[name][rows] for name in ORDER if name in table]
     rows = rows[np.lexsort(keys[::-1])] if keys else rows
@@ -166,7 +173,7 @@ def _forms(columns: Mapping[str, Array]) -> list[_Form]:
     x, y = columns["x"], columns["y"]
     middle = [0.5 * (a.min() + a.max()) for a in (x, y)]
     arm = np.stack([x - middle[0], y - middle[1]], axis=-1)
-    forms = [_over_picture(x, y)]
+    forms = [_over_picture(x, y)] if np.ptp(x) > 0 and np.ptp(y) > 0 else []
     names = [name for name in columns if name not in (*NEEDED, *VELOCITY)]
     for name in names:
         values = columns[name]

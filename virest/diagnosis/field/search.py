@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,24 +65,25 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     """The ladder's end with the fields that its residuals ask for; the same where they ask for none."""
     # bridges of the log stay as they are: hundreds of numbers that no field shares
     terms = tuple(term for term in found.model.terms if OVER not in term.name)
-    model, fitted, accepted = replace(found.model, terms=terms), found.fit, list(found.accepted)
+    state, fitted = _Description(replace(found.model, terms=terms), tuple(found.accepted), ()), found.fit
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
-        forms = _asked_for(evidence, capture, model, fitted)
-        tried = ((asked, _entered(evidence, model, asked, fitted)) for asked in forms)
+        forms = _asked_for(evidence, capture, state.model, fitted)
+        tried = ((asked, _entered(evidence, state.model, asked, fitted)) for asked in forms)
         chosen, entered = next((pair for pair in tried if pair[1] is not None), (None, None))
         if chosen is None or entered is None:
             break
-        model_after, accepted_after = _without_stand_ins(evidence, found, entered.model, accepted)
+        more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
+        after = _without_stand_ins(evidence, found, more)
         small = chosen.selection is not None and chosen.selection.size * evidence.typical_px < MIN_SIZE_PX
-        if small and len(accepted_after) == len(accepted):
+        if small and len(after.accepted) == len(state.accepted):
             break
         before = entered.before
-        if len(accepted_after) < len(accepted):
-            before = _held_out(evidence, _without_form(model_after, entered.form), fitted)
-        model, accepted = model_after, accepted_after
+        if len(after.accepted) < len(state.accepted):
+            before = _held_out(evidence, _without_form(after.model, after.forms[-1]), fitted)
+        model = after.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, FINAL_POINTS))
-        model = replace(model, profile=fitted.profile, scene=fitted.scene)
+        state = replace(after, model=replace(model, profile=fitted.profile, scene=fitted.scene))
         typical = evidence.typical_px
         stability = chosen.selection.stability if chosen.selection else None
         before_px, after_px = before.rms * typical, entered.after.rms * typical
@@ -89,17 +91,47 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
     if not fields:
         return found
-    table = evidence.table(model, FINAL_POINTS)
+    table = evidence.table(state.model, FINAL_POINTS)
+    fields = [replace(entry, form=form, fit=fitted) for entry, form in zip(fields, state.forms, strict=True)]
     return replace(
         found,
-        model=model,
+        model=state.model,
         fit=fitted,
         table=table,
-        accepted=accepted,
+        accepted=list(state.accepted),
         final_rms_px=capped_rms(fitted.distance) * evidence.typical_px,
         noise_px=evidence.noise_px(fitted),
-        fields=[*found.fields, *(replace(entry, fit=fitted) for entry in fields)],
+        fields=[*found.fields, *fields],
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Description:
+    """A model, and what it says: causes and forms of fields."""
+
+    model: Model
+    accepted: tuple[Accepted, ...]
+    forms: tuple[FieldForm, ...]
+
+    def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _Description:
+        """The same without some causes, their values back where the profile had them.
+
+        A displacement begins anew: it stays clear of the principal point that the lens has then.
+        """
+        model = self.model
+        for entry in leaving:
+            assert entry.effect is not None
+            assert entry.effect.term is not None
+            name = entry.effect.term.name
+            back = -entry.effect.total_change(found.nominal.profile, model.profile)
+            terms: Sequence[Term] = [term for term in model.terms if term.name != name]
+            model = replace(model, profile=entry.effect.term.change(model.profile, back), terms=tuple(terms))
+        forms = tuple(form.about(model.profile) for form in self.forms)
+        for old, new in zip(self.forms, forms, strict=True):
+            if old is not new:
+                less = _without_form(model, old)
+                model = replace(less, terms=(*less.terms, new.term))
+        return _Description(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,23 +293,37 @@ def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool
     return HeldOut(np.bincount(block, loss(left, 1.0)) / counts, capped_rms(left))
 
 
-def _without_stand_ins(
-    evidence: Evidence, found: GeometricVerdict, model: Model, accepted: list[Accepted]
-) -> tuple[Model, list[Accepted]]:
-    """Let go of causes that are no longer significant, or of no use on held-out blocks, now that a field is in."""
+def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Description) -> _Description:
+    """Let go of causes that are no longer significant, or of no use on held-out blocks, now that a field is in.
+
+    Two that only compensate for each other, such as a turn and a principal point, are of use until both are gone.
+    """
     while True:
+        model = state.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, JUDGE_POINTS))
-        model = replace(model, profile=fitted.profile, scene=fitted.scene)
-        fitting = [entry for entry in accepted if entry.effect is not None and entry.effect.term is not None]
-        if not fitting:
-            return model, accepted
-        doubts = {entry.name: _doubt(evidence, found, fitted, entry) for entry in fitting}
-        weakest = max(fitting, key=lambda entry: doubts[entry.name])
-        less = _less(found, model, weakest)
-        if doubts[weakest.name] < MAX_P and _useful(evidence, less, model, fitted):
-            return model, accepted
-        log.debug("stood in for a field: %s", weakest.name)
-        model, accepted = less, [entry for entry in accepted if entry is not weakest]
+        state = replace(state, model=replace(model, profile=fitted.profile, scene=fitted.scene))
+        leaving = _stand_ins(evidence, found, state, fitted)
+        if not leaving:
+            return state
+        log.debug("stood in for a field: %s", [entry.name for entry in leaving])
+        state = state.without(found, leaving)
+
+
+def _stand_ins(
+    evidence: Evidence, found: GeometricVerdict, state: _Description, fitted: TrackFit
+) -> tuple[Accepted, ...]:
+    """The cause, or the two, that a model can do without; nothing where it needs all."""
+    fitting = [entry for entry in state.accepted if entry.effect is not None and entry.effect.term is not None]
+    if not fitting:
+        return ()
+    doubts = {entry.name: _doubt(evidence, found, fitted, entry) for entry in fitting}
+    weakest = max(fitting, key=lambda entry: doubts[entry.name])
+    if doubts[weakest.name] >= MAX_P:
+        return (weakest,)
+    for leaving in ((weakest,), *combinations(fitting, 2)):
+        if not _useful(evidence, state.without(found, leaving).model, state.model, fitted):
+            return leaving
+    return ()
 
 
 def _doubt(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:
@@ -290,13 +336,3 @@ def _useful(evidence: Evidence, less: Model, more: Model, fitted: TrackFit) -> b
     before, after = (_held_out(evidence, m, fitted) for m in (less, more))
     gain = before.block_loss - after.block_loss
     return bool(gain.mean() > MIN_GAIN * before.block_loss.mean() and t_ratio(gain) > MIN_T)
-
-
-def _less(found: GeometricVerdict, model: Model, leaving: Accepted) -> Model:
-    """The model without a cause, its values back where the profile had them."""
-    assert leaving.effect is not None
-    assert leaving.effect.term is not None
-    name = leaving.effect.term.name
-    back = -leaving.effect.total_change(found.nominal.profile, model.profile)
-    terms: Sequence[Term] = [term for term in model.terms if term.name != name]
-    return replace(model, profile=leaving.effect.term.change(model.profile, back), terms=tuple(terms))

@@ -14,8 +14,9 @@ from virest.camera.field import FORCES, Field
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
-from virest.diagnosis.field.stretches import CLIPPED, axis_names
+from virest.diagnosis.field.stretches import axis_names
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
+from virest.inference.doubtful_log import CLIPPED
 
 Array = NDArray[np.float64]
 ALIKE = 0.95
