@@ -1,6 +1,6 @@
 """``python -m virest`` without the second of imports: a process that has loaded the package forks one for each call.
 
-The forked process is what the program is when it starts: arguments, folder, standard streams and exit code of its own.
+The forked process is what the program is when it starts: arguments, folder, variables, standard streams and exit code.
 What a start itself does (lazy imports, variables that libraries read as they load) is tested by true starts.
 """
 
@@ -48,6 +48,7 @@ class ForkServer:
             streams = [os.path.join(folder, name) for name in ("in", "out", "err")]
             Path(streams[0]).write_text(stdin)
             call = {"arguments": arguments, "cwd": os.fspath(cwd or os.getcwd()), "streams": streams, "s": timeout}
+            call["environment"] = dict(os.environ)
             assert self.process.stdin is not None
             assert self.process.stdout is not None
             print(json.dumps(call), file=self.process.stdin, flush=True)
@@ -69,6 +70,8 @@ def serve(calls: IO[str], answers: IO[str]) -> None:
         child = os.fork()
         if not child:
             signal.alarm(int(call["s"]))
+            os.environ.clear()
+            os.environ.update(call["environment"])
             become(call["arguments"], call["cwd"], call["streams"])
         print(os.waitpid(child, 0)[1], file=answers, flush=True)
 

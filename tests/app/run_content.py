@@ -13,8 +13,10 @@ def folder_files(run: Path) -> dict[str, bytes]:
 
 
 def content(run: Path) -> dict[str, Any]:
-    """Everything in a run's folder, without what a clock or the command line decides."""
-    return without_clocks(folder_files(run))
+    """Everything in a run's folder, OUT/NAME, without what a clock, the command line or the place of OUT decides."""
+    files = folder_files(run)
+    files["run.json"] = files["run.json"].replace(str(run.parent.parent).encode(), b".")
+    return without_clocks(files)
 
 
 def without_clocks(files: dict[str, bytes], *elsewhere: str) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from run_content import content
 
 from virest.app.cli import run
 
@@ -25,16 +26,6 @@ FAST = ("--preset", "fast", "--jobs", "1")
 def below(folder: Path) -> set[str]:
     """Names of everything below a folder."""
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")} if folder.exists() else set()
-
-
-def content(run: Path) -> dict[str, Any]:
-    """Everything in a run's folder, OUT/NAME, without what a clock, the command line or the place of OUT decides."""
-    found: dict[str, Any] = {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
-    lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
-    found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
-    account = json.loads(found["run.json"].decode().replace(str(run.parent.parent), "."))
-    found["run.json"] = {k: v for k, v in account.items() if k not in ("totals", "command")}
-    return found
 
 
 def assert_refused(result: "subprocess.CompletedProcess[str]", code: int, *says: str) -> None:
@@ -552,7 +543,7 @@ def undisturbed_swing(
     virest: Virest, swing: Path, slow: tuple[object, ...], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Any]:
     """What an undisturbed run of ``swing`` leaves, by one process."""
-    out = tmp_path_factory.mktemp("undisturbed")
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
     assert virest("process", swing, *slow, "--jobs", 1, "--out", out).returncode == 0
     return content(out / "swing")
 
