@@ -376,3 +376,18 @@ def test_a_mask_that_is_undone_is_no_part_of_the_result() -> None:
     copied = restore_frame(FRAME, shown, resting.motion, resting.trajectory, settings, unmasked=unmasked)
     assert copied.status == "copied"
     np.testing.assert_array_equal(_picture(copied), shown)
+
+
+def test_where_nothing_was_blurred_the_mask_stays_as_well() -> None:
+    """About a camera that rolls the middle is as it was shown, the corners are deblurred without the mask."""
+    turning = camera((0.0, 0.0, 2.5), reference="frame-middle")
+    shown = record(turning).picture
+    unmasked = without_mask(shown, UnsharpMask(0.8, 1.2))
+    settings = replace(BALANCED, reference="frame-middle", shutter="none")
+    arguments = (FRAME, shown, turning.motion, turning.trajectory, settings)
+    restored = _picture(restore_frame(*arguments, unmasked=unmasked)).astype(int)
+    x_px, y_px = (round(centre) for centre in (turning.profile.intrinsics.cx_px, turning.profile.intrinsics.cy_px))
+    middle = np.s_[y_px - 8 : y_px + 9, x_px - 8 : x_px + 9]
+    np.testing.assert_allclose(restored[middle], shown[middle], atol=1)
+    assert np.abs(unmasked.astype(int) - shown)[middle].max() > 2
+    assert np.abs(restored - shown)[:40, :40].mean() > 2

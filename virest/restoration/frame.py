@@ -280,10 +280,11 @@ def _deblurred(
         settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
     sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
     part: NDArray[np.float32] | np.float32 = np.float32(1.0)
+    touched = part
     if anchor == 0.5:
         by_tile = settings.deblur not in WHOLE_PICTURE or luma.unevenness > 0
-        part = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
-        part, measured = part * _share_map(blurred, share), measured_share(blurred)
+        touched = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
+        part, measured = touched * _share_map(blurred, share), measured_share(blurred)
         part = part if measured is None else part * measured
         still = still_part(joined.places)
         if still is not None and still.min() < 1:
@@ -312,6 +313,8 @@ def _deblurred(
         "share": share,
         "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
     }
+    if unmasked is not None:  # where nothing was blurred the picture stays as it was shown
+        restored = _mixed(restored.__getitem__, as_shown, touched)
     return restored, details, ()
 
 
