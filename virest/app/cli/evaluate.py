@@ -109,9 +109,9 @@ def deblur(
     $ virest evaluate deblur
     CASE B, motion blur: 12 frames, ...
     method                          MSE  PSNR dB    SSIM  matches  in place
-    blurred                       606.8    20.30  0.7464      198       170
+    blurred                       606.2    20.30  0.7466      197       171
     skimage richardson_lucy       358.9    22.58  0.7600      306       276
-    virest balanced               110.4    27.70  0.9090      638       595
+    virest balanced                90.9    28.55  0.9167      691       648
     ...
     $ virest evaluate deblur --over-time
     $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames
