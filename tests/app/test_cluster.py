@@ -45,7 +45,7 @@ def turning(virest: Virest, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def undisturbed(virest: Virest, turning: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What a local run of one process leaves."""
-    out = tmp_path_factory.mktemp("undisturbed")
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
     done = virest("process", turning, "--out", out, *SLOW, "--jobs", 1)
     assert done.returncode == 0, done.stderr
     return content(out / "turning")
