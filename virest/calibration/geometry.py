@@ -94,6 +94,8 @@ class CalibratedValue:
     note: str = ""
     rough: bool = False
     """Not determined as well as is wanted, and written all the same, with its deviation."""
+    implausible: bool = False
+    """The fit gave a value that no camera has: left at its start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,7 +381,9 @@ def _conclude(
     values = tuple(_value(term.name, given, profile, fit.profile, variances, determined) for term in fit.terms)
     values = tuple(_rough(value, fit) if value.name == "time_offset_s" else value for value in values)
     kept = {_FIELDS[name][0] for name in beyond}
-    values = tuple(replace(value, note=NO_FINDING) if value.name in kept else value for value in values)
+    values = tuple(
+        replace(value, note=NO_FINDING, implausible=True) if value.name in kept else value for value in values
+    )
     direction_known = rough.direction_known and determined["readout_time"]
     values = (*values[:2], _direction_value(given, profile, direction_known), *values[2:])
     profile = _with_estimates(profile, values)
