@@ -47,6 +47,7 @@ def _line(restored: RestoredFrame) -> dict:
 
 
 def test_every_line_has_the_same_keys_in_the_same_order() -> None:
+    """Restored, copied or failed."""
     frames = [
         RestoredFrame(FRAME, "restored", PICTURE, degradation=FOUND),
         RestoredFrame(FRAME, "copied", PICTURE, degradation=unknown_parameters(PROFILE)),
@@ -63,6 +64,7 @@ def test_every_line_has_the_same_keys_in_the_same_order() -> None:
 
 
 def test_a_record_is_written_and_read_by_its_fields_names() -> None:
+    """Nested records are mappings, tuples lists."""
     line = _line(RestoredFrame(FRAME, "restored", PICTURE, degradation=FOUND))
     assert line["blur"]["tiles"][1] == {"centre_px": [48.0, 24.0], "angle_rad": 0.4, "length_px": 4.0}
     assert line["shutter"]["corners_px"][2] == [63.0, 48.0]
@@ -72,6 +74,7 @@ def test_a_record_is_written_and_read_by_its_fields_names() -> None:
 
 
 def test_what_was_done_follows_from_the_record() -> None:
+    """Steps are named for restored frames alone."""
     plain = replace(FOUND, deblur=None)
     still = replace(plain, shutter=replace(FOUND.shutter, method="none"))
     frames = (
