@@ -23,6 +23,8 @@ from virest.diagnosis.local_blur import (
     time_blocks,
 )
 from virest.diagnosis.local_blur_model import predicted_ratios
+from virest.inference.clustered import scatter
+from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -194,8 +196,8 @@ def held_out(
     observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, effects: Sequence[BlurEffect]
 ) -> tuple[float, float]:
     """Robust rms, px, without and with the effects, fitted on every other time block and judged on the rest."""
-    odd = time_blocks(observations.time_s) % 2 == 1
-    before, after = (fit(observations, profile, trajectory, chosen, ~odd) for chosen in ((), effects))
+    even, odd = halves(time_blocks(observations.time_s))
+    before, after = (fit(observations, profile, trajectory, chosen, even) for chosen in ((), effects))
     return judge(observations, before, trajectory, odd), judge(observations, after, trajectory, odd)
 
 
@@ -272,11 +274,7 @@ class _Problem:
         which coding changes too.
         """
         block = time_blocks(self.observations.time_s)[self.use]
-        gradients = np.stack(
-            [(jacobian[block == b] * (weight * residual)[block == b, None]).sum(axis=0) for b in np.unique(block)]
-        )
-        count = len(gradients)
-        meat = gradients.T @ gradients * count / max(count - 1, 1) + np.diag(self.precision)
+        meat = scatter(jacobian * (weight * residual)[:, None], block) + np.diag(self.precision)
         inverse = np.linalg.pinv(self._hessian(jacobian, weight))
         by_damping = (self.residual(theta, 1.0 + _DAMPING_STEP) - residual) / _DAMPING_STEP
         pulled = inverse @ (jacobian.T @ (weight * by_damping)) * np.hypot(self.observations.damping_std, 2 * PATH_STD)
