@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
+from virest.diagnosis.findings import BLUR, HeldOutGain
 from virest.diagnosis.local_blur import (
     LENS_SIGMA_PX,
     LENS_STD_PX,
@@ -194,11 +195,12 @@ def judge(observations: BlurObservations, found: BlurFit, trajectory: Trajectory
 
 def held_out(
     observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, effects: Sequence[BlurEffect]
-) -> tuple[float, float]:
+) -> HeldOutGain:
     """Robust rms, px, without and with the effects, fitted on every other time block and judged on the rest."""
     even, odd = halves(time_blocks(observations.time_s))
     before, after = (fit(observations, profile, trajectory, chosen, even) for chosen in ((), effects))
-    return judge(observations, before, trajectory, odd), judge(observations, after, trajectory, odd)
+    before_px, after_px = (judge(observations, one, trajectory, odd) for one in (before, after))
+    return HeldOutGain(BLUR, before_px, after_px, None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,23 +101,6 @@ class PhotometricFit:
         raise KeyError(effect_name)
 
 
-@dataclass(frozen=True, slots=True)
-class HeldOut:
-    """What effects gain where they were not fitted."""
-
-    before: float
-    """RMS under the profile without them, grey levels."""
-    after: float
-    noise: float
-    split: str
-    """``time``: fitted on some blocks of frames and judged on the others; ``place``: the same of places."""
-
-    @property
-    def gain(self) -> float | None:
-        """As HeldOutGain has it; None where the measured noise leaves nothing to explain."""
-        return HeldOutGain(PHOTOMETRY, self.before, self.after, self.noise).gain
-
-
 def time_blocks(observations: PhotometricObservations) -> Indices:
     """Block of each observation, (n,): contiguous frames, about BLOCKS_S long."""
     frames = observations.frames
@@ -182,7 +165,7 @@ def judge(
     profile: CameraProfile,
     effects: Sequence[PhotometricEffect],
     each: ParallelMap = one_by_one,
-) -> HeldOut:
+) -> HeldOutGain:
     """Fit on one half, judge on the other, and the reverse.
 
     Halves are blocks of time; for effects with a value per frame, which no other frame knows, they are places: a
@@ -193,14 +176,12 @@ def judge(
     folds = [fitted for fitted in both if fitted.any() and not fitted.all()]
     calls = [(observations, profile, some, fitted) for fitted in folds for some in (effects, ())]
     fits = each(fit_photometry, calls)
-    before, after, noise = [], [], []
+    judged = []
     for fitted, fit, without in zip(folds, fits[::2], fits[1::2], strict=True):
         held = _seen_twice(observations.subset(~fitted))
-        before.append(normalised_rms(held.with_memory(without.memory), profile))
-        after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
-        noise.append(before[-1][1])
-    quadratic = [float(np.sqrt(np.mean(np.square(v)))) if v else 0.0 for v in ([b[0] for b in before], after, noise)]
-    return HeldOut(quadratic[0], quadratic[1], quadratic[2], "place" if by_place else "time")
+        before, noise = normalised_rms(held.with_memory(without.memory), profile)
+        judged.append((before, normalised_rms(held.with_memory(fit.memory), fit.profile)[0], noise))
+    return HeldOutGain.of_folds(PHOTOMETRY, judged)
 
 
 def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:
