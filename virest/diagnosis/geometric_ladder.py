@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.calibration.geometry import right_way_round
 from virest.calibration.physical_limits import is_depth
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
@@ -48,6 +47,7 @@ from virest.diagnosis.left_open import variance_left_open
 from virest.diagnosis.selection import POINT_LEVELS, WORD_LEVELS
 from virest.effects.table import EFFECTS
 from virest.image_formation.point_model import TrackTable
+from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.chance import chi2_tail
 from virest.inference.parallel import ParallelMap, one_by_one
