@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from virest.diagnosis import picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
-from virest.diagnosis.geometric_ladder import GeometricVerdict
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
 from virest.image_formation.point_model import seen_s
