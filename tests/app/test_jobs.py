@@ -13,7 +13,7 @@ import pytest
 
 from virest.app import jobs, segments
 from virest.app.jobs import PrefetchedCalls, Workers, run_segments
-from virest.app.outputs import RunFolder
+from virest.app.run_folder import RunFolder
 from virest.app.segments import Segment, cut_frames, cut_imu, run_segment
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.finish import FinishWishes
-from virest.app.outputs import Mode, RunFolder, check_run, file_facts, plain
+from virest.app.outputs import file_facts, plain
+from virest.app.run_folder import Mode, RunFolder, check_run
 from virest.app.segments import PictureWishes
 from virest.app.worker_processes import prepare_worker
 from virest.camera.intrinsics import Intrinsics

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.frame_log import frame_line
-from virest.app.outputs import RunFolder, json_line, write_picture, write_whole
+from virest.app.outputs import json_line, write_picture, write_whole
+from virest.app.run_folder import RunFolder
 from virest.app.worker_processes import prepare_worker
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
