@@ -23,7 +23,8 @@ from virest.app.run_folder import Mode, RunFolder, check_run
 from virest.app.segments import PictureWishes
 from virest.app.worker_processes import prepare_worker
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import CameraProfile, profile_mapping
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile, unpack_hint
 from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
