@@ -15,6 +15,7 @@ from virest.calibration.exposure_check import CONTRADICTS_EV, LN2, FirstCurve, o
 from virest.calibration.grey_levels import FAIR_SIGMA
 from virest.camera.response import KINDS, ResponseCurve
 from virest.errors import CalibrationError
+from virest.inference.robust import robust_std
 
 Array = NDArray[np.float64]
 TRUSTED_EV = 0.02
@@ -183,7 +184,7 @@ def rms_levels(residual: Array) -> float:
     """Root mean square without outliers (beyond six robust deviations)."""
     if not residual.size:
         return 0.0
-    limit = 6.0 * 1.4826 * float(np.median(np.abs(residual))) + 1e-9
+    limit = 6.0 * robust_std(residual) + 1e-9
     inside = residual[np.abs(residual) <= limit]
     return float(np.sqrt(np.mean(inside**2)))
 
