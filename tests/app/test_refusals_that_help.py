@@ -12,7 +12,8 @@ from motion.synthetic_tracks import Setup, recorded
 from virest.app.calibrate import _require_offset
 from virest.app.calibrate_curve import calibrate_curve
 from virest.app.process import _advice
-from virest.calibration.geometry import ROUGH_OFFSET_S, CalibratedValue, GeometryCalibration, _rough
+from virest.calibration.calibrated_values import ROUGH_OFFSET_S, CalibratedValue, roughly_known
+from virest.calibration.geometry import GeometryCalibration
 from virest.capture.detect import choose_reader
 from virest.errors import CalibrationError, CaptureError, OutputError
 from virest.inference.profile_terms import TIME_OFFSET
@@ -38,7 +39,7 @@ def calibrated(value: CalibratedValue) -> GeometryCalibration:
 def test_an_offset_known_roughly_is_written_and_says_so(std_s: float, rough: bool) -> None:
     """3.2 ms is no reason to write nothing; a deviation of half a frame is."""
     fit = fit_of(recorded(Setup(seed=5, frames=14)))
-    value = _rough(CalibratedValue("time_offset_s", None, 0.45, std_s, determined=False), fit)
+    value = roughly_known(CalibratedValue("time_offset_s", None, 0.45, std_s, determined=False), fit)
     assert value.rough is rough
     assert bool(value.note) is rough
     if rough:
@@ -48,10 +49,10 @@ def test_an_offset_known_roughly_is_written_and_says_so(std_s: float, rough: boo
             _require_offset(calibrated(value))
 
 
-def test_an_offset_that_one_moment_tells_is_not_even_rough() -> None:
+def test_an_offset_that_one_moment_tells_is_not_evenroughly_known() -> None:
     """Nothing bears a single block of time out."""
     fit = replace(fit_of(recorded(Setup(seed=5, frames=14))), stretches=np.array([1.1]))
-    assert not _rough(CalibratedValue("time_offset_s", None, 0.45, 0.0032, determined=False), fit).rough
+    assert not roughly_known(CalibratedValue("time_offset_s", None, 0.45, 0.0032, determined=False), fit).rough
 
 
 def test_a_curve_that_exists_is_replaced_only_where_that_is_asked_for(tmp_path: Path) -> None:

@@ -1,12 +1,14 @@
 """What is said of values that a calibration held fixed although the points contradict them."""
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from virest.calibration.geometry import _value
-from virest.calibration.unfitted_parameters import BELIEVABLE, OPTIONAL, HeldValue, held_notes
+from virest.calibration.calibrated_values import held_back, value_of
+from virest.calibration.unfitted_parameters import OPTIONAL, HeldValue, held_notes
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 
@@ -17,8 +19,29 @@ def held(name: str, change: Any, std: Any) -> dict[str, HeldValue]:
 
 
 def test_every_optional_value_has_its_bound() -> None:
-    """None can be called wrong without it."""
-    assert set(BELIEVABLE) == set(OPTIONAL)
+    """None can be called wrong without it; those of the lens are named first."""
+    assert all(not HeldValue(name, np.array([1e9]), np.ones(1)).believable for name in OPTIONAL)
+    assert list(OPTIONAL)[:3] == ["focal", "distortion", "principal-point"]
+
+
+def test_what_is_not_determined_goes_back_to_where_it_was() -> None:
+    """Value by value, as the table of effects says; a readout keeps the middle row's time."""
+    lens = Intrinsics(640, 480, 500.0, 500.0, 319, 239)
+    given = CameraProfile(640, 480, intrinsics=lens, time_offset_s=0.01, clock_skew=1e-4)
+    shutter = replace(given.shutter, readout_time_s=0.03)
+    turned = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+    found = replace(
+        given, intrinsics=replace(lens, fx_px=520.0, fy_px=520.0, cx_px=330.0), shutter=shutter, clock_skew=2e-4,
+        r_cam_imu=turned, gyro_scale=(1.1,) * 3, time_offset_s=0.02,
+    )  # fmt: skip
+    fit, start = SimpleNamespace(profile=found), replace(given, r_cam_imu=turned[::-1])
+    names = ("time_offset", "readout_time", "imu_rotation", "focal_length", "gyro_scale", "clock_skew")
+    held = held_back(fit, given, start, dict.fromkeys(names, False) | {"principal_point": True})  # type: ignore[arg-type]
+    assert held.shutter == given.shutter
+    assert held.time_offset_s == pytest.approx(0.02 + 0.5 * (0.03 - given.shutter.readout_time_s))
+    assert held.r_cam_imu == start.r_cam_imu
+    assert (held.gyro_scale, held.clock_skew) == (given.gyro_scale, given.clock_skew)
+    assert held.intrinsics == replace(lens, cx_px=330.0)
 
 
 def test_values_that_fit_are_not_mentioned() -> None:
@@ -57,7 +80,5 @@ def test_the_deviation_of_an_unknown_focal_length_is_in_pixels() -> None:
     """What stands in a column of pixels is pixels, also where the value is not determined and not taken."""
     lens = Intrinsics(640, 480, 520.0, 520.0, 319, 239)
     unknown, fitted = CameraProfile(640, 480), CameraProfile(640, 480, intrinsics=lens)
-    value = _value(
-        "focal_length", unknown, unknown, fitted, {"focal_length": np.array([0.053**2])}, {"focal_length": False}
-    )
+    value = value_of("focal_length", unknown, unknown, fitted, np.array([0.053**2]), determined=False)
     assert value.std == pytest.approx(0.053 * 520)

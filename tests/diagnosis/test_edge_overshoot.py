@@ -45,7 +45,7 @@ def test_amount_and_radius_come_back_within_their_deviations(rng, amount, radius
     assert seen.p_value < MAX_P
     assert abs(seen.amount - amount) < 2.5 * seen.amount_std < 2.5 * amount
     assert abs(seen.radius_px - radius_px) < 2.5 * seen.radius_std_px < 2.5 * radius_px
-    assert seen.rms_after < 0.5 * seen.rms_before
+    assert seen.held_out.after < 0.5 * seen.held_out.before
 
 
 @pytest.mark.parametrize("soft_px", [0.0, 1.5])

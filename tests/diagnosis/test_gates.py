@@ -18,12 +18,13 @@ from virest.diagnosis.candidates import Candidate
 from virest.diagnosis.catalogue import CATALOGUE, FALSE_ALARM, MAX_P
 from virest.diagnosis.cross_validation import Judged, Screened, choose
 from virest.diagnosis.cross_validation import judge as judge_points
-from virest.diagnosis.findings import Rung
+from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain, Rung
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import Trial, _best_single, _significant
 from virest.diagnosis.photometry_effects import Vignetting
-from virest.diagnosis.photometry_fit import HeldOut, fit_photometry, judge, time_blocks
+from virest.diagnosis.photometry_fit import fit_photometry, judge, time_blocks
+from virest.diagnosis.selection import Levels
 from virest.inference import profile_terms as terms_of
 from virest.inference.parallel import one_by_one
 
@@ -204,15 +205,15 @@ def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("held", "p_value", "named"),
     [
-        (HeldOut(2.0, 1.0, 0.9, "time"), 1e-9, True),
-        (HeldOut(2.0, 1.9, 0.9, "time"), 1e-9, False),
-        (HeldOut(2.0, 1.0, 0.9, "time"), 1e-3, False),
-        (HeldOut(2.0, 1.99, 1.98, "time"), 1e-9, False),
-        (HeldOut(1.0, 0.9, 1.1, "time"), 1e-9, True),
+        (HeldOutGain(PHOTOMETRY, 2.0, 1.0, 0.9), 1e-9, True),
+        (HeldOutGain(PHOTOMETRY, 2.0, 1.9, 0.9), 1e-9, False),
+        (HeldOutGain(PHOTOMETRY, 2.0, 1.0, 0.9), 1e-3, False),
+        (HeldOutGain(PHOTOMETRY, 2.0, 1.99, 1.98), 1e-9, False),
+        (HeldOutGain(PHOTOMETRY, 1.0, 0.9, 1.1), 1e-9, True),
     ],
 )
 def test_brightness_gains_too(
-    held: HeldOut, p_value: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+    held: HeldOutGain, p_value: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A cause of brightness takes 15 % of the excess away and 2 % of the whole, and is significant."""
     observed = made_observations(hidden(), rng)
@@ -276,3 +277,18 @@ def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypa
         monkeypatch.setattr(local_blur_fit._Problem, "residual", lambda *_, r=residual: r)
         variances.append(problem.covariance(np.zeros(3), residual, jacobian, np.ones(400))[0, 0])
     assert variances[0] > 8 * variances[1]
+
+
+def test_levels_are_asked_alike_of_all_evidence() -> None:
+    """Significance, size, held-out gain and evenness each keep a cause from being named."""
+    levels = Levels(1e-3, 0.1, 0.05, ((0.1, 0.01), (0.3, 0.05)), {"defocus": 0.5})
+    assert levels.significant(9e-4)
+    assert not levels.significant(1e-3)
+    assert levels.matters("defocus", 0.51)
+    assert not levels.matters("defocus", 0.49)
+    assert levels.matters("flicker", 0.01)
+    assert levels.gains(HeldOutGain(PHOTOMETRY, 2.0, 1.5, 1.0))
+    assert not levels.gains(HeldOutGain(PHOTOMETRY, 2.0, 1.96, 1.0))
+    assert [levels.gains(HeldOutGain(PHOTOMETRY, 2.0, after, 2.0)) for after in (1.94, 1.96)] == [True, False]
+    asked = ((0.05, 0.0), (0.2, 0.009), (0.2, 0.02), (0.4, 0.02), (0.4, 0.06))
+    assert [levels.holds(*one) for one in asked] == [False, True, False, True, False]

@@ -155,8 +155,8 @@ def test_exposure_and_defocus_are_found_together(altered: Observed) -> None:
         assert value == pytest.approx(truth, rel=0.12)
     assert found.profile.shutter.exposure_scale == found.values[0][0]
     assert found.profile.extensions.defocus_sigma_px == found.values[1][0]
-    before, after = held_out(*altered, BOTH)
-    assert after < 0.95 * before
+    held = held_out(*altered, BOTH)
+    assert held.after < 0.95 * held.before
 
 
 def test_the_profile_alone_carries_the_effects(altered: Observed) -> None:

@@ -9,10 +9,10 @@ import pytest
 from motion.synthetic_tracks import Setup, recorded
 from scipy.spatial.transform import Rotation
 
-from virest.calibration.geometry import right_way_round
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
 from virest.image_formation.point_model import ground, predict, pulse_delay_s, seen_s, with_profile
+from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import Term
 from virest.motion.integration import integrate_gyro

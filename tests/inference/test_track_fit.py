@@ -13,7 +13,8 @@ from virest.camera.profile import CameraProfile
 from virest.errors import ImuError
 from virest.image_formation.point_model import ground, predict
 from virest.inference import profile_terms as terms_of
-from virest.inference.track_fit import CovarianceModel, Term, TrackFit, fit_tracks, start_scene
+from virest.inference.clustered import CovarianceModel
+from virest.inference.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import InertialMotion
 

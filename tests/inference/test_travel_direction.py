@@ -9,7 +9,8 @@ import pytest
 from motion.synthetic_tracks import Setup, recorded
 
 from virest.inference import profile_terms as terms_of
-from virest.inference.track_fit import _Look, _Problem, fit_tracks, many_directions, one_direction
+from virest.inference.track_descent import Linearisation, Problem
+from virest.inference.track_fit import fit_tracks, many_directions, one_direction
 from virest.inference.travel_direction import find_directions, without_directions
 from virest.motion.scene_motion import DirectedMotion
 
@@ -121,11 +122,11 @@ def test_slopes_serve_while_directions_are_found_anew(monkeypatch: pytest.Monkey
     recording = recorded(DRIVE)
     table, taken = recording.table(), []
     start = terms_of.shift_offset(recording.profile, np.array([0.004]))
-    of_terms = _Problem._term_slopes
-    monkeypatch.setattr(_Problem, "_term_slopes", lambda *given: taken.append(1) or of_terms(*given))
+    of_terms = Problem._term_slopes
+    monkeypatch.setattr(Problem, "_term_slopes", lambda *given: taken.append(1) or of_terms(*given))
     kept = fit_tracks(recording.imu, table, start, WANTED, one_direction())
     few = len(taken)
-    monkeypatch.setattr(_Look, "is_stale", lambda look, _limit: look.prediction.second_px is not look.taken_px)
+    monkeypatch.setattr(Linearisation, "is_stale", lambda look, _limit: look.prediction.second_px is not look.taken_px)
     anew = fit_tracks(recording.imu, table, start, WANTED, one_direction())
     assert 2 * few <= len(taken) - few
     std = np.concatenate([anew.std(term.name) for term in WANTED])

@@ -333,14 +333,14 @@ def test_travel_over_depth_is_undone_and_called_no_metres() -> None:
     logs = []
     for known in (travel, replace(travel, depth_m=None, in_metres=False)):
         motion = row_motion(turning.trajectory, turning.profile, FRAME.time_s, FRAME.exposure_s, translation=known)
-        logs.append(degradation_parameters(motion, turning.trajectory, BALANCED))
+        logs.append(degradation_parameters(motion, turning.trajectory))
     metres, over_depth = logs
-    assert metres["blur"] == over_depth["blur"]
-    assert metres["shutter"] == over_depth["shutter"]
-    assert (metres["depth_m"], over_depth["depth_m"], over_depth["depth_source"]) == (1.6, None, "none")
+    assert metres.blur == over_depth.blur
+    assert metres.shutter == over_depth.shutter
+    assert (metres.depth_m, over_depth.depth_m, over_depth.depth_source) == (1.6, None, "none")
     for key in ("delta_position_m", "velocity_m_s"):
-        assert metres["motion"][key] is not None
-        assert over_depth["motion"][key] is None
+        assert getattr(metres.motion, key) is not None
+        assert getattr(over_depth.motion, key) is None
     picture = record(turning).picture
     said = restore_frame(FRAME, picture, motion, turning.trajectory, BALANCED).warnings
     assert any("not in metres" in text for text in said)

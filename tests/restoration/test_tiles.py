@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -308,6 +308,13 @@ def _joined(
     return deconvolution
 
 
+def _blurred_by(sharp: Image, kernels: Sequence[Image], seed: int) -> list[Image]:
+    """A picture blurred by each kernel, with noise of its own."""
+    rng = np.random.default_rng(seed)
+    noise = (rng.normal(0, 0.01, sharp.shape).astype(np.float32) for _ in kernels)
+    return [cv2.filter2D(sharp, cv2.CV_32F, kernel) + one for kernel, one in zip(kernels, noise, strict=True)]
+
+
 def test_a_picture_joined_with_itself_says_nothing_new() -> None:
     """A coder that repeats a still frame repeats its noise: twice the same measurement weighs as much as once."""
     picture, kernel = texture(100, 150).astype(np.float32), _lopsided_kernel()
@@ -320,13 +327,9 @@ def test_a_picture_joined_with_itself_says_nothing_new() -> None:
 
 def test_a_picture_blurred_along_another_path_tells_what_the_first_lost() -> None:
     """Strokes across and down pass each other's lost frequencies; together they are sharper than either alone."""
-    rng = np.random.default_rng(3)
     sharp = texture(140, 200).astype(np.float32)
     across, down = _stroke(True), _stroke(False)
-    first, second = (
-        cv2.filter2D(sharp, cv2.CV_32F, kernel) + rng.normal(0, 0.01, sharp.shape).astype(np.float32)
-        for kernel in (across, down)
-    )
+    first, second = _blurred_by(sharp, (across, down), seed=3)
 
     def error(deconvolution: TileDeconvolution) -> float:
         ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
@@ -349,13 +352,9 @@ def test_a_neighbour_whose_place_is_uncertain_weighs_less() -> None:
 
 def test_a_picture_that_shows_something_else_in_a_place_changes_nothing_there() -> None:
     """Where it is left out its content does not matter, and the rest of the tile still gains by it."""
-    rng = np.random.default_rng(4)
     sharp = texture(140, 200).astype(np.float32)
     across, down = _stroke(True), _stroke(False)
-    first, second = (
-        cv2.filter2D(sharp, cv2.CV_32F, kernel) + rng.normal(0, 0.01, sharp.shape).astype(np.float32)
-        for kernel in (across, down)
-    )
+    first, second = _blurred_by(sharp, (across, down), seed=4)
     trust, foreign = np.ones_like(sharp), second.copy()
     trust[50:90, 70:120], foreign[50:90, 70:120] = 0, 1
     left_out = [_joined(first, across, other, down, trust=trust).back_projected(first) for other in (second, foreign)]

@@ -13,7 +13,8 @@ import numpy as np
 
 from virest.app.console import table
 from virest.app.outputs import output_error, write_whole
-from virest.calibration.geometry import FRAME_LAG, NO_FINDING, CalibratedValue, GeometryCalibration, calibrate_geometry
+from virest.calibration.calibrated_values import CalibratedValue
+from virest.calibration.geometry import FRAME_LAG, GeometryCalibration, calibrate_geometry
 from virest.calibration.unfitted_parameters import OPTIONAL
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
 from virest.camera.profile import CameraProfile, format_profile, load_yaml_mapping, profile_mapping
@@ -234,7 +235,7 @@ def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise |
         "noise_px": found.noise_px,
         "imu": _imu_facts(noise),
         "notes": [*found.notes, *_own_notes(plan, found, noise)],
-        "verdict": _verdict(undetermined, [value["name"] for value in values if value["note"] == NO_FINDING]),
+        "verdict": _verdict(undetermined, [value.name for value in found.values if value.implausible]),
         "profile": profile_mapping(found.profile),
     }
 

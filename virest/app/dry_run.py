@@ -110,12 +110,12 @@ def _restored(
     near = sorted([*near, (frame, decoded[frame.index])], key=lambda pair: pair[0].index)
     began = time.perf_counter()
     restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}), None)
-    if restored is None or restored.picture is None:
+    if restored is None or restored.picture is None or restored.degradation is None:
         return None
     size = len(png_bytes(restored.picture))
     seconds = time.perf_counter() - began
-    parameters = restored.parameters
-    return seconds, size, parameters["blur"]["length_px"], parameters["deblur"].get("expected_gain_db")
+    found = restored.degradation
+    return seconds, size, found.blur.length_px, found.expected_gain_db
 
 
 def _table(forecasts: list[Forecast]) -> str:

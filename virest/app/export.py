@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.export_plan import (
-    INSTANT_NOTE,
     RECORD,
     SCENES,
     ExportFrame,
@@ -221,7 +220,7 @@ def _said(plan: ExportPlan) -> list[str]:
     return [
         f"{plan.capture.name}, pictures {kind}; profile from {Path(plan.source).name}",
         f"a picture stands for the instant {1e3 * plan.instant_s:.4f} ms after its stamp",
-        *(note for note in plan.notes if not note.startswith(INSTANT_NOTE)),
+        *(note.text for note in plan.notes if not note.on_stamps),
     ]
 
 
@@ -278,7 +277,7 @@ def _facts(plan: ExportPlan, frames: list[ExportFrame]) -> Json:
         "instant_after_stamp_s": plan.instant_s,
         "time_offset_known": plan.profile.time_offset_s is not None,
         "profile_source": plan.source,
-        "notes": list(plan.notes),
+        "notes": [note.text for note in plan.notes],
     }
 
 

@@ -35,7 +35,6 @@ FORMATS = ("euroc", "tum", "nerfstudio", "colmap", "gyroflow")
 SCENES = ("nerfstudio", "colmap")
 STAMPS = ("logged", "instant")
 RECORD = "export.json"
-INSTANT_NOTE = "a picture stands for an instant"
 PLAIN_PICTURES = ("restored", "copied")
 
 Json = dict[str, Any]
@@ -72,6 +71,15 @@ class ExportFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class ExportNote:
+    """What a user of the export should know."""
+
+    text: str
+    on_stamps: bool = False
+    """About what the stamps mean, which the written files say in words of their own."""
+
+
+@dataclass(frozen=True, slots=True)
 class ExportPlan:
     """Everything decided, nothing written."""
 
@@ -88,7 +96,7 @@ class ExportPlan:
     imu_time_ns: NDArray[np.int64]
     noise: ImuNoise | None
     source: str
-    notes: tuple[str, ...]
+    notes: tuple[ExportNote, ...]
     camera: CameraProfile
     """Of the capture, as :attr:`profile` is of what is written."""
     velocities: Mapping[int, list[float]]
@@ -130,9 +138,10 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
     written = _for_frames(written, frames, capture, options)
     lens, off_px = (None, 0.0) if written.intrinsics is None else standard_lens(written.intrinsics)
     imu, gyro_rad_s = capture.imu, _corrected_gyro(capture, profile)
-    notes = [*_notes(capture, profile, options, instants_s), *field_notes(written, off_px)]
+    of_fields = (ExportNote(text) for text in field_notes(written, off_px))
+    notes = (*_notes(capture, profile, options, instants_s), *of_fields)
     for note in notes:
-        log.warning("%s: %s", capture.name, note)
+        log.warning("%s: %s", capture.name, note.text)
     noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
     times = _imu_time_ns(capture, profile)
     return ExportPlan(
@@ -146,7 +155,7 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
         times,
         noise,
         source,
-        tuple(notes),
+        notes,
         profile,
         velocities,
         options.restored is not None and reference == "exposure-start",
@@ -345,8 +354,7 @@ def _imu_time_ns(capture: Capture, profile: CameraProfile) -> NDArray[np.int64]:
 
 def _notes(
     capture: Capture, profile: CameraProfile, options: ExportOptions, instants_s: NDArray[np.float64]
-) -> list[str]:
-    """What a user of the export should know."""
+) -> list[ExportNote]:
     notes = []
     if profile.time_offset_s is None:
         notes.append(
@@ -363,10 +371,12 @@ def _notes(
         notes.append(f"the inertial log cannot be trusted from {spans}{more} after the first stamp: written as logged")
     if not capture.imu.has_accelerometer:
         notes.append("no accelerometer: its columns are nan, and tools can use the camera alone")
+    found = [ExportNote(text) for text in notes]
     shift_ms = 1e3 * float(np.median(instants_s))
     if options.stamps == "logged" and abs(shift_ms) > 1.0:
-        notes.append(
-            f"{INSTANT_NOTE} {shift_ms:.1f} ms after its stamp (timeshift_cam_imu); for tools that cannot shift times, "
-            "as ORB-SLAM3, export with --stamps instant"
+        text = (
+            f"a picture stands for an instant {shift_ms:.1f} ms after its stamp (timeshift_cam_imu); for tools that "
+            "cannot shift times, as ORB-SLAM3, export with --stamps instant"
         )
-    return notes
+        found.append(ExportNote(text, on_stamps=True))
+    return found

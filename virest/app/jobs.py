@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.cluster import ClusterExecutor
+from virest.app.frame_log import frame_line
 from virest.app.memory import keep_freed_memory
 from virest.app.outputs import RunFolder, json_line, write_picture, write_whole
 from virest.capture.folder import Capture, Frame
@@ -193,7 +194,7 @@ def _skipped(segment: Segment) -> Iterator[RestoredFrame]:
 
 
 def _without_picture(frame: Frame, status: str, reason: str) -> RestoredFrame:
-    return RestoredFrame(frame, status, None, warnings=(reason,), valid_px=(0, 0, 0, 0), parameters={}, seconds={})
+    return RestoredFrame(frame, status, None, warnings=(reason,), valid_px=(0, 0, 0, 0), seconds={})
 
 
 def _decoded(segment: Segment, seconds: dict[int, float]) -> Iterator[tuple[Frame, Picture | None]]:
@@ -280,7 +281,7 @@ def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> 
         write_picture(path, restored.picture)
     write_s = time.perf_counter() - began if restored.picture is not None else 0.0
     seconds = {"decode": decode_s, "estimate": 0.0, "deblur": 0.0, "shutter": 0.0, "write": write_s, **restored.seconds}
-    return frame_line(segment, restored, seconds)
+    return frame_line(segment.capture_name, segment.plan.profile, restored, path, seconds)
 
 
 def recorded_mask(picture: Picture, source_px: NDArray[np.float32] | None) -> Picture:
@@ -291,42 +292,6 @@ def recorded_mask(picture: Picture, source_px: NDArray[np.float32] | None) -> Pi
     return np.asarray(
         cv2.inRange(source_px, (-EDGE_PX, -EDGE_PX), (width - 1 + EDGE_PX, height - 1 + EDGE_PX)), np.uint8
     )
-
-
-def frame_line(segment: Segment, restored: RestoredFrame, seconds: dict[str, float]) -> dict[str, Any]:
-    """One line of parameters.jsonl."""
-    frame, profile = restored.frame, segment.plan.profile
-    scale = profile.shutter.exposure_scale
-    curve = profile.response.kind if profile.response else "srgb"
-    line: dict[str, Any] = {
-        "capture": segment.capture_name,
-        "frame": frame.index,
-        "timestamp_ns": frame.timestamp_ns,
-        "exposure_s": None if frame.exposure_s is None else frame.exposure_s * scale,
-        "status": restored.status,
-        "done": [],
-        "output": None if restored.picture is None else f"frames/{segment.run.picture(frame.index).name}",
-        "warnings": list(restored.warnings),
-        "valid_px": list(restored.valid_px),
-        "motion": None,
-        "depth_m": None,
-        "depth_source": "none",
-        "blur": None,
-        "shutter": None,
-        "response": curve,
-        "deblur": {"method": "none"},
-    }
-    line |= restored.parameters
-    line["done"] = [*steps_done(line), *(["undistorted"] if restored.undistorted and line["output"] else [])]
-    return {**line, "seconds": {name: round(s, 4) for name, s in seconds.items()}}
-
-
-def steps_done(line: dict[str, Any]) -> list[str]:
-    """What was done to a frame: ``deblurred``, ``straightened``."""
-    if line["status"] != "restored":
-        return []
-    steps = (("deblurred", line["deblur"]), ("straightened", line["shutter"]))
-    return [name for name, step in steps if step and step["method"] != "none"]
 
 
 # ── workers ──────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -17,6 +17,7 @@ from virest.errors import CaptureError, OutputError
 from virest.image_formation.row_clock import RowClock
 from virest.report.concepts import preview_figure
 from virest.restoration.frame import RestoredFrame
+from virest.restoration.parameters import DegradationParameters
 
 log = logging.getLogger(__name__)
 
@@ -42,16 +43,15 @@ def run_preview(path: str, options: PreviewOptions) -> tuple[Json, str]:
         raise OutputError(f"{out}: exists already", hint="name another by --out, or pass --overwrite")
     number = most_blurred(capture) if options.frame is None else options.frame
     restored = capture.restore(number, options.preset)
-    if restored.picture is None:
+    found = restored.degradation
+    if restored.picture is None or found is None:
         raise CaptureError(
             f"{capture.name}: frame {number} is {restored.status}: {'; '.join(restored.warnings)}",
             hint="choose another by --frame",
         )
-    tiles = restored.parameters["blur"]["tiles"]
-    write_whole(
-        out, preview_figure(capture.read_frame(number), restored.picture, tiles, f"{capture.name}, frame {number}")
-    )
-    facts = _facts(capture.name, restored, out)
+    title = f"{capture.name}, frame {number}"
+    write_whole(out, preview_figure(capture.read_frame(number), restored.picture, found.blur.tiles, title))
+    facts = _facts(capture.name, restored, found, out)
     return facts, "\n".join([_describe(facts), *(f"note: {text}" for text in facts["warnings"]), f"wrote {out}"])
 
 
@@ -75,15 +75,14 @@ def _turned_rad(capture: api.Capture, frame: Frame) -> float:
     return float(np.hypot(turning[0], turning[1])) * (exposure_s or readout_s or 1.0)
 
 
-def _facts(name: str, restored: RestoredFrame, out: Path) -> Json:
-    parameters = restored.parameters
+def _facts(name: str, restored: RestoredFrame, found: DegradationParameters, out: Path) -> Json:
     return {
         "capture": name,
         "frame": restored.frame.index,
         "status": restored.status,
-        "blur_px": parameters["blur"]["length_px"],
-        "max_displacement_px": parameters["shutter"]["max_displacement_px"],
-        "expected_gain_db": parameters["deblur"].get("expected_gain_db"),
+        "blur_px": found.blur.length_px,
+        "max_displacement_px": found.shutter.max_displacement_px,
+        "expected_gain_db": found.expected_gain_db,
         "warnings": list(restored.warnings),
         "path": str(out),
     }

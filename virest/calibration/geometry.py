@@ -13,18 +13,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from virest.calibration.physical_limits import limit_reasons
+from virest.calibration.calibrated_values import (
+    NO_FINDING,
+    CalibratedValue,
+    beyond_limits,
+    calibrated,
+    correlations_of,
+    direction_value,
+    held_back,
+    is_determined,
+    roughly_known,
+    value_of,
+    variances_of,
+    with_estimates,
+)
 from virest.calibration.unfitted_parameters import OPTIONAL, HeldValue, held_notes, held_values
-from virest.camera.intrinsics import Intrinsics
 from virest.camera.kalibr import measure_imu_noise
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
+from virest.effects.changes import keep_readout
 from virest.errors import CalibrationError
 from virest.image_formation.point_model import TrackTable, ground
-from virest.image_formation.row_clock import row_time_s
+from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.blur_bias import blur_bias_px
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
@@ -50,50 +62,13 @@ DIRECTION_COST = 12.0
 """Readouts along rows and along columns are told apart from this difference in cost, in units of its own noise."""
 OUTLIER_WEIGHT = 0.1
 ASTRAY_PASSES = 3
-MIN_STRETCHES = 2.5
-"""A value that rests on fewer stretches of time is a single moment's, and nothing else bears it out."""
 MANY_OUTLIERS = 0.1
-LARGE_CORRELATION = 0.9
 CONSTANT_EXPOSURE_S = 1e-4
 """Exposures that differ by no more tell no offset from a scale of theirs, nor from the stamp's meaning."""
 DRIFT_SIGMA, LEAST_DRIFT_S = 4.5, 1e-3
 """Clocks are said to drift apart above this many deviations (false alarms: 7e-6) and this much over the capture."""
 FRAME_LAG = "frame-lag"
 """The start-up's lag, which ``--with`` adds too."""
-NO_FINDING = "no camera has it"
-MAX_STD = {
-    "time_offset": 0.002,
-    "readout_time": 0.002,
-    "imu_rotation": 0.01,
-    "gyro_bias": 0.006,
-    "focal_length": 0.02,
-    "radial_distortion": 0.03,
-    "principal_point": 12.0,
-    "gyro_scale": 0.02,
-    "clock_skew": 0.0015,
-    "exposure_time": 0.25,
-}
-"""Values known no better than this are not determined and stay where they were."""
-
-
-ROUGH_OFFSET_S = 0.01
-"""An offset known to this is written, and said to be rough; what is worse tells less than a phone's usual clocks do."""
-
-
-@dataclass(frozen=True, slots=True)
-class CalibratedValue:
-    """One value of the profile, before and after."""
-
-    name: str
-    """As in the profile: time_offset_s, readout_time_s, readout_direction, rotation_rad, gyro_bias_rad_s, fx_px ..."""
-    start: float | list[float] | str | None
-    value: float | list[float] | str | None
-    """Fitted; the start where not determined."""
-    std: float | list[float] | None
-    determined: bool
-    note: str = ""
-    rough: bool = False
-    """Not determined as well as is wanted, and written all the same, with its deviation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +172,7 @@ def _clocks_drift(skew: HeldValue | None, span_s: float) -> bool:
 
     One offset for all of a capture is then right at one instant only, and looks well known.
     """
-    if skew is None or skew.std[0] > MAX_STD["clock_skew"]:
+    if skew is None or skew.std[0] > calibrated("clock_skew").max_std:
         return False
     return skew.sigma > DRIFT_SIGMA and abs(float(skew.change[0])) * span_s > LEAST_DRIFT_S
 
@@ -309,7 +284,7 @@ def _with_uneven_rows(rough: _Rough, given: CameraProfile) -> _Rough:
     if uneven is None:
         return rough
     if not rough.direction_known:
-        found = _with_given_readout(found, given)
+        found = keep_readout(found, given)
     if found.shutter.readout_direction != given.shutter.readout_direction or not found.shutter.readout_time_s:
         return rough
     return replace(rough, profile=replace(found, shutter=replace(found.shutter, uneven=uneven)))
@@ -367,75 +342,35 @@ def _conclude(
         bias = {term.name: remaining_std(fit, term.name, fit.value(term.name), gyro_rad_s) for term in fit.terms}
     else:
         bias = {term.name: bias_std(fit, term.name, noise) for term in fit.terms}
-    variances = _variances(fit, bias, _drift_rad(fit, imu))
-    beyond = _beyond_limits(fit, observed)
+    variances = variances_of(fit, bias, _drift_rad(fit, imu))
+    beyond = beyond_limits(fit, observed)
     determined = {
-        term.name: term.name not in beyond and _is_determined(fit, term.name, variances[term.name])
-        for term in fit.terms
+        term.name: term.name not in beyond and is_determined(fit, term.name, variances[term.name]) for term in fit.terms
     }
-    profile = right_way_round(_held_back(fit, given, start, determined))
+    profile = right_way_round(held_back(fit, given, start, determined))
     if not rough.direction_known and not determined["readout_time"]:
-        profile = _with_given_readout(profile, given)
-    values = tuple(_value(term.name, given, profile, fit.profile, variances, determined) for term in fit.terms)
-    values = tuple(_rough(value, fit) if value.name == "time_offset_s" else value for value in values)
-    kept = {_FIELDS[name][0] for name in beyond}
-    values = tuple(replace(value, note=NO_FINDING) if value.name in kept else value for value in values)
+        profile = keep_readout(profile, given)
+    values = tuple(
+        value_of(term.name, given, profile, fit.profile, variances[term.name], determined[term.name])
+        for term in fit.terms
+    )
+    values = tuple(roughly_known(value, fit) if value.name == "time_offset_s" else value for value in values)
+    kept = {calibrated(name).name for name in beyond}
+    values = tuple(
+        replace(value, note=NO_FINDING, implausible=True) if value.name in kept else value for value in values
+    )
     direction_known = rough.direction_known and determined["readout_time"]
-    values = (*values[:2], _direction_value(given, profile, direction_known), *values[2:])
-    profile = _with_estimates(profile, values)
+    values = (*values[:2], direction_value(given, profile, direction_known), *values[2:])
+    profile = with_estimates(profile, values)
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
     notes = _notes(coarse, fit, moving, astray, observed, determined)
-    notes = (*notes, *(f"{_FIELDS[name][0]} would be {said}: that is no finding, and it is left as it was; "
+    notes = (*notes, *(f"{calibrated(name).name} would be {said}: that is no finding, and it is left as it was; "
                        "virest diagnose may find what it stands for" for name, said in beyond.items()))  # fmt: skip
     return GeometryCalibration(
-        profile, values, _correlations(fit, variances), _translation(fit), residual_px(fit),
+        profile, values, correlations_of(fit, variances), _translation(fit), residual_px(fit),
         tracking_noise_px(observed, fit), residual_px(rough.before), coarse.explained, moving,
         len(observed.pairs), observed.tracks, notes, fit,
     )  # fmt: skip
-
-
-def _beyond_limits(fit: TrackFit, observed: ObservedTracks) -> dict[str, str]:
-    """Of the fitted terms, those whose values no camera has, and why."""
-    stamps = observed.stamp_s[np.isfinite(observed.stamp_s)]
-    period_s, fitted = float(np.median(np.diff(stamps))), right_way_round(fit.profile)
-    reasons = limit_reasons(fitted, period_s, float(np.median(observed.exposure_s)))
-    return {term.name: reasons[term.name] for term in fit.terms if term.name in reasons}
-
-
-def _is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
-    """Known well enough, and not by a single moment alone; a readout within two deviations of 0 has no known sense."""
-    known = bool(np.all(np.sqrt(variance) <= MAX_STD[name]))
-    if name == "readout_time" and abs(fit.profile.shutter.readout_time_s) < 2 * float(np.sqrt(variance[0])):
-        return False
-    return known and bool(np.all(fit.stretches[fit.slices[name]] >= MIN_STRETCHES))
-
-
-def _rough(offset: CalibratedValue, fit: TrackFit) -> CalibratedValue:
-    """An offset that is known roughly, by more than a single moment, says so."""
-    std_s = float(np.max(np.asarray(offset.std, float)))
-    if offset.determined or std_s > ROUGH_OFFSET_S or fit.stretches[fit.slices["time_offset"]][0] < MIN_STRETCHES:
-        return offset
-    return replace(offset, rough=True, note=f"rough: {1e3 * MAX_STD['time_offset']:g} ms are wanted")
-
-
-def right_way_round(profile: CameraProfile) -> CameraProfile:
-    """A negative readout along one sense is a positive one along the other: t₀' = t₀ + r (1 − 1 / rows)."""
-    shutter = profile.shutter
-    if shutter.readout_time_s >= 0:
-        return profile
-    opposite = {
-        "top_to_bottom": "bottom_to_top",
-        "bottom_to_top": "top_to_bottom",
-        "left_to_right": "right_to_left",
-        "right_to_left": "left_to_right",
-    }[shutter.readout_direction]
-    rows = profile.width if shutter.reads_columns else profile.height
-    moved = row_time_s(0.0, shutter.readout_time_s, 1 - 1 / rows)
-    return replace(
-        profile,
-        time_offset_s=(profile.time_offset_s or 0.0) + moved,
-        shutter=replace(shutter, readout_time_s=-shutter.readout_time_s, readout_direction=opposite),
-    )
 
 
 def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
@@ -453,144 +388,10 @@ def _gyro_mean_std_rad_s(imu: ImuSamples, span_s: float) -> float:
     return (noise.gyro_density or 0.0) / max(span_s, 0.1) ** 0.5 if noise else 0.0
 
 
-def _variances(fit: TrackFit, bias: dict[str, Array], drift: tuple[float, float]) -> dict[str, Array]:
-    """Variance of each term's values, with what remains of tracking's bias; the offset is that of the first row."""
-    found = {term.name: fit.std(term.name) ** 2 + bias[term.name] ** 2 for term in fit.terms}
-    found["imu_rotation"] = found["imu_rotation"] + (0.5 * drift[0]) ** 2
-    found["gyro_bias"] = found["gyro_bias"] + (drift[0] / drift[1]) ** 2
-    if "readout_time" in found:
-        cross = fit.covariance[fit.slices["time_offset"], fit.slices["readout_time"]][0]
-        first_row = found["time_offset"] + 0.25 * found["readout_time"] - cross
-        found["time_offset"] = np.maximum(first_row, found["time_offset"])
-    return found
-
-
-def _held_back(fit: TrackFit, given: CameraProfile, start: CameraProfile, determined: dict[str, bool]) -> CameraProfile:
-    """The fitted profile, with what is not determined put back to where it began."""
-    profile = fit.profile
-    if not determined.get("readout_time", True):
-        profile = _with_given_readout(profile, given)
-    if not determined.get("imu_rotation", True):
-        profile = replace(profile, r_cam_imu=start.r_cam_imu)
-    if not determined.get("gyro_bias", True):
-        profile = replace(profile, gyro_bias_rad_s=given.gyro_bias_rad_s)
-    if not determined.get("gyro_scale", True):
-        profile = replace(profile, gyro_scale=given.gyro_scale)
-    if not determined.get("clock_skew", True):
-        profile = replace(profile, clock_skew=given.clock_skew)
-    if not determined.get("exposure_time", True):
-        scale = given.shutter.exposure_scale
-        profile = replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
-    lens_names = ("focal_length", "radial_distortion", "principal_point")
-    if not all(determined.get(name, True) for name in lens_names):
-        profile = replace(profile, intrinsics=_lens_held_back(profile, given, determined))
-    return profile
-
-
-def _lens_held_back(profile: CameraProfile, given: CameraProfile, determined: dict[str, bool]) -> Intrinsics | None:
-    lens, before = profile.intrinsics, given.intrinsics
-    if before is None or lens is None:
-        return before
-    if not determined.get("focal_length", True):
-        lens = replace(lens, fx_px=before.fx_px, fy_px=before.fy_px)
-    if not determined.get("radial_distortion", True):
-        lens = replace(lens, model=before.model, coefficients=before.coefficients)
-    if not determined.get("principal_point", True):
-        lens = replace(lens, cx_px=before.cx_px, cy_px=before.cy_px)
-    return lens
-
-
-def _with_given_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
-    """Put the given readout back, the picture's middle row kept where it was."""
-    middle = (profile.time_offset_s or 0.0) + 0.5 * profile.shutter.readout_time_s
-    shutter = replace(
-        profile.shutter,
-        readout_time_s=given.shutter.readout_time_s,
-        readout_direction=given.shutter.readout_direction,
-    )
-    return replace(profile, shutter=shutter, time_offset_s=middle - 0.5 * shutter.readout_time_s)
-
-
-_FIELDS: dict[str, tuple[str, Callable[[CameraProfile], float | list[float] | None]]] = {
-    "time_offset": ("time_offset_s", lambda p: p.time_offset_s),
-    "readout_time": ("readout_time_s", lambda p: p.shutter.readout_time_s if p.readout_known else None),
-    "imu_rotation": ("rotation_rad", lambda p: None),
-    "gyro_bias": ("gyro_bias_rad_s", lambda p: list(p.gyro_bias_rad_s)),
-    "gyro_scale": ("gyro_scale", lambda p: p.gyro_scale[0]),
-    "focal_length": ("fx_px", lambda p: p.intrinsics.fx_px if p.intrinsics else None),
-    "radial_distortion": (
-        "k1",
-        lambda p: p.intrinsics.coefficients[0] if p.intrinsics and p.intrinsics.coefficients else 0.0,
-    ),
-    "principal_point": (
-        "principal_point_px",
-        lambda p: [p.intrinsics.cx_px, p.intrinsics.cy_px] if p.intrinsics else None,
-    ),
-    "clock_skew": ("clock_skew", lambda p: p.clock_skew),
-    "exposure_time": ("exposure_scale", lambda p: p.shutter.exposure_scale),
-}
-
-
-def _value(
-    name: str,
-    given: CameraProfile,
-    profile: CameraProfile,
-    fitted: CameraProfile,
-    variances: dict[str, Array],
-    determined: dict[str, bool],
-) -> CalibratedValue:
-    """One value; fitted: the profile with what is not determined too, which turns relative deviations into units."""
-    field, read = _FIELDS[name]
-    std = np.sqrt(variances[name])
-    before, after = read(given), read(profile)
-    if name == "imu_rotation":
-        turn = profile.rotation_cam_imu @ given.rotation_cam_imu.T
-        before, after = [0.0, 0.0, 0.0], _rotation_vector(turn)
-    if name in ("focal_length", "gyro_scale", "exposure_time") and isinstance(scale := read(fitted), float):
-        std = std * abs(scale)
-    if name == "readout_time" and determined[name]:
-        after = profile.shutter.readout_time_s
-    shown = [float(s) for s in std]
-    return CalibratedValue(field, before, after, shown if len(shown) > 1 else shown[0], determined[name])
-
-
-def _rotation_vector(matrix: Array) -> list[float]:
-    return [float(v) for v in Rotation.from_matrix(matrix).as_rotvec()]
-
-
-def _direction_value(given: CameraProfile, profile: CameraProfile, known: bool) -> CalibratedValue:
-    return CalibratedValue(
-        "readout_direction", given.shutter.readout_direction, profile.shutter.readout_direction, None, known
-    )
-
-
-def _with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -> CameraProfile:
-    source = "tracked points against the inertial data"
-    for value in values:
-        if (value.determined or value.rough) and value.value is not None:
-            profile = profile.with_estimate(value.name, value.value, value.std, source)
-    known = profile.readout_known or any(v.name == "readout_time_s" and v.determined for v in values)
-    return replace(profile, readout_known=known)
-
-
 def _translation(fit: TrackFit) -> str:
     if fit.scene is None:
         return "none"
     return "inertial" if isinstance(fit.scene, InertialMotion) else "direction"
-
-
-def _correlations(fit: TrackFit, variances: dict[str, Array]) -> tuple[tuple[str, str, float], ...]:
-    names = [
-        f"{_FIELDS[t.name][0]}{'' if len(t) == 1 else '[' + str(k) + ']'}" for t in fit.terms for k in range(len(t))
-    ]
-    count = len(names)
-    total = np.sqrt(np.concatenate([variances[t.name] for t in fit.terms]))
-    correlation = fit.covariance[:count, :count] / np.outer(total, total)
-    rows, columns = np.triu_indices(count, 1)
-    strong = np.abs(correlation[rows, columns]) > LARGE_CORRELATION
-    return tuple(
-        (names[i], names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong], strict=True)
-    )
 
 
 def _notes(

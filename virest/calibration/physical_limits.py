@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from virest.camera.gyro_filter import LEAST_HZ
 from virest.camera.profile import CameraProfile
-from virest.inference.profile_terms import GYRO_SCALE_OFF
+from virest.effects.table import CLOCK_SKEW_OFF, GYRO_SCALE_OFF
 
 LEAST_READOUT_S = 1e-3
 """The fastest rolling shutters (stacked sensors, 960 frames/s) read a frame in about 1 ms; a global shutter has 0."""
@@ -21,8 +21,6 @@ SCALE_OF_EXPOSURE = (0.05, 20.0)
 """The true exposure over the logged one."""
 OFFSET_S = 2.0
 """A larger offset is another recording, or another clock."""
-CLOCK_SKEW = 0.02
-"""Crystals keep 1e-4, recorders that write another clock's rate 0.5 %."""
 
 
 def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> frozenset[str]:
@@ -74,8 +72,8 @@ def limit_reasons(profile: CameraProfile, period_s: float, exposure_s: float) ->
     worst = max(profile.gyro_scale, key=lambda scale: abs(scale - 1))
     if abs(worst - 1) >= GYRO_SCALE_OFF:
         found["gyro_scale"] = f"{worst:.3f}, where gyroscopes are right to within {GYRO_SCALE_OFF:.0%}"
-    if abs(profile.clock_skew) >= CLOCK_SKEW:
-        found["clock_skew"] = f"{profile.clock_skew:+.4f}, where clocks differ by less than {CLOCK_SKEW:.0%}"
+    if abs(profile.clock_skew) >= CLOCK_SKEW_OFF:
+        found["clock_skew"] = f"{profile.clock_skew:+.4f}, where clocks differ by less than {CLOCK_SKEW_OFF:.0%}"
     return found
 
 

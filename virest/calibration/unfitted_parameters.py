@@ -8,39 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.calibration.physical_limits import CLOCK_SKEW
 from virest.capture.imu import ImuSamples
+from virest.effects.table import EFFECTS
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import TrackFit, fit_tracks
 from virest.inference.tracking_bias import bias_std
 
-OPTIONAL = {
-    "focal": terms_of.FOCAL,
-    "distortion": terms_of.K1,
-    "principal-point": terms_of.PRINCIPAL_POINT,
-    "gyro-scale": terms_of.GYRO_SCALE,
-    "clock-skew": terms_of.CLOCK_SKEW,
-    "exposure-scale": terms_of.EXPOSURE_SCALE,
-}
-"""What ``--with`` adds to the fit of points."""
+_PLACES = ("intrinsics", "imu", "shutter")
+_NAMED = sorted(
+    (effect for effect in EFFECTS.values() if effect.calibrated is not None and effect.calibrated.option),
+    key=lambda effect: _PLACES.index(effect.place.partition(".")[0]),
+)
+_CALIBRATED = {effect.calibrated.option: effect.calibrated for effect in _NAMED if effect.calibrated is not None}
+OPTIONAL = {option: terms_of.TERMS[effect.name] for option, effect in zip(_CALIBRATED, _NAMED, strict=True)}
+"""What ``--with`` adds to the fit of points: of the lens, of the inertial sensor, of the shutter."""
 TWINS = {"focal": "gyro-scale", "gyro-scale": "focal"}
 """What turns about the picture's axes tell only the product of; turns about the optical axis tell the two apart."""
 TWIN_SIGMA, TWIN_STD = 3.0, 0.01
 """A twin held fixed is reported as wrong above this many deviations, and as undetermined above this part of itself."""
 WRONG_SIGMA = 6.0
 """Any other value held fixed is reported as wrong above this many deviations."""
-BELIEVABLE = {
-    "focal": 0.2,
-    "distortion": 0.3,
-    "principal-point": 100.0,
-    "gyro-scale": terms_of.GYRO_SCALE_OFF,
-    "clock-skew": CLOCK_SKEW,
-    "exposure-scale": 1.0,
-}
-"""A larger change absorbs something else, such as a stabiliser or stamps of another meaning."""
-_FACTORS = ("focal", "gyro-scale", "exposure-scale")
-"""Values whose terms are natural logarithms of a factor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +50,10 @@ class HeldValue:
     @property
     def believable(self) -> bool:
         """Whether a phone can be like that."""
-        return bool(np.all(np.abs(self.change) <= BELIEVABLE[self.name]))
+        return bool(np.all(np.abs(self.change) <= _CALIBRATED[self.name].believable))
 
     def __str__(self) -> str:
-        if self.name in _FACTORS:
+        if _CALIBRATED[self.name].is_factor:
             change = np.expm1(self.change)
             return f"{self.name} ({change[0]:+.1%} ± {(1 + change[0]) * self.std[0]:.1%})"
         pairs = zip(self.change, self.std, strict=True)

@@ -23,6 +23,7 @@ from virest.diagnosis.geometric_evidence import (
 from virest.image_formation.point_model import TrackTable
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap
+from virest.inference.time_blocks import halves
 from virest.inference.track_fit import Term
 
 Array = NDArray[np.float64]
@@ -35,7 +36,7 @@ GLANCE, RACED, RACED_STARTS = 2, 3, 2
 """Steps that all of many candidates take; causes that go on from there, times those wanted, and starts of each."""
 
 FOLDS = (0, 1)
-"""A fit of fold k sees the blocks of time whose number is k modulo 2; the others judge it."""
+"""A fit of fold k sees every other block of time, from block k on; the others judge it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ def _descended(
         lag: evidence.table(model, SCREEN_POINTS)
         for lag, model in {c.model.lag: c.model for c, _ in starts}.items()
     }  # fmt: skip
-    use = [evidence.block % 2 == fold for fold in FOLDS]
+    use = halves(evidence.block)
     calls = [
         (evidence.imu, tables[c.model.lag], models[fold], (*c.model.terms, *c.added), use[fold], iterations)
         for c, models in starts
@@ -163,16 +164,16 @@ def judge(
 ) -> list[Judged]:
     """Fit on every other block, judge on those between, and the other way round."""
     tables = [evidence.table(entry.candidate.model, JUDGE_POINTS) for entry in screened]
+    use = halves(evidence.block)
     calls = [
-        (evidence.imu, table, model, (*model.terms, *entry.candidate.added), evidence.block % 2 == fold,
-         depth_spread_per_m)
+        (evidence.imu, table, model, (*model.terms, *entry.candidate.added), use[fold], depth_spread_per_m)
         for entry, table in zip(screened, tables, strict=True)
         for fold, model in enumerate(entry.models)
     ]  # fmt: skip
-    halves = each(_held_out, calls)
+    found = each(_held_out, calls)
     judged = []
-    for entry, table, first, second in zip(screened, tables, halves[::2], halves[1::2], strict=True):
-        distance = np.where(evidence.block[table.pair] % 2 == 0, second, first)
+    for entry, table, first, second in zip(screened, tables, found[::2], found[1::2], strict=True):
+        distance = np.where(use[0][table.pair], second, first)
         judged.append(_judged(evidence, entry.candidate, table, distance, scale))
     return judged
 

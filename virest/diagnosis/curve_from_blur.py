@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
+from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask
-from virest.diagnosis.photometry_fit import HeldOut
 from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
@@ -214,7 +214,7 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
     return MixingEstimate(value, std, p_value if 0 < value <= evidence.largest_black else 1.0, len(pairs))
 
 
-def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOut | None:
+def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOutGain | None:
     """Find the change on half the pairs of frames and judge it on the others, and the reverse.
 
     RMS of the luma that one frame's light, blurred and encoded, differs by from the other's, grey levels.
@@ -222,13 +222,14 @@ def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOut | None:
     pairs = np.unique(evidence.pair)
     if len(pairs) < 4:
         return None
-    squares = []
+    folds = []
     for odd in (0, 1):
         change = _root(evidence.subset(np.isin(evidence.pair, pairs[odd::2])), effect_name)
         held = evidence.subset(np.isin(evidence.pair, pairs[1 - odd :: 2]))
-        squares.append((held.mean_square(effect_name, 0.0)[0], *held.mean_square(effect_name, change)))
-    before, after, noise = np.sqrt(np.mean(squares, axis=0))
-    return HeldOut(float(before), float(after), float(noise), "pairs")
+        squares = (held.mean_square(effect_name, 0.0)[0], *held.mean_square(effect_name, change))
+        before, after, noise = np.sqrt(squares).tolist()
+        folds.append((before, after, noise))
+    return HeldOutGain.of_folds(PHOTOMETRY, folds)
 
 
 def _root(evidence: MixingEvidence, effect_name: str) -> float:

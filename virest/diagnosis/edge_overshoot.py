@@ -23,13 +23,14 @@ from scipy.special import ndtr
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture, Frame
-from virest.diagnosis.catalogue import MAX_P
 from virest.diagnosis.findings import EDGES, Finding, HeldOutGain, ParameterChange, Rung
 from virest.diagnosis.local_blur import STILL_PX, frames_to_read, time_blocks
 from virest.diagnosis.local_blur_model import across, path_tensors
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader
+from virest.diagnosis.selection import EDGE_LEVELS
 from virest.inference.chance import normal_tail
 from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
+from virest.inference.time_blocks import halves
 from virest.inference.unsharp_mask import PROFILE_STD
 from virest.motion.trajectory import Trajectory
 
@@ -89,9 +90,8 @@ class Sharpening:
     """Beyond the plateaus, both sides' mean, as part of the step."""
     z: float
     """Of the overshoot, less that of bare movies, in its deviations; of the weaker of the two sides."""
-    rms_before: float
-    """Of the mean profile on held-out time blocks, as part of the step, without and with the mask."""
-    rms_after: float
+    held_out: HeldOutGain
+    """Rms of the mean profile, as part of the step, without and with the mask."""
 
     @property
     def p_value(self) -> float:
@@ -106,16 +106,15 @@ def judge_sharpening(capture: Capture, profile: CameraProfile, trajectory: Traje
     found = fit_sharpening(observe_profiles(gray(wanted), capture.frames, profile, trajectory)) if wanted else None
     if found is None:
         verdict.notes.append("too few sharp, isolated edges: sharpening was not judged")
-    elif found.p_value < MAX_P:
+    elif EDGE_LEVELS.significant(found.p_value):
         values = {"amount": (found.amount, found.amount_std), "radius_px": (found.radius_px, found.radius_std_px)}
         changes = {name: ParameterChange(0.0, value, std) for name, (value, std) in values.items()}
-        gain = HeldOutGain(EDGES, found.rms_before, found.rms_after, None)
         sentence = (
             f"edges overshoot by {found.overshoot:.0%} of their step: the phone sharpened its pictures by an unsharp "
             f"mask of {found.amount:.2g} with a radius of {found.radius_px:.2g} px"
         )
-        verdict.findings.append(Finding("sharpening", changes, gain, (), found.p_value, sentence))
-        verdict.rungs.append(Rung("sharpening", {"sharpening": found.rms_after}, found.rms_before, EDGES))
+        verdict.findings.append(Finding("sharpening", changes, found.held_out, (), found.p_value, sentence))
+        verdict.rungs.append(Rung("sharpening", {"sharpening": found.held_out.after}, found.held_out.before, EDGES))
     return verdict
 
 
@@ -154,7 +153,6 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
     sides_std = np.sqrt(np.diag(_jackknife([np.array(_overshoots(one)) for one in without])) + BARE_STD**2)
     std = np.sqrt(np.diag(covariance + scatter + _by_bare_overshoot(_evened(mean), theta)))
     amount, radius_px = float(theta[1]), float(np.exp(theta[2]))
-    before, after = _held_out(profiles, block)
     return Sharpening(
         amount,
         float(np.hypot(std[1], SIZE_ERROR * amount)),
@@ -162,8 +160,7 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
         radius_px * float(np.hypot(std[2], SIZE_ERROR)),
         float(sides.mean()),
         float(((sides - BARE_OVERSHOOT) / sides_std).min()),
-        before,
-        after,
+        _held_out(profiles, block),
     )
 
 
@@ -261,12 +258,11 @@ def _jackknife(values: Sequence[Array]) -> Array:
     return np.asarray(away.T @ away * (len(values) - 1) / len(values))
 
 
-def _held_out(profiles: Array, block: NDArray[np.intp]) -> tuple[float, float]:
+def _held_out(profiles: Array, block: NDArray[np.intp]) -> HeldOutGain:
     """Rms of the mean profile of every other block about the step fitted to the rest, without and with a mask."""
-    odd = block % 2 == 1
-    seen, judged = (_evened(np.median(profiles[use], axis=0)) for use in (~odd, odd))
+    seen, judged = (_evened(np.median(profiles[use], axis=0)) for use in halves(block))
     width = least_squares(lambda s: sharpened_step(s[0], 0.0, 1.0) - seen, [0.7], bounds=(BOUNDS[0][0], BOUNDS[1][0]))
     theta, _ = _fit(seen)
     models = sharpened_step(width.x[0], 0.0, 1.0), sharpened_step(theta[0], theta[1], float(np.exp(theta[2])))
     before, after = (float(np.sqrt(np.mean((model - judged) ** 2))) for model in models)
-    return before, after
+    return HeldOutGain(EDGES, before, after, None)

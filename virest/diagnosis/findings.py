@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as default
 from typing import Any
+
+import numpy as np
 
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
@@ -38,6 +41,12 @@ class HeldOutGain:
     after: float
     noise: float | None
     """Measured without the model and its fit; None: unknown."""
+
+    @classmethod
+    def of_folds(cls, quantity: str, folds: Sequence[tuple[float, float, float]]) -> HeldOutGain:
+        """Of folds, each judged by a fit that saw the others: rms (before, after, noise) of each."""
+        before, after, noise = np.sqrt(np.mean(np.square(folds), axis=0)).tolist() if len(folds) else (0.0,) * 3
+        return cls(quantity, before, after, noise)
 
     @property
     def gain(self) -> float | None:

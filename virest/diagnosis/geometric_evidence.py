@@ -15,6 +15,7 @@ from virest.image_formation.point_model import TrackTable, centre, ground, seen_
 from virest.inference.comparable_noise import noise_distances
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
+from virest.inference.time_blocks import varied_blocks
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
@@ -23,7 +24,7 @@ Mask = NDArray[np.bool_]
 CAP = 4.0
 """Differences count up to this many of their own median scales: single lost tracks do not decide."""
 BLOCK_LENGTHS = (7, 11, 8, 13, 9)
-"""Pairs in a block of time, in turn: fixed lengths beat with periodic faults."""
+"""Pairs in a block of time, in turn."""
 FULL_LENGTH_PAIRS = 60
 """With fewer pairs blocks are shorter, so that there are some six of them."""
 TILT_STD, KNOWN_DEPTH_STD = 0.8, 0.03
@@ -118,13 +119,9 @@ def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread
 
 def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
     """Number the blocks of time."""
-    sizes: list[int] = []
-    total, part = 0, min(len(observed.pairs) / FULL_LENGTH_PAIRS, 1.0)
-    while total < len(observed.pairs):
-        sizes.append(max(round(part * BLOCK_LENGTHS[len(sizes) % len(BLOCK_LENGTHS)]), 1))
-        total += sizes[-1]
-    block = np.repeat(np.arange(len(sizes)), sizes)[: len(observed.pairs)]
-    return Evidence(imu, observed, block)
+    part = min(len(observed.pairs) / FULL_LENGTH_PAIRS, 1.0)
+    lengths = [max(round(part * length), 1) for length in BLOCK_LENGTHS]
+    return Evidence(imu, observed, varied_blocks(np.arange(len(observed.pairs)), lengths))
 
 
 def loss(distance: Array, scale: float) -> Array:

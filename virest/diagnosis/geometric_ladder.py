@@ -16,11 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.calibration.geometry import right_way_round
 from virest.calibration.physical_limits import is_depth
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
-from virest.diagnosis.catalogue import FALSE_ALARM, MAX_P
 from virest.diagnosis.cross_validation import (
     JUDGE_POINTS,
     Judged,
@@ -46,8 +44,10 @@ from virest.diagnosis.geometric_evidence import (
     depth_of,
 )
 from virest.diagnosis.left_open import variance_left_open
+from virest.diagnosis.selection import POINT_LEVELS, WORD_LEVELS
 from virest.effects.table import EFFECTS
 from virest.image_formation.point_model import TrackTable
+from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.chance import chi2_tail
 from virest.inference.parallel import ParallelMap, one_by_one
@@ -62,13 +62,7 @@ Mask = NDArray[np.bool_]
 FINAL_POINTS = 7000
 PROMISING = 3
 """Causes that each fold chooses from."""
-HOLDS_P, LARGE_HOLDS_P = 0.01, 0.05
-"""The gain must hold between blocks too (one-sided t test; the cause was chosen by other blocks, so this is one test).
-A capture with nothing wrong passes both this and the value's test at most as often as the latter alone."""
-LARGE_GAIN = 0.05
-"""Above this part of the loss a gain need be less even: time blocks differ in how much they tell of a cause."""
-MIN_GAIN = 0.004
-"""Least part of the loss that a cause must take away on held-out blocks."""
+MAX_P, MIN_GAIN = POINT_LEVELS.max_p, POINT_LEVELS.least_gain
 FEEBLE_GAIN, ASTRAY_SCALE = 0.1, 1.25
 """A cause that takes less than this part away, while points are this many times their noise from where the model puts
 them, is not what is wrong: two that gain little alone are then tried together."""
@@ -359,11 +353,6 @@ def _rung(course: SearchContext, model: Model, accepted: list[Accepted]) -> tupl
     return step, rival, rung
 
 
-def _holds(gain: Array, part: float) -> bool:
-    """Whether a gain (blocks,), as a part of the loss, is no matter of a few blocks."""
-    return chance_of(gain) < (HOLDS_P if part < LARGE_GAIN else LARGE_HOLDS_P)
-
-
 def _names(step: _Step) -> str:
     return JOINED.join(entry.name for entry in step.accepted)
 
@@ -374,7 +363,7 @@ def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None
     typical = evidence.typical_px
     for best, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
-        if part < MIN_GAIN or not _holds(gain, part):
+        if not POINT_LEVELS.holds(part, chance_of(gain)):
             continue
         entered, p_value = _significant(evidence, best.candidate, model.profile, gain)
         if entered is None:
@@ -441,7 +430,7 @@ def _best_pair(
     before = trial.before
     for pair, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
-        if part < FEEBLE_GAIN or not _holds(gain, part):
+        if part < FEEBLE_GAIN or not POINT_LEVELS.holds(part, chance_of(gain)):
             continue
         step = _pair_step(model, trial, members_of[pair.candidate.name], pair, after)
         if step is not None:
@@ -462,7 +451,7 @@ def _pair_step(
     evidence, before, typical = trial.evidence, trial.before, trial.evidence.typical_px
     entered, fitted = _with(evidence, pair.candidate)
     p_values = [_p_value(evidence, fitted, member, entered.profile, model.profile) for member in members]
-    if max(p_values) >= MAX_P:
+    if not all(map(POINT_LEVELS.significant, p_values)):
         return None
     causes = tuple(
         Accepted(member.name, member.effect, "", before.rms * typical, after.rms * typical, p_value, ())
@@ -486,12 +475,12 @@ def _significant(
     model, fitted = _with(evidence, candidate)
     if candidate.name != "scene_depth" and (candidate.effect is None or candidate.effect.term is None):
         p_value = chance_of(gain)
-        return (model if p_value < FALSE_ALARM else None), p_value
+        return (model if WORD_LEVELS.significant(p_value) else None), p_value
     if candidate.name == "scene_depth":
         p_value = depth_p(fitted, evidence.table(model, JUDGE_POINTS), before.depth_m)
     else:
         p_value = _p_value(evidence, fitted, candidate, model.profile, before)
-    return (model if p_value < MAX_P else None), p_value
+    return (model if POINT_LEVELS.significant(p_value) else None), p_value
 
 
 def _p_value(
@@ -570,7 +559,9 @@ def _conclude(
         leaving = [
             entry
             for entry in accepted
-            if _doubt(evidence, fitted, table, entry, model.profile, nominal_model.profile) > MAX_P
+            if not POINT_LEVELS.significant(
+                _doubt(evidence, fitted, table, entry, model.profile, nominal_model.profile)
+            )
         ]
         if not leaving and (paired or len(accepted) < entered):
             judged = [_rejudged(evidence, model, nominal_model, entry, fitted) for entry in accepted]

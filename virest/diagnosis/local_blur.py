@@ -42,6 +42,7 @@ from virest.diagnosis.local_blur_spectra import (
 )
 from virest.inference.edges import EdgeSettings
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.time_blocks import even_blocks
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -299,4 +300,4 @@ def _motion_px(edges: EdgeWidths, profile: CameraProfile, trajectory: Trajectory
 def time_blocks(time_s: Array, count: int = BLOCKS) -> NDArray[np.intp]:
     """Block (n,) of each residual: equal numbers of distinct stamps in each."""
     stamps = np.unique(time_s)
-    return np.searchsorted(stamps, time_s) * count // max(len(stamps), 1)
+    return even_blocks(np.searchsorted(stamps, time_s), len(stamps), count)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
+from virest.diagnosis.findings import BLUR, HeldOutGain
 from virest.diagnosis.local_blur import (
     LENS_SIGMA_PX,
     LENS_STD_PX,
@@ -23,6 +24,8 @@ from virest.diagnosis.local_blur import (
     time_blocks,
 )
 from virest.diagnosis.local_blur_model import predicted_ratios
+from virest.inference.clustered import scatter
+from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -192,11 +195,12 @@ def judge(observations: BlurObservations, found: BlurFit, trajectory: Trajectory
 
 def held_out(
     observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, effects: Sequence[BlurEffect]
-) -> tuple[float, float]:
+) -> HeldOutGain:
     """Robust rms, px, without and with the effects, fitted on every other time block and judged on the rest."""
-    odd = time_blocks(observations.time_s) % 2 == 1
-    before, after = (fit(observations, profile, trajectory, chosen, ~odd) for chosen in ((), effects))
-    return judge(observations, before, trajectory, odd), judge(observations, after, trajectory, odd)
+    even, odd = halves(time_blocks(observations.time_s))
+    before, after = (fit(observations, profile, trajectory, chosen, even) for chosen in ((), effects))
+    before_px, after_px = (judge(observations, one, trajectory, odd) for one in (before, after))
+    return HeldOutGain(BLUR, before_px, after_px, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,11 +276,7 @@ class _Problem:
         which coding changes too.
         """
         block = time_blocks(self.observations.time_s)[self.use]
-        gradients = np.stack(
-            [(jacobian[block == b] * (weight * residual)[block == b, None]).sum(axis=0) for b in np.unique(block)]
-        )
-        count = len(gradients)
-        meat = gradients.T @ gradients * count / max(count - 1, 1) + np.diag(self.precision)
+        meat = scatter(jacobian * (weight * residual)[:, None], block) + np.diag(self.precision)
         inverse = np.linalg.pinv(self._hessian(jacobian, weight))
         by_damping = (self.residual(theta, 1.0 + _DAMPING_STEP) - residual) / _DAMPING_STEP
         pulled = inverse @ (jacobian.T @ (weight * by_damping)) * np.hypot(self.observations.damping_std, 2 * PATH_STD)

@@ -18,7 +18,9 @@ from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
 from virest.inference.chance import chi2_tail, normal_deviate
+from virest.inference.clustered import raised, scatter
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.time_blocks import halves, varied_blocks
 
 _CAUCHY = 2.5
 """Residuals, in noises, at which the weight has fallen to a half."""
@@ -53,6 +55,8 @@ NEIGHBOURS = 3.0
 BLOCKS_S = 0.3
 """About the length of a block of frames: longer than a hand's sway keeps its direction, and than the encoder's memory
 of a picture that moves."""
+BLOCK_LENGTHS = (1.0, 0.7, 1.25, 0.85, 1.4)
+"""Of the blocks in turn, times BLOCKS_S."""
 RESOLUTION = {"vignetting": 0.006, "flicker": 0.004, "response_curve": 0.01, "black_level": 0.002, "gain_drift": 0.003}
 """Part of every standard deviation: smaller values are not told from what encoders and slightly textured patches do,
 whatever the statistics say."""
@@ -97,31 +101,12 @@ class PhotometricFit:
         raise KeyError(effect_name)
 
 
-@dataclass(frozen=True, slots=True)
-class HeldOut:
-    """What effects gain where they were not fitted."""
-
-    before: float
-    """RMS under the profile without them, grey levels."""
-    after: float
-    noise: float
-    split: str
-    """``time``: fitted on some blocks of frames and judged on the others; ``place``: the same of places."""
-
-    @property
-    def gain(self) -> float | None:
-        """As HeldOutGain has it; None where the measured noise leaves nothing to explain."""
-        return HeldOutGain(PHOTOMETRY, self.before, self.after, self.noise).gain
-
-
 def time_blocks(observations: PhotometricObservations) -> Indices:
-    """Block of each observation, (n,): contiguous frames, about BLOCKS_S long, lengths varied so that nothing beats."""
+    """Block of each observation, (n,): contiguous frames, about BLOCKS_S long."""
     frames = observations.frames
     stamp = np.array([observations.stamp_s[np.argmax(observations.frame == k)] for k in frames])
-    lengths = BLOCKS_S * np.array([1.0, 0.7, 1.25, 0.85, 1.4])
-    edges = stamp[0] + np.cumsum(np.resize(lengths, int(np.ceil(np.ptp(stamp) / lengths.mean())) + len(lengths)))
-    block = np.searchsorted(edges, stamp, side="right")
-    return np.asarray(block[np.searchsorted(frames, observations.frame)], np.intp)
+    block = varied_blocks(stamp, BLOCKS_S * np.array(BLOCK_LENGTHS))
+    return block[np.searchsorted(frames, observations.frame)]
 
 
 def fit_photometry(
@@ -180,25 +165,23 @@ def judge(
     profile: CameraProfile,
     effects: Sequence[PhotometricEffect],
     each: ParallelMap = one_by_one,
-) -> HeldOut:
+) -> HeldOutGain:
     """Fit on one half, judge on the other, and the reverse.
 
     Halves are blocks of time; for effects with a value per frame, which no other frame knows, they are places: a
     frame's gain is found on half its patches and has to hold for the others.
     """
     by_place = any(effect.per_frame for effect in effects)
-    half = (observations.place if by_place else time_blocks(observations)) % 2 == 0
-    halves = [fitted for fitted in (half, ~half) if fitted.any() and not fitted.all()]
-    calls = [(observations, profile, some, fitted) for fitted in halves for some in (effects, ())]
+    both = halves(observations.place if by_place else time_blocks(observations))
+    folds = [fitted for fitted in both if fitted.any() and not fitted.all()]
+    calls = [(observations, profile, some, fitted) for fitted in folds for some in (effects, ())]
     fits = each(fit_photometry, calls)
-    before, after, noise = [], [], []
-    for fitted, fit, without in zip(halves, fits[::2], fits[1::2], strict=True):
+    judged = []
+    for fitted, fit, without in zip(folds, fits[::2], fits[1::2], strict=True):
         held = _seen_twice(observations.subset(~fitted))
-        before.append(normalised_rms(held.with_memory(without.memory), profile))
-        after.append(normalised_rms(held.with_memory(fit.memory), fit.profile)[0])
-        noise.append(before[-1][1])
-    quadratic = [float(np.sqrt(np.mean(np.square(v)))) if v else 0.0 for v in ([b[0] for b in before], after, noise)]
-    return HeldOut(quadratic[0], quadratic[1], quadratic[2], "place" if by_place else "time")
+        before, noise = normalised_rms(held.with_memory(without.memory), profile)
+        judged.append((before, normalised_rms(held.with_memory(fit.memory), fit.profile)[0], noise))
+    return HeldOutGain.of_folds(PHOTOMETRY, judged)
 
 
 def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:
@@ -428,19 +411,19 @@ def _covariance(
     inverse = np.asarray(np.linalg.inv(normal), np.float64)
     by_frame = any(effect.per_frame for effect in effects)
     score = jacobian * (weight * residual)[:, None]
-    spread = _clustered(score, observations.place)
+    spread = scatter(score, observations.place)
     if not by_frame:
-        spread = spread + _clustered(score, time_blocks(observations)) - score.T @ score
+        spread = spread + scatter(score, time_blocks(observations)) - score.T @ score
     white: Array = inverse * max(float(np.sum(weight * residual**2) / np.sum(weight)), 1.0)
     sandwich = inverse @ (spread + prior) @ inverse
     doubt = MEMORY_DOUBT * _memory(values) * _pull_of_memory(normal)
     lag = LAG_DOUBT * _changes(observations, effects, values)
     model = np.outer(doubt, doubt) + np.diag(lag**2) + _resolution(observations, profile, effects, values)
     if not by_frame:
-        return _at_least(sandwich, white) + model
+        return raised(sandwich, white) + model
     shared, frames = np.ones(len(values)), _centring(effects)
     shared[:-1][np.diag(frames)[:-1] < 1] = SHARED_ERRORS
-    return frames @ (_at_least(white * np.outer(shared, shared), sandwich) + model) @ frames.T
+    return frames @ (raised(white * np.outer(shared, shared), sandwich) + model) @ frames.T
 
 
 def _resolution(
@@ -511,20 +494,3 @@ def _pull_of_memory(normal: Array) -> Array:
     if len(normal) > 1:
         pull[:-1] = -np.linalg.solve(normal[:-1, :-1], normal[:-1, -1])
     return pull
-
-
-def _clustered(score: Array, cluster: Indices) -> Array:
-    """Sum over clusters of the outer product of their summed scores, corrected for a small number of clusters."""
-    dense = np.unique(cluster, return_inverse=True)[1]
-    sums = np.stack([np.bincount(dense, column) for column in score.T], axis=-1).astype(np.float64)
-    count = len(sums)
-    return np.asarray(sums.T @ sums * (count / max(count - 1, 1)), np.float64)
-
-
-def _at_least(covariance: Array, floor: Array) -> Array:
-    """Raise variances that lie below those of white noise to theirs; correlations stay."""
-    have, need = np.diag(covariance), np.diag(floor)
-    if np.any(have <= 0):
-        return floor
-    grow = np.sqrt(np.maximum(need / have, 1.0))
-    return np.asarray(covariance * np.outer(grow, grow), np.float64)

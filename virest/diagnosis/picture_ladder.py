@@ -18,7 +18,6 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
-from virest.diagnosis.catalogue import MAX_P
 from virest.diagnosis.curve_from_blur import (
     MixingEstimate,
     MixingEvidence,
@@ -29,10 +28,11 @@ from virest.diagnosis.curve_from_blur import (
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
-from virest.diagnosis.photometry_fit import HeldOut, PhotometricFit, fit_photometry, judge, significance
+from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
+from virest.diagnosis.selection import BLUR_LEVELS, LIGHT_LEVELS, MIXING_LEVELS
 from virest.effects.table import EFFECTS
-from virest.inference.chance import normal_deviate, student_tail
+from virest.inference.chance import normal_tail, student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
@@ -41,10 +41,6 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
-MIN_GAIN = 0.15
-"""Least part of the excess over the noise that a cause of brightness must take away on held-out blocks."""
-LEAST_FALL = 0.02
-"""Least part of the held-out mean square that it takes away, where the noise measured leaves no excess."""
 MAX_RUNGS = 3
 WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130
 """Brightness is judged in every frame of a short capture, and in one stretch of a longer one: patches hang together
@@ -60,22 +56,14 @@ curve:
 a black level would only absorb that."""
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
-MIXING_P = 1.5e-3
-MIXING_LEAST = {"response_curve": 0.05, "black_level": 0.02}
-"""Smallest change of the curve that is named from mixing: of the logarithm of gamma, of black level."""
 MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
-BLUR_Z = normal_deviate(MAX_P / 2)
-"""Deviations from no change of exposure or defocus at which the two-sided probability is MAX_P."""
-MIN_DEFOCUS_PX = 0.5
 SOFT_Z = 5.0
-"""Above this many deviations, note possible defocus; report it as a cause only above twice BLUR_Z, since lenses
-vary."""
-MIN_EXPOSURE_CHANGE = 0.08
+"""Above this many deviations, note possible defocus; lenses vary, so as a cause it must be more significant."""
 
 SENTENCES = {name: effect.sentence for name, effect in EFFECTS.items() if effect.seen_in in (PHOTOMETRY, BLUR)}
 
 
-Mixed = tuple[MixingEstimate, HeldOut]
+Mixed = tuple[MixingEstimate, HeldOutGain]
 """A change of the curve that blur shows, and what it gains."""
 
 
@@ -215,12 +203,12 @@ def _rung(
     for name in order[:2]:
         effect = next(e for e in effects if e.name == name)
         p_value = significance(fits[name], name, observations)[1]
-        if fits[name].cost >= plain.cost or p_value > MAX_P or (name in CURVE and fits[name].memory > MOST_KEPT):
+        forgetful = name not in CURVE or fits[name].memory <= MOST_KEPT
+        if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not forgetful:
             continue
         held_out = judge(observations, nominal, [*accepted, effect], each)
         log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
-        enough = held_out.gain is None or held_out.gain > MIN_GAIN
-        if enough and held_out.after**2 < (1 - LEAST_FALL) * held_out.before**2:
+        if LIGHT_LEVELS.gains(held_out):
             return replace(nothing, entered=name), effect, fits[name]
     return nothing, None, plain
 
@@ -233,7 +221,7 @@ def _still_needed(
 ) -> tuple[list[PhotometricEffect], PhotometricFit]:
     """Without causes that a later one made superfluous: free gains take up whatever else changes frames' brightness."""
     for effect in accepted[:-1]:
-        if significance(fitted, effect.name, observations)[1] > MAX_P:
+        if not LIGHT_LEVELS.significant(significance(fitted, effect.name, observations)[1]):
             accepted = [other for other in accepted if other is not effect]
             fitted = fit_photometry(observations, nominal, accepted)
     return accepted, fitted
@@ -244,13 +232,12 @@ def _finding(
     nominal: CameraProfile,
     fitted: PhotometricFit,
     effect: PhotometricEffect,
-    held: HeldOut,
+    held: HeldOutGain,
 ) -> Finding:
     std = np.sqrt(np.diag(fitted.of(effect.name)[1]))
     changes = changes_of(values_of(effect, nominal), values_of(effect, fitted.profile), std, frames_of(fitted))
     p_value = significance(fitted, effect.name, observations)[1]
-    gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
-    return Finding(effect.name, changes, gain, (), p_value, sentence_of(effect.name, changes))
+    return Finding(effect.name, changes, held, (), p_value, sentence_of(effect.name, changes))
 
 
 def values_of(effect: PhotometricEffect, profile: CameraProfile) -> dict[str, Any]:
@@ -335,8 +322,7 @@ def name_curve(verdict: PictureVerdict, evidence: MixingEvidence) -> None:
     rivals = tuple(Rival(other, sure[other][1].after) for other in sure if other != name)
     before = _value_of_curve(verdict.profile, name)
     changes = {MIXING_PARAMETER[name]: ParameterChange(before, estimate.value, estimate.std)}
-    gain = HeldOutGain(PHOTOMETRY, held.before, held.after, held.noise)
-    verdict.findings.append(Finding(name, changes, gain, rivals, estimate.p_value, sentence_of(name, changes)))
+    verdict.findings.append(Finding(name, changes, held, rivals, estimate.p_value, sentence_of(name, changes)))
     curve = _curve(verdict.profile)
     is_black = name == "black_level"
     curve = replace(curve, black_level=estimate.value) if is_black else replace(curve, extra_gamma=estimate.value)
@@ -354,8 +340,8 @@ def _is_sure(found: Mixed, name: str, profile: CameraProfile) -> bool:
     estimate, held = found
     now = _value_of_curve(profile, name)
     size = estimate.value - now if name == "black_level" else abs(np.log(estimate.value / now))
-    gains = held.gain is not None and held.gain > MIN_GAIN
-    return bool(estimate.p_value < MIXING_P and size > MIXING_LEAST[name] and gains)
+    levels = MIXING_LEVELS
+    return levels.significant(estimate.p_value) and levels.matters(name, float(size)) and levels.gains(held)
 
 
 def _value_of_curve(profile: CameraProfile, name: str) -> float:
@@ -399,9 +385,9 @@ def climb_blur(
     named = []
     scale, sigma = float(fitted.values[0][0]), float(fitted.values[1][0])
     std = fitted.std
-    if fitted.determined[0] and (is_exposure or _is_exposure(scale, float(std[0]))):
+    if fitted.determined[0] and (is_exposure or _is_named("exposure_time", abs(np.log(scale)), float(std[0]) / scale)):
         named.append(0)
-    if fitted.determined[1] and sigma > MIN_DEFOCUS_PX and sigma**2 > BLUR_Z * 2 * sigma * float(std[1]):
+    if fitted.determined[1] and _is_named("defocus", sigma, 2 * float(std[1])):
         named.append(1)
     if 1 not in named and fitted.determined[1] and sigma > SOFT_Z * float(std[1]):
         soft = float(np.hypot(sigma, fitted.nuisance[0]))
@@ -410,22 +396,21 @@ def climb_blur(
         )
     for k in named:
         alone = tuple(effects[j] for j in named)
-        before, after = local_blur_fit.held_out(observations, profile, trajectory, alone)
+        held = local_blur_fit.held_out(observations, profile, trajectory, alone)
         changes = _blur_change(k, profile, scale, sigma, std)
         z = abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / (2 * std[1])
         p_value = (2 if k == 0 else 1) * student_tail(z, local_blur.BLOCKS - 1)
         name = effects[k].name
-        verdict.findings.append(
-            Finding(name, changes, HeldOutGain(BLUR, before, after, None), (), p_value, sentence_of(name, changes))
-        )
-        verdict.rungs.append(Rung(name, {name: after}, before, BLUR))
+        verdict.findings.append(Finding(name, changes, held, (), p_value, sentence_of(name, changes)))
+        verdict.rungs.append(Rung(name, {name: held.after}, held.before, BLUR))
         values = np.array([scale]) if k == 0 else np.array([sigma])
         verdict.profile = effects[k].apply(verdict.profile, values)
     return verdict, is_exposure
 
 
-def _is_exposure(scale: float, std: float) -> bool:
-    return abs(np.log(scale)) > max(MIN_EXPOSURE_CHANGE, BLUR_Z * std / scale)
+def _is_named(name: str, change: float, std: float) -> bool:
+    """Whether a change that blur shows is significant, two-sided, and large enough."""
+    return BLUR_LEVELS.matters(name, change) and BLUR_LEVELS.significant(2 * normal_tail(change / std))
 
 
 def _exposure_holds(fitted: local_blur_fit.BlurFit, hypothesis: float | None) -> bool:

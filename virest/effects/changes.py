@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -71,6 +72,31 @@ def delay_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
 def lengthen_readout(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] seconds to the readout, the first row kept where it was."""
     return with_shutter(profile, readout_time_s=max(profile.shutter.readout_time_s + float(v[0]), 0.0))
+
+
+def keep_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+    """Put the given readout back, the picture's middle row kept where it was."""
+    middle = (profile.time_offset_s or 0.0) + 0.5 * profile.shutter.readout_time_s
+    readout_time_s, direction = given.shutter.readout_time_s, given.shutter.readout_direction
+    back = with_shutter(profile, readout_time_s=readout_time_s, readout_direction=direction)
+    return replace(back, time_offset_s=middle - 0.5 * readout_time_s)
+
+
+def keep_lens(*names: str) -> Callable[[CameraProfile, CameraProfile], CameraProfile]:
+    """A function that puts these values of a given lens back; where none was given, there is none."""
+
+    def keep(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+        lens, before = profile.intrinsics, given.intrinsics
+        if lens is None or before is None:
+            return replace(profile, intrinsics=before)
+        return replace(profile, intrinsics=replace(lens, **{name: getattr(before, name) for name in names}))
+
+    return keep
+
+
+def keep_value(name: str) -> Callable[[CameraProfile, CameraProfile], CameraProfile]:
+    """A function that puts a given value back."""
+    return lambda profile, given: replace(profile, **{name: getattr(given, name)})
 
 
 def add_readout(profile: CameraProfile, v: Array) -> CameraProfile:

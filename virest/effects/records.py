@@ -58,6 +58,26 @@ class Choice:
 
 
 @dataclass(frozen=True, slots=True)
+class Calibrated:
+    """How ``virest calibrate`` prints, keeps and judges the value that an effect's steps are fitted to."""
+
+    name: str
+    """Of the value, as in ``estimates``."""
+    read: Callable[[CameraProfile], float | list[float] | None]
+    """None: not known, or counted from where it began."""
+    keep: Callable[[CameraProfile, CameraProfile], CameraProfile]
+    """The first profile with this value of the second."""
+    max_std: float
+    """Of the steps; a value known no better is not determined and stays where it was."""
+    option: str = ""
+    """Of ``--with``; empty: it is always fitted."""
+    believable: float = np.inf
+    """Held fixed: a larger change absorbs something else, such as a stabiliser or stamps of another meaning."""
+    is_factor: bool = False
+    """Steps are natural logarithms of a factor."""
+
+
+@dataclass(frozen=True, slots=True)
 class Effect:
     """One way in which a camera differs from its profile."""
 
@@ -75,6 +95,8 @@ class Effect:
     steps: Steps | None = None
     """None: not fitted to points, or not by steps of a profile."""
     choice: Choice | None = None
+    calibrated: Calibrated | None = None
+    """None: no value of ``virest calibrate``."""
     applied: Callable[[CameraProfile], str] = lambda profile: ""
     """What restoring makes of it; empty: the profile does not have it, or states it as one of its plain values."""
 

@@ -16,7 +16,7 @@ from virest.camera.gyro_filter import delay_s
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import READOUT_DIRECTIONS, STAMP_FRACTION
 from virest.effects import changes as by
-from virest.effects.records import BLUR, EDGES, GEOMETRY, PHOTOMETRY, Choice, Effect, Parameter, Steps
+from virest.effects.records import BLUR, EDGES, GEOMETRY, PHOTOMETRY, Calibrated, Choice, Effect, Parameter, Steps
 
 Array = NDArray[np.float64]
 INF = float("inf")
@@ -78,6 +78,11 @@ def _applied(size: str, text: str) -> Callable[[CameraProfile], str]:
     return lambda profile: text.format(e=profile.extensions) if getattr(profile.extensions, size) else ""
 
 
+GYRO_SCALE_OFF = 0.15
+"""Makers trim gyroscopes to 3 % (BMI160, LSM6DSO, ICM-20602: sensitivity tolerance); five times that is a fault."""
+CLOCK_SKEW_OFF = 0.02
+"""Crystals keep 1e-4, recorders that write another clock's rate 0.5 %."""
+
 _POINTS = (
     Effect(
         "time_offset",
@@ -95,6 +100,7 @@ _POINTS = (
             2.0,
             tuple((0.02 * k,) for k in (-3, -2, -1, 1, 2, 3)),
         ),
+        calibrated=Calibrated("time_offset_s", lambda p: p.time_offset_s, lambda p, given: p, 0.002),
     ),
     Effect(
         "clock_skew",
@@ -112,6 +118,9 @@ _POINTS = (
             0.03,
             ((-0.003,), (0.003,)),
         ),
+        calibrated=Calibrated(
+            "clock_skew", lambda p: p.clock_skew, by.keep_value("clock_skew"), 0.0015, "clock-skew", CLOCK_SKEW_OFF
+        ),
     ),
     Effect(
         "readout_time",
@@ -128,6 +137,9 @@ _POINTS = (
             (INF,),
             0.06,
             ((0.008,), (-0.008,)),
+        ),
+        calibrated=Calibrated(
+            "readout_time_s", lambda p: p.shutter.readout_time_s if p.readout_known else None, by.keep_readout, 0.002
         ),
     ),
     Effect(
@@ -156,6 +168,15 @@ _POINTS = (
         "the exposure lasts longer or shorter than logged",
         "the true exposure is {exposure_scale} times the logged one",
         Steps(by.scale_exposure, _log_ratio(lambda p: p.shutter.exposure_scale), (0.05,), (0.3,), (0.7,), 1.5),
+        calibrated=Calibrated(
+            "exposure_scale",
+            lambda p: p.shutter.exposure_scale,
+            lambda p, given: by.with_shutter(p, exposure_scale=given.shutter.exposure_scale),
+            0.25,
+            "exposure-scale",
+            1.0,
+            True,
+        ),
     ),
     Effect(
         "gyro_bias",
@@ -165,6 +186,9 @@ _POINTS = (
         "the gyroscope reads a rate at rest",
         "the gyroscope reads {gyro_bias_rad_s} rad/s at rest",
         Steps(by.add_bias, _difference(lambda p: p.gyro_bias_rad_s), (1e-3,) * 3, (0.05,) * 3, (0.1,) * 3, 0.5),
+        calibrated=Calibrated(
+            "gyro_bias_rad_s", lambda p: list(p.gyro_bias_rad_s), by.keep_value("gyro_bias_rad_s"), 0.006
+        ),
     ),
     Effect(
         "gyro_scale",
@@ -174,6 +198,15 @@ _POINTS = (
         "the gyroscope reads too much or too little",
         "the gyroscope's rates are {gyro_scale} times the true ones",
         Steps(by.scale_gyro, _log_ratio(lambda p: p.gyro_scale[0]), (1e-3,), (0.1,), (0.3,), 0.4),
+        calibrated=Calibrated(
+            "gyro_scale",
+            lambda p: p.gyro_scale[0],
+            by.keep_value("gyro_scale"),
+            0.02,
+            "gyro-scale",
+            GYRO_SCALE_OFF,
+            True,
+        ),
     ),
     Effect(
         "gyro_lowpass",
@@ -201,6 +234,7 @@ _POINTS = (
         "the gyroscope's axes are turned against the camera's",
         "the inertial sensor sits turned by {rotation_rad} rad against the camera",
         Steps(by.rotate_imu, by.rotation_between, (1e-3,) * 3, (0.1,) * 3, (INF,) * 3, 1.0),
+        calibrated=Calibrated("rotation_rad", lambda p: None, by.keep_value("r_cam_imu"), 0.01),
     ),
     Effect(
         "focal_length",
@@ -210,6 +244,15 @@ _POINTS = (
         "the focal length is another",
         "the focal length is {focal_scale} times the profile's",
         Steps(by.scale_focal, _log_ratio(_focal), (1e-3,), (0.1,), (0.5,), 0.5),
+        calibrated=Calibrated(
+            "fx_px",
+            lambda p: p.intrinsics.fx_px if p.intrinsics else None,
+            by.keep_lens("fx_px", "fy_px"),
+            0.02,
+            "focal",
+            0.2,
+            True,
+        ),
     ),
     Effect(
         "pixel_aspect",
@@ -238,6 +281,7 @@ _POINTS = (
         "the lens bends straight lines",
         "the lens bends rays by k1 = {k1}",
         Steps(by.add_k1, _difference(by.k1_of), (1e-3,), (0.1,), (0.5,), 0.8),
+        calibrated=Calibrated("k1", by.k1_of, by.keep_lens("model", "coefficients"), 0.03, "distortion", 0.3),
     ),
     Effect(
         "principal_point",
@@ -247,6 +291,14 @@ _POINTS = (
         "the optical axis meets the picture elsewhere",
         "the optical axis meets the picture {offset_px} px from where the profile says",
         Steps(by.shift_principal_point, by.principal_shift, (1.0, 1.0), (20.0, 20.0), (200.0, 200.0), 300.0),
+        calibrated=Calibrated(
+            "principal_point_px",
+            lambda p: [p.intrinsics.cx_px, p.intrinsics.cy_px] if p.intrinsics else None,
+            by.keep_lens("cx_px", "cy_px"),
+            12.0,
+            "principal-point",
+            100.0,
+        ),
     ),
     Effect(
         "stabilisation",

@@ -7,7 +7,7 @@ and skew; readout and true exposure last as long as the profile says, in seconds
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,3 +70,23 @@ class RowClock:
     def camera_time_s(self, imu_time_s: Any) -> Any:
         """Camera clock of an IMU time: the inverse of :meth:`CameraProfile.imu_time_s`."""
         return self.profile.camera_time_s(imu_time_s)
+
+
+def right_way_round(profile: CameraProfile) -> CameraProfile:
+    """A negative readout along one sense is a positive one along the other: t₀' = t₀ + r (1 − 1 / rows)."""
+    shutter = profile.shutter
+    if shutter.readout_time_s >= 0:
+        return profile
+    opposite = {
+        "top_to_bottom": "bottom_to_top",
+        "bottom_to_top": "top_to_bottom",
+        "left_to_right": "right_to_left",
+        "right_to_left": "left_to_right",
+    }[shutter.readout_direction]
+    rows = profile.width if shutter.reads_columns else profile.height
+    moved = row_time_s(0.0, shutter.readout_time_s, 1 - 1 / rows)
+    return replace(
+        profile,
+        time_offset_s=(profile.time_offset_s or 0.0) + moved,
+        shutter=replace(shutter, readout_time_s=-shutter.readout_time_s, readout_direction=opposite),
+    )

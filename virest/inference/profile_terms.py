@@ -11,9 +11,6 @@ from virest.inference.track_fit import Term
 
 __all__ = ["TERMS", "add_readout", "rotate_imu", "shift_offset"]
 
-GYRO_SCALE_OFF = 0.15
-"""Makers trim gyroscopes to 3 % (BMI160, LSM6DSO, ICM-20602: sensitivity tolerance); five times that is a fault."""
-
 TERMS = {
     name: Term(name, steps.change, steps.quotient, steps.limit, steps.prior_std)
     for name, steps in ((effect.name, effect.steps) for effect in EFFECTS.values())

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.report.figures import as_file, canvas
+from virest.restoration.parameters import TileBlur
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -134,11 +135,8 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], title: str
     axes.set_title(title, fontsize=9)
 
 
-def preview_figure(recorded: Picture, restored: Picture, tiles: Sequence[dict[str, Any]], title: str) -> bytes:
-    """Recorded, restored, and the recorded frame again under arrows along its blur.
-
-    tiles: ``centre_px``, ``angle_rad``, ``length_px`` of each, as the log has them.
-    """
+def preview_figure(recorded: Picture, restored: Picture, tiles: Sequence[TileBlur], title: str) -> bytes:
+    """Recorded, restored, and the recorded frame again under arrows along its blur."""
     height, width = recorded.shape[:2]
     tall = 6.0 if height > width else 4.0
     figure = canvas(3 * tall * width / height + 0.3, tall + 0.7)
@@ -147,13 +145,12 @@ def preview_figure(recorded: Picture, restored: Picture, tiles: Sequence[dict[st
         axes.imshow(picture)
         axes.set_title(name, fontsize=10)
         axes.set_axis_off()
-    known = [tile for tile in tiles if tile["length_px"] is not None]
-    longest = max((tile["length_px"] for tile in known), default=0.0)
+    longest = max((tile.length_px for tile in tiles), default=0.0)
     if longest > 0:
         scale = max(1.0, float(np.floor(0.12 * min(height, width) / longest)))
-        x, y = np.array([tile["centre_px"] for tile in known]).T
-        length = scale * np.array([tile["length_px"] for tile in known])
-        angle = np.array([tile["angle_rad"] for tile in known])
+        x, y = np.array([tile.centre_px for tile in tiles]).T
+        length = scale * np.array([tile.length_px for tile in tiles])
+        angle = np.array([tile.angle_rad for tile in tiles])
         u, v = length * np.cos(angle), length * np.sin(angle)
         right.quiver(x - u / 2, y - v / 2, u, v, angles="xy", scale_units="xy", scale=1, color="gold", width=0.006)
         right.set_title(f"blur × {scale:g}, up to {longest:.1f} px", fontsize=10)

@@ -155,12 +155,12 @@ def restore_frames(
             yield copied_frame(frame, picture, profile, plan.copy_reason or FOCAL_UNKNOWN, undistort=undistort)
             continue
         if here.outside:
-            yield RestoredFrame(frame, "skipped", None, (here.outside,), parameters=unknown_parameters(profile))
+            yield RestoredFrame(frame, "skipped", None, (here.outside,), degradation=unknown_parameters(profile))
             continue
         reason = plan.copy_reason or untrusted_reason(motion)
         if reason:
-            said = degradation_parameters(motion, trajectory, plan.settings)
-            yield copied_frame(frame, picture, profile, reason, said, undistort=undistort)
+            found = degradation_parameters(motion, trajectory)
+            yield copied_frame(frame, picture, profile, reason, found, undistort=undistort)
             continue
         seen = None
         if plan.contradicted is not None:

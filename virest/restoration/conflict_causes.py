@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
+from virest.effects.table import GYRO_SCALE_OFF
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import Term
@@ -131,7 +132,7 @@ CAUSES = (
         GYROSCOPE,
         terms_of.GYRO_SCALE,
         _gyro_scales,
-        lambda given, found: abs(found.gyro_scale[0] - 1) < terms_of.GYRO_SCALE_OFF,
+        lambda given, found: abs(found.gyro_scale[0] - 1) < GYRO_SCALE_OFF,
         lambda given, found: float(np.log(_gyro_ratio(given, found))),
         _with_gyro_scale,
         lambda given, found, std: (

@@ -15,7 +15,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.image_formation.blur import tile_grid
-from virest.image_formation.kernel_spread import kernel_spread
+from virest.image_formation.kernel_spread import KernelSpread, kernel_spread
 from virest.image_formation.kernels import KernelField, blur_chords, smooth_field
 from virest.image_formation.light import FrameLight, equivalent_length_px, frame_light
 from virest.image_formation.row_motion import RowMotion
@@ -27,9 +27,16 @@ from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.neighbours.confirmation import ConfirmedGain
-from virest.restoration.neighbours.joint import NeighbourPicture, joined_neighbours, still_part
+from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, still_part
 from virest.restoration.neighbours.refinement import RefinedMotion
-from virest.restoration.parameters import degradation_parameters, unknown_parameters
+from virest.restoration.parameters import (
+    Deblurring,
+    DegradationParameters,
+    JoinedNeighbour,
+    Json,
+    degradation_parameters,
+    unknown_parameters,
+)
 from virest.restoration.row_chunks import RowRenderer, bands
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
@@ -74,14 +81,19 @@ class RestoredFrame:
     """x0, y0, x1, y1, the last two one past the end: the rectangle of real data."""
     exposure_s: float | None = None
     """True exposure: logged × scale."""
-    parameters: dict[str, Any] = field(default_factory=dict)
-    """motion, depth_m, depth_source, blur, shutter, response, deblur: the log's line."""
+    degradation: DegradationParameters | None = None
+    """What was found out about the frame and done about it; None where it was not looked at."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent: estimate, deblur, shutter."""
     source_px: NDArray[np.float32] | None = None
     """(height, width, 2) where in the recorded picture each pixel came from; None: from its own place."""
     undistorted: bool = False
     """Whether the picture is a pinhole's: the lens's distortion was undone."""
+
+    @property
+    def parameters(self) -> Json:
+        """``degradation`` with the keys of ``parameters.jsonl``, for users; empty where there is none."""
+        return {} if self.degradation is None else self.degradation.as_json()
 
 
 def restore_frame(
@@ -111,9 +123,8 @@ def restore_frame(
             seen = _exposed_as(motion, seen)
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
-    parameters = degradation_parameters(motion, trajectory, settings)
-    longest_px = max(tile["length_px"] for tile in parameters["blur"]["tiles"])
-    longest_px = float(equivalent_length_px(motion.profile, longest_px))
+    found = degradation_parameters(motion, trajectory)
+    longest_px = float(equivalent_length_px(motion.profile, found.blur.longest_px))
     method, why_not = deblur_method(motion, settings, longest_px)
     if seen is not None and method != "none" and deblurring_loses(motion, seen):
         method, why_not = "none", (OTHER_BLUR,)
@@ -122,19 +133,18 @@ def restore_frame(
     light = frame_light(motion, anchor, straighten and motion.profile.readout_known)
     clock.lap("estimate")
     restored: NDArray[Any] = picture
-    parameters["deblur"] = {"method": "none"}
+    deblurring: Deblurring | None = None
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-        restored, parameters["deblur"], why_not = _deblurred(
-            picture, motion, settings, anchor, longest_px, light, covariance_px2, confirmed, neighbours, unmasked
-        )
+        blur = _FrameBlur(motion, anchor, longest_px, covariance_px2, light)
+        restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
     clock.lap("deblur")
-    source = _source_map(motion, settings, anchor, parameters["deblur"]["method"]) if straighten else None
+    source = _source_map(motion, settings, anchor, deblurring is not None) if straighten else None
     if seen is not None and source is not None and straightening_loses(motion, seen, anchor):
         source, why_not = None, (*why_not, OTHER_ROWS)
-    parameters["shutter"]["method"] = settings.shutter if source is not None else "none"
+    shutter = replace(found.shutter, method=settings.shutter if source is not None else "none")
     status = "copied" if restored is picture and source is None else "restored"
     if source is None:
         source = _lens_map(motion.profile, settings.undistort)
@@ -142,9 +152,7 @@ def restore_frame(
     if source is not None:
         valid_px = valid_rectangle(source)
         if not any(valid_px):
-            return copied_frame(
-                frame, picture, motion.profile, NOTHING_LEFT, parameters, undistort=settings.undistort
-            )  # fmt: skip
+            return copied_frame(frame, picture, motion.profile, NOTHING_LEFT, found, undistort=settings.undistort)
         restored = warp(restored, source)
     elif restored.dtype != np.uint8:
         restored = rounded(restored)
@@ -152,8 +160,8 @@ def restore_frame(
     warnings = (*_limits(motion), *why_not)
     undistorted = settings.undistort and motion.optics.lens.is_distorted
     return RestoredFrame(
-        frame, status, restored, warnings, valid_px, motion.exposure_s or None, parameters, clock.seconds, source,
-        undistorted,
+        frame, status, restored, warnings, valid_px, motion.exposure_s or None,
+        replace(found, shutter=shutter, deblur=deblurring), clock.seconds, source, undistorted,
     )  # fmt: skip
 
 
@@ -185,13 +193,13 @@ def copied_frame(
     picture: NDArray[np.uint8],
     profile: CameraProfile,
     reason: str,
-    parameters: dict[str, Any] | None = None,
+    found: DegradationParameters | None = None,
     *,
     undistort: bool = False,
 ) -> RestoredFrame:
-    """The decoded pixels unchanged, and why.  undistort: but for the lens's distortion, as in a run's other pictures.
+    """The decoded pixels unchanged, and why.  found: of a frame of which nothing was undone; None: not known.
 
-    The lens is then the profile's, at stamp_0.
+    undistort: but for the lens's distortion, as in a run's other pictures.  The lens is then the profile's, at stamp_0.
     """
     height, width = picture.shape[:2]
     clock, valid_px, source = _Clock(), (0, 0, width, height), _lens_map(profile, undistort)
@@ -199,10 +207,9 @@ def copied_frame(
         picture, valid_px = warp(picture, source), valid_rectangle(source)
         clock.lap("shutter")
     exposure_s = profile.shutter.true_exposure_s(frame.exposure_s) if frame.exposure_s else None
-    details = {**unknown_parameters(profile), **(parameters or {}), "deblur": {"method": "none"}}
-    details["shutter"] = {**details["shutter"], "method": "none"}
+    found = found or unknown_parameters(profile)
     return RestoredFrame(
-        frame, "copied", picture, (reason,), valid_px, exposure_s, details, clock.seconds, source, source is not None
+        frame, "copied", picture, (reason,), valid_px, exposure_s, found, clock.seconds, source, source is not None
     )
 
 
@@ -212,12 +219,12 @@ def _lens_map(profile: CameraProfile, undistort: bool) -> NDArray[np.float32] | 
 
 
 def _source_map(
-    motion: RowMotion, settings: RestorationSettings, anchor: float, deblurred: str
+    motion: RowMotion, settings: RestorationSettings, anchor: float, deblurred: bool
 ) -> NDArray[np.float32] | None:
     """Where each pixel of the output was recorded; None where nothing would move."""
     corners = corner_points(motion.profile.width, motion.profile.height)
     moved_px = np.abs(straightened_points(motion, corners, anchor) - corners).max()
-    if deblurred == "none" and (moved_px < MIN_WARP_PX or not motion.profile.readout_known):
+    if not deblurred and (moved_px < MIN_WARP_PX or not motion.profile.readout_known):
         return None
     mapped = perspective_map if settings.shutter == "perspective" else rowwise_map
     return mapped(motion, anchor, undistort=settings.undistort and motion.optics.lens.is_distorted)
@@ -234,88 +241,148 @@ def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: 
     return settings.deblur, ()
 
 
+@dataclass(frozen=True, slots=True)
+class _FrameBlur:
+    """What is known of a frame's blur before its picture is looked at."""
+
+    motion: RowMotion
+    anchor: float
+    """Part of each row's exposure that the restored picture shows."""
+    longest_px: float
+    """Length of the longest path, defocus included."""
+    covariance_px2: NDArray[np.float64]
+    """(2, 2) of the path."""
+    light: FrameLight | None
+    """Flicker and vignetting; None: neither."""
+
+
+@dataclass(frozen=True, slots=True)
+class _BlurStatistics:
+    """What a blurred picture shows of noise and detail, and what undoing the blur is to gain."""
+
+    field: Callable[[NDArray[np.float64]], KernelField]
+    spread: KernelSpread | None
+    luma: PictureStatistics
+    chroma: PictureStatistics
+    luma_model: PictureStatistics
+    """``luma`` with what the kernels are uncertain by."""
+    expected_db: float
+    """By the model, and by the neighbours where they tell."""
+    share: float
+    """Part of the deblurred picture to take."""
+
+
 def _deblurred(
     picture: NDArray[np.uint8],
-    motion: RowMotion,
+    blur: _FrameBlur,
     settings: RestorationSettings,
-    anchor: float,
-    longest_px: float,
-    light: FrameLight | None,
-    covariance_px2: NDArray[np.float64],
     confirmed: ConfirmedGain | None,
     neighbours: NeighbourFinder | None = None,
     unmasked: NDArray[np.uint8] | None = None,
-) -> tuple[NDArray[Any], dict[str, Any], tuple[str, ...]]:
+) -> tuple[NDArray[Any], Deblurring | None, tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
     as_shown, picture = picture, picture if unmasked is None else unmasked
-    height, width = picture.shape[:2]
-    curve = motion.profile.response or ResponseCurve("srgb")
-    centres_px = most_blurred(motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
-    tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
-    field = smooth_field(motion, anchor)
-    luma, chroma = picture_statistics(picture, field(centres_px), curve, tiles)
-    spread = kernel_spread(field, width, height, covariance_px2)
-    luma_model = luma.doubted_by(spread)
-    share = 1.0 if anchor != 0.5 else trusted_share(luma_model)
-    promised_db = luma_model.expected_gain_db
-    expected_db = promised_db
-    if confirmed is not None:  # neighbours have told whether what lies at few places was detail
-        expected_db = confirmed.expected_db(replace(luma_model, places=None).expected_gain_db)
-    why_not = too_little_to_gain(luma_model, expected_db)
+    curve, light = blur.motion.profile.response or ResponseCurve("srgb"), blur.light
+    measured = _blur_statistics(picture, blur, settings, confirmed)
+    why_not = too_little_to_gain(measured.luma_model, measured.expected_db)
     if why_not:
-        return as_shown, {"method": "none"}, (why_not,)
-    blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    found = neighbours(luma, field) if neighbours is not None and light is None and anchor == 0.5 else ()
-    joined = joined_neighbours(found, luma_model)
-    longest_px = max((longest_px, *(one.longest_px for one in joined.places)))
-    if joined.pictures:
-        promised_db = luma_model.joint_gain_db(joined.passed)
-    blurred = replace(blurred, spread=spread, neighbours=joined.pictures, longest_px=longest_px)
-    if light is not None:
-        blurred = _evened(blurred, light)
+        return as_shown, None, (why_not,)
+    blurred = blurred_picture(picture, curve, (measured.luma, measured.chroma), measured.field, blur.longest_px)
+    together = neighbours is not None and light is None and blur.anchor == 0.5
+    found = neighbours(measured.luma, measured.field) if together and neighbours is not None else ()
+    joined = joined_neighbours(found, measured.luma_model)
+    longest_px = max((blur.longest_px, *(one.longest_px for one in joined.places)))
+    blurred = replace(blurred, spread=measured.spread, neighbours=joined.pictures, longest_px=longest_px)
     recorded = picture
     if light is not None:
+        blurred = _evened(blurred, light)
         recorded = encode_picture([as_kept(plane, blurred) for plane in blurred.light], curve)
     if joined.pictures:
         settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
     sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
-    part: NDArray[np.float32] | np.float32 = np.float32(1.0)
-    touched = part
-    if anchor == 0.5:
-        by_tile = settings.deblur not in WHOLE_PICTURE or luma.unevenness > 0
-        touched = blurred_part(motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
-        part, measured = touched * _share_map(blurred, share), measured_share(blurred)
-        part = part if measured is None else part * measured
-        still = still_part(joined.places)
-        if still is not None and still.min() < 1:
-            part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
-        if confirmed is not None:
-            part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.places)))
+    touched, part = _part_taken(blur, settings, blurred, measured, joined, confirmed)
     restored = _mixed(sharp, recorded, part)
-    ideal = luma_model.ideal_error(joined.passed)
-    alone = luma_model.ideal_error(np.zeros_like(joined.passed))
-    gain_db: tuple[float | None, float | None] = (None, None)
-    if confirmed is not None:
-        gain_db = confirmed.of_change_db(_mean_square(restored, recorded), luma_model.blur_error, ideal)
-    details = {
-        "method": settings.deblur,
-        "preset": settings.preset,
-        "iterations": settings.iterations,
-        "strength": settings.strength,
-        "tile_px": settings.tile_px,
-        "noise_grey_levels": luma.noise_levels,
-        "expected_gain_db": gain_db[0],
-        "expected_gain_std_db": gain_db[1],
-        "promised_gain_db": promised_db,
-        "path_std_px": float(np.sqrt(np.trace(covariance_px2) / 2)),
-        "neighbours": [{"frame": one.number, "weight": one.weight} for one in joined.places],
-        "neighbours_gain_db": 10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
-        "share": share,
-        "defocus_sigma_px": motion.profile.extensions.defocus_sigma_px,
-    }
+    changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
+    details = _details(blur, settings, measured, joined, confirmed, changed)
     if unmasked is not None:  # where nothing was blurred the picture stays as it was shown
         restored = _mixed(restored.__getitem__, as_shown, touched)
     return restored, details, ()
+
+
+def _blur_statistics(
+    picture: NDArray[np.uint8], blur: _FrameBlur, settings: RestorationSettings, confirmed: ConfirmedGain | None
+) -> _BlurStatistics:
+    """Noise, detail and kernels of a picture (height, width, 3)."""
+    height, width = picture.shape[:2]
+    curve = blur.motion.profile.response or ResponseCurve("srgb")
+    centres_px = most_blurred(blur.motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
+    tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
+    field = smooth_field(blur.motion, blur.anchor)
+    luma, chroma = picture_statistics(picture, field(centres_px), curve, tiles)
+    spread = kernel_spread(field, width, height, blur.covariance_px2)
+    luma_model = luma.doubted_by(spread)
+    share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)
+    expected_db = luma_model.expected_gain_db
+    if confirmed is not None:  # neighbours have told whether what lies at few places was detail
+        expected_db = confirmed.expected_db(replace(luma_model, places=None).expected_gain_db)
+    return _BlurStatistics(field, spread, luma, chroma, luma_model, expected_db, share)
+
+
+def _part_taken(
+    blur: _FrameBlur,
+    settings: RestorationSettings,
+    blurred: BlurredPicture,
+    measured: _BlurStatistics,
+    joined: JoinedNeighbours,
+    confirmed: ConfirmedGain | None,
+) -> tuple[NDArray[np.float32] | np.float32, NDArray[np.float32] | np.float32]:
+    """Where the picture was blurred, and how much of the deblurred one is taken: 0 to 1 each.
+
+    (height, width), or one number for all.
+    """
+    if blur.anchor != 0.5:
+        return np.float32(1.0), np.float32(1.0)
+    by_tile = settings.deblur not in WHOLE_PICTURE or measured.luma.unevenness > 0
+    touched = blurred_part(blur.motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
+    part, seen = touched * _share_map(blurred, measured.share), measured_share(blurred)
+    part = part if seen is None else part * seen
+    still = still_part(joined.places)
+    if still is not None and still.min() < 1:
+        height, width = blurred.light[0].shape
+        part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
+    if confirmed is not None:
+        part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.places)))
+    return touched, part
+
+
+def _details(
+    blur: _FrameBlur,
+    settings: RestorationSettings,
+    measured: _BlurStatistics,
+    joined: JoinedNeighbours,
+    confirmed: ConfirmedGain | None,
+    changed: float,
+) -> Deblurring:
+    """How a frame was deblurred.  changed: mean square of what restoring changed, grey levels."""
+    model = measured.luma_model
+    ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
+    gain_db = None if confirmed is None else confirmed.of_change_db(changed, model.blur_error, ideal)
+    return Deblurring(
+        method=settings.deblur,
+        preset=settings.preset,
+        iterations=settings.iterations,
+        strength=settings.strength,
+        tile_px=settings.tile_px,
+        noise_grey_levels=measured.luma.noise_levels,
+        expected_gain_db=gain_db[0] if gain_db else None,
+        expected_gain_std_db=gain_db[1] if gain_db else None,
+        promised_gain_db=model.joint_gain_db(joined.passed) if joined.pictures else model.expected_gain_db,
+        path_std_px=float(np.sqrt(np.trace(blur.covariance_px2) / 2)),
+        neighbours=tuple(JoinedNeighbour(one.number, one.weight) for one in joined.places),
+        neighbours_gain_db=10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
+        share=measured.share,
+        defocus_sigma_px=blur.motion.profile.extensions.defocus_sigma_px,
+    )
 
 
 def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:

@@ -35,7 +35,7 @@ class RestorationSettings:
     iterations: int = 4
     """Of the iterative methods."""
     joined_iterations: int = 5
-    """At most so many where a frame is restored with neighbours, which leave less to the prior."""
+    """Iteration limit for frames restored with neighbours: more measurements leave less to the prior."""
     inner_iterations: int = 4
     """Of the whole-picture method: conjugate-gradient steps in each iteration."""
     tile_px: int = 128

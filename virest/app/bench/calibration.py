@@ -24,7 +24,8 @@ from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale
 from virest.app.calibrate import plan_calibration
 from virest.app.simulate import simulate_command
-from virest.calibration.geometry import CalibratedValue, GeometryCalibration, calibrate_geometry
+from virest.calibration.calibrated_values import CalibratedValue
+from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
 from virest.camera.profile import CameraProfile, read_profile
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import VirestError

@@ -196,7 +196,8 @@ def _near_and_far(results: list[RestoredFrame], clipped: Path) -> list[list[floa
     for result in results:
         truth = truth_frame(clipped, result.frame.index)
         white = (truth == 255).any(axis=2)
-        reach = int(np.ceil(result.parameters["blur"]["length_px"])) + CODED_PX
+        length_px = (result.degradation.blur.length_px if result.degradation else None) or 0.0
+        reach = int(np.ceil(length_px)) + CODED_PX
         near = cv2.dilate(white.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
         there = inside(result, truth.shape)
         parts = (there & near & ~white, there & ~near, there)

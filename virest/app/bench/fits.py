@@ -150,7 +150,7 @@ def _promises(
     for preset in LEFT_OVER_PRESETS:
         watched = _Watched(**{f.name: getattr(plan.confirmed, f.name) for f in dataclasses.fields(ConfirmedGain)})
         for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=watched)):
-            if restored.parameters["deblur"]["method"] == "none":
+            if restored.degradation is None or restored.degradation.deblur is None:
                 continue
             changed, lost, ideal = watched.asked[-1]
             before_db, valid_px = straight_db[restored.frame.index]

@@ -1,0 +1,151 @@
+"""The values that a calibration prints and writes: which are known well enough, and what happens to the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.calibration.physical_limits import limit_reasons
+from virest.camera.profile import CameraProfile
+from virest.effects.changes import rotation_between
+from virest.effects.records import Calibrated
+from virest.effects.table import EFFECTS
+from virest.image_formation.row_clock import right_way_round
+from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.track_fit import TrackFit
+
+Array = NDArray[np.float64]
+MIN_STRETCHES = 2.5
+"""A value that rests on fewer stretches of time is a single moment's, and nothing else bears it out."""
+LARGE_CORRELATION = 0.9
+NO_FINDING = "no camera has it"
+ROUGH_OFFSET_S = 0.01
+"""An offset known to this is written, and said to be rough; what is worse tells less than a phone's usual clocks do."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedValue:
+    """One value of the profile, before and after."""
+
+    name: str
+    """As in the profile: time_offset_s, readout_time_s, readout_direction, rotation_rad, gyro_bias_rad_s, fx_px ..."""
+    start: float | list[float] | str | None
+    value: float | list[float] | str | None
+    """Fitted; the start where not determined."""
+    std: float | list[float] | None
+    determined: bool
+    note: str = ""
+    rough: bool = False
+    """Not determined as well as is wanted, and written all the same, with its deviation."""
+    implausible: bool = False
+    """The fit gave a value that no camera has: left at its start."""
+
+
+def calibrated(effect: str) -> Calibrated:
+    """What the table of effects says of the value that a term of this name is fitted to."""
+    found = EFFECTS[effect].calibrated
+    assert found is not None
+    return found
+
+
+def beyond_limits(fit: TrackFit, observed: ObservedTracks) -> dict[str, str]:
+    """Of the fitted terms, those whose values no camera has, and why."""
+    stamps = observed.stamp_s[np.isfinite(observed.stamp_s)]
+    period_s, fitted = float(np.median(np.diff(stamps))), right_way_round(fit.profile)
+    reasons = limit_reasons(fitted, period_s, float(np.median(observed.exposure_s)))
+    return {term.name: reasons[term.name] for term in fit.terms if term.name in reasons}
+
+
+def is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
+    """Known well enough, and not by a single moment alone; a readout within two deviations of 0 has no known sense."""
+    known = bool(np.all(np.sqrt(variance) <= calibrated(name).max_std))
+    if name == "readout_time" and abs(fit.profile.shutter.readout_time_s) < 2 * float(np.sqrt(variance[0])):
+        return False
+    return known and bool(np.all(fit.stretches[fit.slices[name]] >= MIN_STRETCHES))
+
+
+def roughly_known(offset: CalibratedValue, fit: TrackFit) -> CalibratedValue:
+    """An offset that is known roughly, by more than a single moment, says so."""
+    std_s = float(np.max(np.asarray(offset.std, float)))
+    if offset.determined or std_s > ROUGH_OFFSET_S or fit.stretches[fit.slices["time_offset"]][0] < MIN_STRETCHES:
+        return offset
+    return replace(offset, rough=True, note=f"rough: {1e3 * calibrated('time_offset').max_std:g} ms are wanted")
+
+
+def variances_of(fit: TrackFit, bias: dict[str, Array], drift: tuple[float, float]) -> dict[str, Array]:
+    """Variance of each term's values, with what remains of tracking's bias; the offset is that of the first row."""
+    found = {term.name: fit.std(term.name) ** 2 + bias[term.name] ** 2 for term in fit.terms}
+    found["imu_rotation"] = found["imu_rotation"] + (0.5 * drift[0]) ** 2
+    found["gyro_bias"] = found["gyro_bias"] + (drift[0] / drift[1]) ** 2
+    if "readout_time" in found:
+        cross = fit.covariance[fit.slices["time_offset"], fit.slices["readout_time"]][0]
+        first_row = found["time_offset"] + 0.25 * found["readout_time"] - cross
+        found["time_offset"] = np.maximum(first_row, found["time_offset"])
+    return found
+
+
+def held_back(fit: TrackFit, given: CameraProfile, start: CameraProfile, determined: dict[str, bool]) -> CameraProfile:
+    """The fitted profile, with what is not determined put back to where it began: axes to those found coarsely."""
+    profile, before = fit.profile, replace(given, r_cam_imu=start.r_cam_imu)
+    for name in (name for name, known in determined.items() if not known):
+        profile = calibrated(name).keep(profile, before)
+    return profile
+
+
+def value_of(
+    name: str,
+    given: CameraProfile,
+    profile: CameraProfile,
+    fitted: CameraProfile,
+    variance: Array,
+    determined: bool,
+) -> CalibratedValue:
+    """One value; fitted: the profile with what is not determined too, which turns relative deviations into units."""
+    shown = calibrated(name)
+    std = np.sqrt(variance)
+    before, after = shown.read(given), shown.read(profile)
+    if name == "imu_rotation":
+        before, after = [0.0, 0.0, 0.0], rotation_between(given, profile).tolist()
+    if shown.is_factor and isinstance(scale := shown.read(fitted), float):
+        std = std * abs(scale)
+    if name == "readout_time" and determined:
+        after = profile.shutter.readout_time_s
+    stds = std.tolist()
+    return CalibratedValue(shown.name, before, after, stds if len(stds) > 1 else stds[0], determined)
+
+
+def direction_value(given: CameraProfile, profile: CameraProfile, known: bool) -> CalibratedValue:
+    """The readout's direction, a word."""
+    return CalibratedValue(
+        "readout_direction", given.shutter.readout_direction, profile.shutter.readout_direction, None, known
+    )
+
+
+def with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -> CameraProfile:
+    """The profile with its estimates: of values that are known well, or roughly."""
+    source = "tracked points against the inertial data"
+    for value in values:
+        if (value.determined or value.rough) and value.value is not None:
+            profile = profile.with_estimate(value.name, value.value, value.std, source)
+    known = profile.readout_known or any(v.name == "readout_time_s" and v.determined for v in values)
+    return replace(profile, readout_known=known)
+
+
+def correlations_of(fit: TrackFit, variances: dict[str, Array]) -> tuple[tuple[str, str, float], ...]:
+    """Pairs of values whose errors go together, and how far."""
+    names = [
+        f"{calibrated(t.name).name}{'' if len(t) == 1 else '[' + str(k) + ']'}"
+        for t in fit.terms
+        for k in range(len(t))
+    ]
+    count = len(names)
+    total = np.sqrt(np.concatenate([variances[t.name] for t in fit.terms]))
+    correlation = fit.covariance[:count, :count] / np.outer(total, total)
+    rows, columns = np.triu_indices(count, 1)
+    strong = np.abs(correlation[rows, columns]) > LARGE_CORRELATION
+    return tuple(
+        (names[i], names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong], strict=True)
+    )
