@@ -44,7 +44,7 @@ from virest.restoration.settings import PRESETS
 
 log = logging.getLogger(__name__)
 
-SEEDS, DEVICE_SEEDS = 3, 1
+SEEDS = 3
 QUICK_FRAMES, QUICK_DEVICES = 24, 2
 TIMEOUT_S = 600.0
 PARTLY_FAILED = 9
@@ -58,7 +58,7 @@ class SlamOptions:
     command: str | None = None
     """SLAM to be run in COLMAP's place, with its placeholders."""
     seeds: int | None = None
-    """Runs of each sequence; None: SEEDS, and DEVICE_SEEDS for each device."""
+    """Runs of each capture; None: SEEDS, since COLMAP's result on 24 frames varies up to fivefold with its seed."""
     devices: bool = False
     quick: bool = False
     out: Path | None = None
@@ -209,7 +209,7 @@ def _plan_facts(plan: SlamCapture | None) -> dict[str, Any]:
 
 
 def _tasks(captures: Sequence[Path], options: SlamOptions) -> list[_Task]:
-    seeds, device_seeds = options.seeds or (1 if options.quick else SEEDS), options.seeds or DEVICE_SEEDS
+    seeds = options.seeds or (1 if options.quick else SEEDS)
     if captures:
         names = [Path(path).resolve().name for path in captures]
         if len(set(names)) < len(names):
@@ -224,7 +224,7 @@ def _tasks(captures: Sequence[Path], options: SlamOptions) -> list[_Task]:
         plans = tuple(smaller(plan, QUICK_FRAMES) for plan in plans)
     return [
         *(_Task(plan.name, plan, None, seeds, "sequences") for plan in plans),
-        *(_Task(plan.name, plan, None, device_seeds, "devices") for plan in phones),
+        *(_Task(plan.name, plan, None, seeds, "devices") for plan in phones),
     ]
 
 

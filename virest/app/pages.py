@@ -263,6 +263,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="compare and write nothing; exit 1 where a page differs")
     parser.add_argument("--list", action="store_true", help="list the blocks and run nothing")
     options = parser.parse_args(arguments)
+    for page in options.pages:
+        if not (page.is_file() and page.resolve().is_relative_to(ROOT)):
+            parser.error(f"no page of this repository: {page}")
     if options.list:
         console.emit(_listing([block for page in options.pages or pages() for block in blocks(page.resolve())]))
         return 0

@@ -24,7 +24,7 @@ def slam(
             help="Run this SLAM in COLMAP's place: {sequence} {trajectory}, and {settings} {times} {seed} if wanted.",
         ),
     ] = None,
-    seeds: Annotated[int | None, typer.Option(metavar="N", min=1, help="Runs of each. [3; 1 for devices]")] = None,
+    seeds: Annotated[int | None, typer.Option(metavar="N", min=1, help="Runs of each. [3]")] = None,
     devices: Annotated[bool, typer.Option("--devices", help="Eight simulated phones too.")] = False,
     preset: Annotated[
         str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Of the restoration.")
