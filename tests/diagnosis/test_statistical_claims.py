@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from motion.synthetic_tracks import Recording, Setup
 
-from virest.diagnosis.cross_validation import chance_of
 from virest.diagnosis.findings import GEOMETRY, HeldOutGain
 from virest.diagnosis.geometric_conclusion import lag_std_s
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_findings import findings_of
 from virest.diagnosis.geometric_ladder import climb
 from virest.image_formation.point_model import ground
+from virest.inference.chance import chance_of
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.track_fit import many_directions, start_scene
 from virest.report.words import remaining_words, residual_words

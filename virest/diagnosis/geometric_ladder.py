@@ -22,14 +22,12 @@ from virest.diagnosis.cross_validation import (
     Judged,
     Screened,
     best_of_each,
-    chance_of,
     choose,
     judge,
     lagging_gain,
     promising,
     race,
     screen,
-    t_ratio,
 )
 from virest.diagnosis.findings import GEOMETRY, JOINED, Rival, Rung
 from virest.diagnosis.geometric_conclusion import conclude
@@ -38,6 +36,7 @@ from virest.diagnosis.geometric_significance import fitted_with, is_plausible, p
 from virest.diagnosis.geometric_verdict import FINAL_POINTS, Accepted, GeometricVerdict
 from virest.diagnosis.left_open import variance_left_open
 from virest.diagnosis.selection import POINT_LEVELS
+from virest.inference.chance import chance_of, t_ratio
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.recorder_lag import Schedule
 from virest.inference.track_fit import Term

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from virest.calibration.physical_limits import is_depth
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import Candidate
-from virest.diagnosis.cross_validation import JUDGE_POINTS, chance_of
+from virest.diagnosis.cross_validation import JUDGE_POINTS
 from virest.diagnosis.geometric_effects import GeometricEffect
 from virest.diagnosis.geometric_evidence import KNOWN_DEPTH_STD, Evidence, Model, depth_of
 from virest.diagnosis.selection import POINT_LEVELS, WORD_LEVELS
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import right_way_round
-from virest.inference.chance import chi2_tail
+from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.track_fit import TrackFit
 from virest.inference.tracking_bias import bias_std
 
