@@ -75,6 +75,13 @@ def test_a_right_prediction_is_left_as_it_is(simulated):
     assert simulated().plan(PRESETS["fast"]).missing_turn is None
 
 
+def test_lamps_in_every_tile_leave_the_rest_to_judge_by(simulated):
+    """Neighbours confirm deblurring though no tile is free of clipped light."""
+    confirmed = simulated(scene="bright").plan(PRESETS["fast"]).confirmed
+    assert confirmed is not None
+    assert confirmed.share > 0.5
+
+
 @pytest.mark.scenario
 @pytest.mark.parametrize(
     "isp",

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField, smooth_field
 from virest.image_formation.neighbour import NeighbourView, turn_jacobian_px
@@ -41,7 +42,9 @@ FAR_PX = 3.0
 RIVAL_PEAK = 0.8
 """Of two agreements nearly as good the one nearer to the prediction is taken: periodic texture has many."""
 CLIPPED_LIGHT = 0.95
-"""Tiles with brighter places are not judged: light that was clipped cannot be blurred again."""
+"""Brighter places are not judged: light that was clipped cannot be blurred again."""
+LEAST_SEEN = 0.5
+"""Part of a tile that must be seen for it to be judged."""
 LEAST_COHERENCE = 0.5
 """Tiles whose spectra agree less, Σ|Re A*B| over Σ|A||B|, show different things."""
 HUBER = 1.5
@@ -241,8 +244,7 @@ def tile_agreement(
         return None
     source = view.map_px(times=tiles.times)
     there = cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles), TILE // 4)
-    lamps = (cv2.max(tiles.light, there) > CLIPPED_LIGHT).astype(np.uint8)
+    wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles.tops_lefts, tiles.times), TILE // 4)
     here, there_blurred = _inner(wide), _inner(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
     a, b = _spectra(here), _spectra(there_blurred)
     shift, precision = _tile_shifts(a, b, np.zeros(2))
@@ -256,17 +258,18 @@ def tile_agreement(
         there_blurred * per_mean[1],
         float(np.median(_cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
-        cv2.inRange(source, (-0.5, -0.5), (second.shape[1] - 0.5, second.shape[0] - 0.5)) > 0,
-        cv2.dilate(lamps, np.ones((4 * blur_px + 1, 4 * blur_px + 1), np.uint8)) > 0,
+        _inside(source, second),
+        _near_lamps(tiles.light, there, blur_px) > 0,
         blur_px,
         np.asarray(_power(tiles.kernels).mean(axis=0) + _power(kernels).mean(axis=0)),
         tiles.times,
     )
 
 
-def _reach_px(field: Callable[[Array], KernelField], tiles: FrameTiles) -> int:
+def _reach_px(field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int) -> int:
     """Half of the longest path of a neighbour's kernels, reduced pixels, rounded up."""
-    return int(np.ceil(0.5 * field(tiles.centres_px).length_px.max() / tiles.times))
+    centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)
+    return int(np.ceil(0.5 * field(centres_px).length_px.max() / times))
 
 
 def judged_change(
@@ -275,26 +278,61 @@ def judged_change(
     """What restoring a frame gains by a neighbour's account, what it changed, and what was and is left.
 
     With D what restoring changed, M what the recorded frame lacks of the neighbour, both blurred as that one was, and G
-    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in light over its mean, and |M|² and |M − D|² over
-    |G|².  What only shifts a tile is no error of the blur: both pictures are shifted alike.  All are reduced; None
-    where a path does not fit into a tile or the frames show different things.
+    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in grey levels, and |M|² and |M − D|² over |G|².
+    What only shifts a tile is no error of the blur: both pictures are shifted alike.  Tiles that the neighbour
+    does not show whole are left out, and places that light may reach that the frame does not show: what was clipped,
+    and what lies beyond its edges.  All are reduced; None where a path does not fit into a tile, or where less than
+    LEAST_TILES tiles are seen, by half at least.
     """
     times = reduction(view.frame.profile.height, view.frame.profile.width)
-    tops_lefts = _tiles(*recorded.shape)
-    kernels = _kernel_spectra(view.field(), tops_lefts, times)
+    tops_lefts, field = _tiles(*recorded.shape), view.field()
+    kernels = _kernel_spectra(field, tops_lefts, times)
     if kernels is None:
         return None
-    there = _cut(_brought(view, second, times), tops_lefts)
-    b = _spectra(there)
-    onto = [_spectra(_inner(_wide_spectra(picture, tops_lefts) * kernels)) for picture in (recorded, restored)]
+    source = view.map_px(times=times)
+    brought = cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    unknown = _near_lamps(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
+    seen = _cut(np.float32(1) - unknown, tops_lefts)
+    b = _spectra(_cut(brought, tops_lefts), seen)
+    onto = [_spectra(_inner(_wide_spectra(picture, tops_lefts) * kernels), seen) for picture in (recorded, restored)]
     shift, precision = _tile_shifts(onto[0] + onto[1], b, np.zeros(2))
     onto = [_shifted(a, shift) for a in onto]
-    used = (precision > 0) & (np.maximum(_cut(recorded, tops_lefts), there).max(axis=(1, 2)) < CLIPPED_LIGHT)
+    used = (precision > 0) & (_cut(_inside(source, second), tops_lefts).min(axis=(1, 2)) > 0)
+    used &= seen.mean(axis=(1, 2)) > LEAST_SEEN
     if np.count_nonzero(used) < LEAST_TILES:
         return None
-    spectra = b, b - onto[0], b - onto[1], onto[1] - onto[0]
-    shown, lacked, left, changed = (float(_power(one[used]).mean()) for one in spectra)
+    levels = seen[used] * _levels_per_part(_cut(recorded, tops_lefts)[used], view.frame.profile)
+    pixels = float(seen[used].sum())
+
+    def mean_square(spectra: NDArray[np.complex64]) -> float:
+        return float(np.sum((fft.irfft2(spectra[used], (TILE, TILE)) * levels) ** 2)) / pixels
+
+    shown, lacked, left, changed = map(mean_square, (b, b - onto[0], b - onto[1], onto[1] - onto[0]))
     return lacked - left, changed, lacked / shown, left / shown
+
+
+def _levels_per_part(tiles: Image, profile: CameraProfile) -> Image:
+    """Grey levels that a change by a part of the mean light makes in each tile, (n, 1, 1)."""
+    curve = profile.response or ResponseCurve("srgb")
+    light = tiles.mean(axis=(1, 2), keepdims=True)
+    grey = np.rint(255 * curve.encode(light)).astype(np.uint8)
+    return np.asarray(light * curve.slope_table()[grey], np.float32)
+
+
+def _inside(source: NDArray[np.float32], second: Image) -> NDArray[np.bool_]:
+    """Whether a map (h, w, 2) finds something in the neighbour's picture."""
+    height, width = second.shape
+    return np.asarray(cv2.inRange(source, (-0.5, -0.5), (width - 0.5, height - 0.5)) > 0)
+
+
+def _near_lamps(light: Image, there: Image, reach_px: int, beyond: int = 0) -> NDArray[np.uint8]:
+    """1 where light that was too bright to be measured may reach, in either of two reduced pictures of one scene.
+
+    beyond: 1 if what lies beyond their edges is not to reach either.
+    """
+    lamps = (cv2.max(light, there) > CLIPPED_LIGHT).astype(np.uint8)
+    around = np.ones((4 * reach_px + 1, 4 * reach_px + 1), np.uint8)
+    return cv2.dilate(lamps, around, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
 
 
 def _shifted(spectra: NDArray[np.complex64], shift: Array) -> NDArray[np.complex64]:
@@ -344,7 +382,7 @@ def _kernel_spectra(
     return np.asarray(fft.fft(rows, WIDE, axis=1) * down[:, None])
 
 
-def _cut(picture: Image, tops_lefts: NDArray[np.intp], side: int = TILE) -> Image:
+def _cut(picture: NDArray[Any], tops_lefts: NDArray[np.intp], side: int = TILE) -> NDArray[Any]:
     return np.stack([picture[top : top + side, left : left + side] for top, left in tops_lefts.tolist()])
 
 
@@ -369,10 +407,15 @@ def _brought(view: NeighbourView, second: Image, times: int, apart: Array | None
     return cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _spectra(tiles: Image) -> NDArray[np.complex64]:
-    """Spectra (n, TILE, TILE / 2 + 1) of tiles less their mean, under a Hann window; light that changed is evened."""
+def _spectra(tiles: Image, seen: Image | None = None) -> NDArray[np.complex64]:
+    """Spectra (n, TILE, TILE / 2 + 1) of tiles less their mean, under a Hann window; light that changed is evened.
+
+    seen: (n, TILE, TILE) weights of the places that make the mean; None: all.
+    """
     window = _window()
-    means = np.einsum("nij,ij->n", tiles, window)[:, None, None] / window.sum()
+    weight = np.broadcast_to(window, tiles.shape) if seen is None else window * seen
+    total = np.maximum(weight.sum(axis=(1, 2)), 1e-6)
+    means = (np.einsum("nij,nij->n", tiles, weight) / total)[:, None, None]
     return np.asarray(fft.rfft2((tiles / np.maximum(means, 1e-3) - 1) * window))
 
 
