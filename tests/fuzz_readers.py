@@ -25,9 +25,9 @@ import numpy as np
 
 with atheris.instrument_imports(include=["virest"]):
     from virest.app import settings
-    from virest.app.outputs import RunFolder, find_run, finished_segments
+    from virest.app.run_folder import RunFolder, find_run, finished_segments
     from virest.camera.kalibr import parse_imu
-    from virest.camera.profile import load_yaml_mapping
+    from virest.camera.yaml_mapping import load_yaml_mapping
     from virest.capture.euroc import parse_sensor, read_exposure_times, read_imu_rows
     from virest.capture.gyroflow import read_header, read_log
     from virest.capture.marslogger_android import (

@@ -16,7 +16,7 @@ from virest.app.bench import __main__ as bench
 from virest.app.cli import app
 from virest.app.gallery import CASES
 from virest.app.settings import settings_model
-from virest.camera import profile
+from virest.camera import profile_schema
 from virest.diagnosis.catalogue import CATALOGUE
 
 TEXT = "\n".join(map(read, PAGES))
@@ -110,7 +110,7 @@ def test_every_command_has_its_page_with_every_option(name: str) -> None:
 def test_every_profile_and_settings_key_is_documented() -> None:
     """A key that a YAML file may hold is named on the page of profiles."""
     page = read(DOCS / "profile.md")
-    keys = keys_of(profile._Profile) | keys_of(settings_model())
+    keys = keys_of(profile_schema.ProfileFile) | keys_of(settings_model())
     assert not {key for key in keys if not re.search(rf"\b{re.escape(key)}\b", page)}
 
 
@@ -124,7 +124,7 @@ def test_every_effect_is_documented_and_in_the_gallery() -> None:
 
 def test_every_key_of_a_shown_profile_exists() -> None:
     """A YAML block that shows a profile or settings names only known keys."""
-    known = keys_of(profile._Profile) | keys_of(settings_model())
+    known = keys_of(profile_schema.ProfileFile) | keys_of(settings_model())
     for fence in (fence for page in PAGES for fence in fences(page)):
         if not re.search(r"^virest_(profile|settings):", fence.text, re.MULTILINE):
             continue

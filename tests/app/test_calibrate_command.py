@@ -16,7 +16,8 @@ from virest.app import calibrate as command
 from virest.app.calibrate import CalibrationOutput, describe, plan_calibration, run_calibration, unknown_extra
 from virest.app.cli.calibrate import CALIBRATED_EXTRAS
 from virest.app.simulate import simulate_command
-from virest.camera.profile import CameraProfile, read_profile, write_profile
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import read_profile, write_profile
 from virest.capture.folder import read_capture
 from virest.capture.profile_source import read_any_profile
 from virest.errors import CalibrationError, OutputError

@@ -12,7 +12,7 @@ from virest.app.bench.workload import Scale
 from virest.app.calibrate import plan_calibration
 from virest.app.simulate import simulate_command
 from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
-from virest.camera.profile import read_profile
+from virest.camera.profile_file import read_profile
 from virest.capture.video import GrayReader, probe_movie
 from virest.inference.guide_choice import track_guided
 

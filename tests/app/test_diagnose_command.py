@@ -12,7 +12,7 @@ import yaml
 
 from virest.app import cli, diagnose
 from virest.app.simulate import simulate_command
-from virest.camera.profile import parse_profile, read_profile
+from virest.camera.profile_file import parse_profile, read_profile
 from virest.diagnosis.findings import (
     Diagnosis,
     Finding,

@@ -16,7 +16,7 @@ from virest.app.process import ProcessOptions, process_captures
 from virest.app.simulate import simulate_command
 from virest.camera.field import Field
 from virest.camera.kalibr import is_kalibr, parse_camchain, parse_imu
-from virest.camera.profile import format_profile, read_profile
+from virest.camera.profile_file import format_profile, read_profile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_frames
 from virest.errors import CaptureError, OutputError

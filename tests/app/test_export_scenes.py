@@ -13,7 +13,7 @@ from virest.app.export import ExportOptions, plan_export, run_export
 from virest.app.export_scenes import fisheye_coefficients
 from virest.app.simulate import simulate_command
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import read_profile
+from virest.camera.profile_file import read_profile
 from virest.capture.folder import read_capture
 from virest.errors import CaptureError, SettingsError
 

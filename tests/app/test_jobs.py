@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from virest.app import jobs
-from virest.app.jobs import PrefetchedCalls, Segment, Workers, cut_frames, cut_imu, run_segment, run_segments
-from virest.app.outputs import RunFolder
+from virest.app import jobs, segments
+from virest.app.jobs import PrefetchedCalls, Workers, run_segments
+from virest.app.run_folder import RunFolder
+from virest.app.segments import Segment, cut_frames, cut_imu, run_segment
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
 from virest.capture.imu import ImuSamples
@@ -61,7 +62,7 @@ def decoder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
                     raise VideoError("movie.mp4: ends")
                 yield i, None if i in broken else grey(i)
 
-        monkeypatch.setattr(jobs, "read_frames", read)
+        monkeypatch.setattr(segments, "read_frames", read)
 
     install()
     return install
@@ -78,7 +79,7 @@ def restoration(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
     """Put a restoration in place."""
 
     def install(function: Any) -> None:
-        monkeypatch.setattr(jobs, "restore_frames", function)
+        monkeypatch.setattr(segments, "restore_frames", function)
 
     install(restore_all)
     return install
@@ -269,7 +270,7 @@ def test_a_fault_of_ours_fails_one_segment_and_the_rest_goes_on(
 def _die_on_second(segment: Segment) -> dict[str, int]:
     if segment.frames[0].index == 2:
         os._exit(1)
-    return jobs.fail_segment(segment, "stand-in for work")
+    return segments.fail_segment(segment, "stand-in for work")
 
 
 @pytest.mark.scenario

@@ -17,13 +17,14 @@ locked = []
 sys.modules["msvcrt"] = types.SimpleNamespace(LK_NBLCK=2, locking=lambda handle, mode, length: locked.append(length))
 del signal.pthread_sigmask, signal.SIGHUP
 import virest.app.cli
-from virest.app import jobs, outputs
+from virest.app import run_folder
+from virest.app.worker_processes import submit_uninterrupted
 from pathlib import Path
 
-with outputs._locked(outputs.RunFolder(Path(sys.argv[1]))):
+with run_folder._locked(run_folder.RunFolder(Path(sys.argv[1]))):
     assert locked == [1]
 with concurrent.futures.ThreadPoolExecutor(1) as pool:
-    assert jobs.submit_uninterrupted(pool, abs, -3).result() == 3
+    assert submit_uninterrupted(pool, abs, -3).result() == 3
 sys.argv = ["virest", "--version"]
 virest.app.cli.main()
 """

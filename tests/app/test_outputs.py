@@ -12,18 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from virest.app import outputs
-from virest.app.outputs import (
-    RunFolder,
-    capture_name,
-    check_run,
-    json_line,
-    opened_run,
-    plain,
-    write_failure,
-    write_picture,
-    write_whole,
-)
+from virest.app import outputs, run_folder
+from virest.app.outputs import capture_name, json_line, plain, write_picture, write_whole
+from virest.app.run_folder import RunFolder, check_run, opened_run, write_failure
 from virest.errors import OutputError
 
 REQUEST = {
@@ -55,7 +46,7 @@ def finish(run: RunFolder) -> None:
         (run.frames / "000000.png").write_bytes(b"png")
         log = run.segment_log(0, 0)
         write_whole(log, b'{"frame": 0}\n')
-        outputs.finish_run(run, [log], REQUEST)
+        run_folder.finish_run(run, [log], REQUEST)
 
 
 def test_a_picture_comes_back_as_it_was(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -229,7 +220,7 @@ def test_a_capture_that_was_moved_is_continued(tmp_path: Path) -> None:
     run = RunFolder(tmp_path / "trip")
     moved = {**REQUEST, "inputs": [{**REQUEST["inputs"][0], "path": "/old/movie.mp4"}]}  # type: ignore[dict-item]
     with opened_run(run, REQUEST, "new"):
-        outputs.finish_run(run, [], moved)
+        run_folder.finish_run(run, [], moved)
     assert check_run(run, REQUEST, "resume") == "finished"
 
 
@@ -288,7 +279,7 @@ def test_two_processes_cannot_work_in_one_folder(tmp_path: Path) -> None:
     """The second is refused; the lock goes with its holder, even by SIGKILL."""
     run = RunFolder(tmp_path / "trip")
     program = (
-        "import sys, time, pathlib; from virest.app.outputs import *\n"
+        "import sys, time, pathlib; from virest.app.run_folder import *\n"
         "with opened_run(RunFolder(pathlib.Path(sys.argv[1])), {'profile_sha256': 'ab'}, 'new'):\n"
         "    print('ready', flush=True); time.sleep(60)"
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from virest.app.settings import compose_settings, settings_model
-from virest.camera.profile import read_profile
+from virest.camera.profile_file import read_profile
 from virest.errors import SettingsError
 from virest.restoration.settings import PRESETS, RestorationSettings
 

@@ -12,7 +12,7 @@ import yaml
 
 from virest.app import doctor
 from virest.camera.phones import READOUTS
-from virest.camera.profile import read_profile
+from virest.camera.profile_file import read_profile
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,8 +12,9 @@ import pytest
 from moto.server import ThreadedMotoServer
 from run_content import folder_files, without_clocks
 
-from virest.app import outputs
-from virest.app.outputs import RunFolder, capture_name, finished_segments, opened_run, write_whole
+from virest.app import run_folder
+from virest.app.outputs import capture_name, write_whole
+from virest.app.run_folder import RunFolder, finished_segments, opened_run
 from virest.capture import location
 from virest.capture.folder import read_capture
 from virest.capture.location import is_remote, is_unreachable, locate, read_each, remove_files
@@ -226,7 +227,7 @@ def test_the_state_of_a_run_is_told_in_a_bucket_as_in_a_folder(bucket: str) -> N
     with opened_run(run, REQUEST, "resume") as found:
         assert found == "unfinished"
         assert finished_segments(run, [(0,), (1, 2)]) == {(0,)}
-        outputs.finish_run(run, [run.segment_log(0, 0)], REQUEST)
+        run_folder.finish_run(run, [run.segment_log(0, 0)], REQUEST)
     names = {"frames/000000.png", "parameters.jsonl", "run.json"}
     assert set(everything("s3://trips/out/trip")) == names
     with pytest.raises(OutputError, match="finished"), opened_run(run, REQUEST, "new"):

@@ -18,7 +18,7 @@ from bracket_making import FIVE, FIVE_LOW_TOP, SRGB, make_bracket
 from virest.app.calibrate_curve import calibrate_curve
 from virest.app.simulate import simulate_command
 from virest.calibration.response_curve import curve_distance_levels
-from virest.camera.profile import parse_profile
+from virest.camera.profile_file import parse_profile
 from virest.camera.response import ResponseCurve
 
 Virest = Callable[..., subprocess.CompletedProcess[str]]

@@ -10,7 +10,8 @@ import yaml
 
 from virest.camera.field import Field
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import CameraProfile, format_profile, parse_profile
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import format_profile, parse_profile
 from virest.camera.shutter import Shutter
 from virest.errors import SettingsError
 

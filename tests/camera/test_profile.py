@@ -15,19 +15,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from virest.camera.intrinsics import COEFFICIENT_NAMES, Intrinsics
-from virest.camera.profile import (
-    CameraProfile,
-    Estimate,
-    Extensions,
-    format_profile,
-    load_yaml_mapping,
-    parse_profile,
-    profile_mapping,
-    read_profile,
-    write_profile,
-)
+from virest.camera.profile import CameraProfile, Estimate, Extensions
+from virest.camera.profile_file import format_profile, parse_profile, profile_mapping, read_profile, write_profile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import READOUT_DIRECTIONS, STAMP_FRACTION, Shutter
+from virest.camera.yaml_mapping import load_yaml_mapping
 from virest.errors import SettingsError
 
 CONTRACT_EXAMPLE = """

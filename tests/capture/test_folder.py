@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from capture_writing import METADATA_11, PERIOD_NS, START_NS, CaptureWriter, moving_pictures, write_movie
 
-from virest.camera.profile import write_profile
+from virest.camera.profile_file import write_profile
 from virest.capture.folder import Capture, default_profile, read_capture, resolve_profile
 from virest.errors import CaptureError, ClockError, ImuError, SettingsError, VideoError
 

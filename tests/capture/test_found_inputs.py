@@ -12,7 +12,7 @@ from capture_writing import PERIOD_NS, moving_pictures, write_movie
 
 from virest.app.settings import read_settings
 from virest.camera.kalibr import parse_imu
-from virest.camera.profile import load_yaml_mapping
+from virest.camera.yaml_mapping import load_yaml_mapping
 from virest.capture.euroc import parse_sensor
 from virest.capture.marslogger_android import read_gyro_accel
 from virest.capture.pictures import read_picture_list

@@ -11,7 +11,7 @@ import pytest
 from capture_writing import METADATA_11, CaptureWriter
 
 from virest.app.simulate import simulate_command
-from virest.camera.profile import parse_profile, profile_mapping
+from virest.camera.profile_file import parse_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.logged_focal import corners, focal_scales, written_step
 from virest.motion.integration import integrate_gyro

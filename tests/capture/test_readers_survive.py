@@ -10,7 +10,7 @@ from capture_writing import GYRO_7, METADATA_11, PERIOD_NS, moving_pictures, wri
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from virest.app.outputs import RunFolder, find_run, finished_segments
+from virest.app.run_folder import RunFolder, find_run, finished_segments
 from virest.app.settings import read_settings
 from virest.capture.euroc import read_imu_rows
 from virest.capture.marslogger_android import (

@@ -21,7 +21,8 @@ from virest.diagnosis.field.stretches import bridging_form, rate_walk
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
 from virest.diagnosis.geometric_evidence import make_evidence
-from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
 from virest.inference.track_fit import Term

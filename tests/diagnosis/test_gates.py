@@ -13,7 +13,14 @@ from diagnosis.test_photometry import FRAMES, NOISE, NOMINAL, hidden, made_obser
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.camera.profile import CameraProfile
-from virest.diagnosis import geometric_ladder, local_blur, local_blur_fit, photometry_fit, picture_ladder
+from virest.diagnosis import (
+    geometric_ladder,
+    geometric_significance,
+    local_blur,
+    local_blur_fit,
+    photometry_fit,
+    picture_ladder,
+)
 from virest.diagnosis.candidates import Candidate
 from virest.diagnosis.catalogue import CATALOGUE, FALSE_ALARM, MAX_P
 from virest.diagnosis.cross_validation import Judged, Screened, choose
@@ -21,7 +28,8 @@ from virest.diagnosis.cross_validation import judge as judge_points
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain, Rung
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
-from virest.diagnosis.geometric_ladder import Trial, _best_single, _significant
+from virest.diagnosis.geometric_ladder import Trial, _best_single
+from virest.diagnosis.geometric_significance import significant
 from virest.diagnosis.photometry_effects import Vignetting
 from virest.diagnosis.photometry_fit import fit_photometry, judge, time_blocks
 from virest.diagnosis.selection import Levels
@@ -143,7 +151,7 @@ def trial_of(monkeypatch: pytest.MonkeyPatch, losses: dict[str, Any], p_value: f
     entries = [judged(name, each) for name, each in losses.items()]
     before = judged("", np.ones(len(next(iter(losses.values())))))
     monkeypatch.setattr(geometric_ladder, "choose", lambda _evidence, judged, *_: judged[1])
-    monkeypatch.setattr(geometric_ladder, "_significant", lambda *_: (model if p_value < MAX_P else None, p_value))
+    monkeypatch.setattr(geometric_ladder, "significant", lambda *_: (model if p_value < MAX_P else None, p_value))
     allowed = frozenset(losses)
     return _best_single(model, Trial(evidence, before, entries, (allowed, allowed), 1.0))
 
@@ -190,13 +198,13 @@ def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
     model = Model(camera.profile, None, ())
     candidate = Candidate("time_offset", model, (terms_of.TIME_OFFSET,), EFFECT["time_offset"])
     for p_value, named in ((0.5 * MAX_P, True), (1e-3, False)):
-        monkeypatch.setattr(geometric_ladder, "_p_value", lambda *_, p=p_value: p)
-        entered, told = _significant(evidence, candidate, camera.profile, np.zeros(3))
+        monkeypatch.setattr(geometric_significance, "p_value_of", lambda *_, p=p_value: p)
+        entered, told = significant(evidence, candidate, camera.profile, np.zeros(3))
         assert (entered is not None, told) == (named, p_value)
     word = Candidate("readout_direction", model, (), EFFECT["readout_direction"], "top_to_bottom")
     even, uneven = np.array([0.1, 0.11, 0.1, 0.09, 0.1, 0.1]), np.array([0.1, -0.05, 0.3, 0.0, 0.1, 0.02])
-    assert _significant(evidence, word, camera.profile, even)[0] is not None
-    assert _significant(evidence, word, camera.profile, uneven)[0] is None
+    assert significant(evidence, word, camera.profile, even)[0] is not None
+    assert significant(evidence, word, camera.profile, uneven)[0] is None
 
 
 # ── gates of brightness ──────────────────────────────────────────────────────────────────────────────────────────

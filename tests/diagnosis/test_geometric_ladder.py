@@ -24,7 +24,9 @@ from virest.diagnosis.geometric_evidence import (
     loss,
     make_evidence,
 )
-from virest.diagnosis.geometric_ladder import GeometricVerdict, climb, findings_of
+from virest.diagnosis.geometric_findings import findings_of
+from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.effects.changes import rotation_between
 from virest.inference import profile_terms as terms_of
 from virest.motion.scene_motion import DirectedMotion, InertialMotion

@@ -21,7 +21,8 @@ from virest.diagnosis.ambiguities import offset_as_timestamp
 from virest.diagnosis.findings import CONSISTENT, GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
-from virest.diagnosis.geometric_ladder import _p_if_plausible, climb
+from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.geometric_significance import p_if_plausible
 from virest.diagnosis.local_blur import MEMORY, _recent
 from virest.diagnosis.local_blur_model import transfers
 from virest.diagnosis.local_blur_spectra import bin_count, join_ratios
@@ -128,7 +129,7 @@ def test_a_value_at_the_end_of_what_can_be_is_no_cause() -> None:
         found = replace(camera.profile, shutter=replace(shutter, readout_time_s=readout_s))
         model = Model(found, None, (terms_of.TIME_OFFSET, effect.term))  # type: ignore[arg-type]
         fitted = evidence.fit(model, model.terms, evidence.table(model, 400))
-        assert (_p_if_plausible(evidence, fitted, effect, found, camera.profile) == 1.0) is expected
+        assert (p_if_plausible(evidence, fitted, effect, found, camera.profile) == 1.0) is expected
 
 
 def test_an_unknown_readout_of_the_other_sense_is_turned_about() -> None:

@@ -12,7 +12,7 @@ from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import FarClock, candidates_of
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
-from virest.diagnosis.geometric_ladder import is_plausible
+from virest.diagnosis.geometric_significance import is_plausible
 from virest.diagnosis.left_open import variance_left_open
 from virest.inference.parallel import one_by_one
 

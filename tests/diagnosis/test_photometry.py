@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from virest.app.simulate import simulate_command
-from virest.camera.profile import CameraProfile, Extensions, read_profile
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.profile_file import read_profile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture

@@ -18,7 +18,9 @@ from virest.diagnosis import geometric_ladder
 from virest.diagnosis.cross_validation import Judged
 from virest.diagnosis.findings import ParameterChange
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
-from virest.diagnosis.geometric_ladder import Accepted, _apart, _either
+from virest.diagnosis.geometric_findings import _apart
+from virest.diagnosis.geometric_ladder import _either
+from virest.diagnosis.geometric_verdict import Accepted
 
 TESTS = Path(__file__).resolve().parent.parent
 CORES = ("Haswell", "Nehalem")

@@ -9,7 +9,8 @@ import pytest
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.diagnosis.geometric_evidence import make_evidence
-from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.ladder import MOST_TRAVEL_PX, travel_blur_px
 from virest.diagnosis.residual_tests import points_left
 

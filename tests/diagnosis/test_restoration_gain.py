@@ -10,7 +10,7 @@ import pytest
 
 from virest.app.diagnose import open_source
 from virest.app.simulate import simulate_command
-from virest.camera.profile import read_profile
+from virest.camera.profile_file import read_profile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_frames, read_gray
 from virest.diagnosis.ladder import diagnose_capture

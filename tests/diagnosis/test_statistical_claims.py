@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from motion.synthetic_tracks import Recording, Setup
 
-from virest.diagnosis.cross_validation import chance_of
 from virest.diagnosis.findings import GEOMETRY, HeldOutGain
+from virest.diagnosis.geometric_conclusion import lag_std_s
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
-from virest.diagnosis.geometric_ladder import _lag_std_s, climb, findings_of
+from virest.diagnosis.geometric_findings import findings_of
+from virest.diagnosis.geometric_ladder import climb
 from virest.image_formation.point_model import ground
+from virest.inference.chance import chance_of
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.track_fit import many_directions, start_scene
 from virest.report.words import remaining_words, residual_words
@@ -49,10 +51,10 @@ def test_a_lag_is_as_well_known_as_its_pairs_tell_it() -> None:
         camera, evidence = evidence_of(replace(HAND, noise_px=noise_px))
         early = replace(camera.profile.extensions, frame_lag_s=0.05, frame_lag_frames=20)
         model = Model(replace(camera.profile, extensions=early), None, ())
-        found.append(_lag_std_s(evidence, model, evidence.table(model, 2000)))
+        found.append(lag_std_s(evidence, model, evidence.table(model, 2000)))
     assert found[0] < 0.5 * found[1]
     late = replace(model, profile=replace(model.profile, time_offset_s=(model.profile.time_offset_s or 0.0) + 0.006))
-    assert _lag_std_s(evidence, late, evidence.table(late, 2000)) == pytest.approx(0.006, rel=0.2)
+    assert lag_std_s(evidence, late, evidence.table(late, 2000)) == pytest.approx(0.006, rel=0.2)
 
 
 def test_a_gain_without_noise_is_a_lower_bound() -> None:

@@ -10,8 +10,9 @@ from motion.swaying_camera import Sway, SwayingCamera
 from scipy.spatial.transform import Rotation
 
 from virest.camera.intrinsics import Intrinsics
+from virest.inference.camera_travel import Stretch
 from virest.inference.depth import FrameDepth, TriangulatedPoints, frame_depth
-from virest.inference.visual_inertial import Stretch, align
+from virest.inference.visual_inertial import align
 from virest.motion.optics import MovingLens
 
 LENS = MovingLens(Intrinsics(640, 480, 500.0, 500.0, 310.0, 236.0))

@@ -13,7 +13,8 @@ from motion.synthetic_motion import R_CAM_IMU, Setup, Synthetic, hand_motion, ma
 from motion.synthetic_tracks import Setup as Hand
 from motion.synthetic_tracks import recorded as hand
 
-from virest.camera.profile import CameraProfile, Extensions, read_profile
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.profile_file import read_profile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.inference.frame_selection import choose_pairs

@@ -13,7 +13,8 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.inference import visual_inertial
-from virest.inference.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
+from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
+from virest.inference.visual_inertial import align, choose_runs
 
 SWAYS = {
     "portrait": Sway(),

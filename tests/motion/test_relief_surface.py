@@ -11,9 +11,10 @@ import pytest
 from motion.swaying_camera import CENTRE_PX, Sway, SwayingCamera
 
 from virest.camera.intrinsics import Intrinsics
+from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
 from virest.inference.depth import Sightings, TriangulatedPoints
 from virest.inference.relief import measure_roughness, picture_grid
-from virest.inference.visual_inertial import FrameMotion, VisualInertialAlignment, align
+from virest.inference.visual_inertial import align
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief, angles
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from virest.app.jobs import cut_imu
 from virest.app.process import ProcessOptions, process_captures
+from virest.app.segments import cut_imu
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from capture_files import SMALL, read_imu, read_movie
 
-from virest.camera.profile import profile_mapping, read_profile
+from virest.camera.profile_file import profile_mapping, read_profile
 from virest.errors import SettingsError
 from virest.simulation.effects import EffectContext, effect_names, hide_effects
 from virest.simulation.hand_motion import random_hand_motion

@@ -8,7 +8,8 @@ import pytest
 from capture_files import SMALL, read_imu, read_movie
 
 from virest.app.simulate import simulate_command
-from virest.camera.profile import CameraProfile, Extensions, read_profile
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.profile_file import read_profile
 from virest.errors import SettingsError
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
 from virest.simulation.phone_isp import ISPS, PhoneIsp, make_isp

@@ -13,7 +13,8 @@ from virest.app import cli
 from virest.app.recreate import simulate_like
 from virest.app.simulate import simulate_command
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import CameraProfile, Extensions, read_profile
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.profile_file import read_profile
 from virest.capture.folder import read_capture
 from virest.capture.records import Frame
 from virest.errors import CaptureError, ImuError, OutputError, SettingsError

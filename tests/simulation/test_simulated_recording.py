@@ -8,7 +8,7 @@ import pytest
 from capture_files import read_imu, read_movie, read_stamps
 from scipy.spatial.transform import Rotation
 
-from virest.camera.profile import read_profile
+from virest.camera.profile_file import read_profile
 from virest.errors import OutputError, SettingsError
 from virest.simulation import recording
 from virest.simulation.recording import yuv_planes

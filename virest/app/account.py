@@ -12,9 +12,10 @@ from typing import Any
 from virest import __version__
 from virest.app import console
 from virest.app.finish import Finished, pictures_profile
-from virest.app.outputs import file_facts, parse_lines, resolved
+from virest.app.outputs import file_facts, resolved
 from virest.app.planning import Job, ProcessOptions
-from virest.camera.profile import profile_mapping
+from virest.app.run_folder import parse_lines
+from virest.camera.profile_file import profile_mapping
 from virest.capture.location import is_remote, locate, read_each
 from virest.errors import VirestError
 from virest.image_formation import transforms

@@ -17,7 +17,9 @@ from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import FRAME_LAG, GeometryCalibration, calibrate_geometry
 from virest.calibration.unfitted_parameters import OPTIONAL
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
-from virest.camera.profile import CameraProfile, format_profile, load_yaml_mapping, profile_mapping
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import format_profile, profile_mapping
+from virest.camera.yaml_mapping import load_yaml_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie

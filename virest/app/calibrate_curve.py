@@ -12,7 +12,7 @@ from virest.app.console import table
 from virest.app.outputs import write_whole
 from virest.calibration.bracket_samples import BracketPicture
 from virest.calibration.response_curve import CurveFit, fit_response
-from virest.camera.profile import response_block
+from virest.camera.profile_file import response_block
 from virest.camera.response import ResponseCurve
 from virest.capture.detect import is_capture
 from virest.capture.folder import read_capture

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from virest.app.console import table
 from virest.app.outputs import capture_name, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
-from virest.camera.profile import CameraProfile, format_profile, profile_mapping
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames

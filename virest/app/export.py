@@ -39,7 +39,7 @@ from virest.app.export_scenes import colmap_files, frame_poses, gyroflow_profile
 from virest.app.outputs import output_error, plain, write_picture
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu
 from virest.camera.orb_slam import format_orb_slam
-from virest.camera.profile import format_profile
+from virest.camera.profile_file import format_profile
 from virest.capture.euroc import (
     format_camera_sensor,
     format_exposure_times,

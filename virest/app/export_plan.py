@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.outputs import RunFolder, capture_name, read_lines
+from virest.app.outputs import capture_name
+from virest.app.run_folder import RunFolder, read_lines
 from virest.camera.kalibr import ImuNoise, field_notes, measure_imu_noise
 from virest.camera.lens_fit import standard_lens
-from virest.camera.profile import CameraProfile, parse_profile
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import parse_profile
 from virest.camera.recounting import counted_from, on_camera_clock
 from virest.capture.files import label, scan_text
 from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile

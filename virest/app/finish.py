@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.film import display_turn, side_by_side, write_film
-from virest.app.outputs import RunFolder, parse_lines, write_picture
+from virest.app.outputs import write_picture
+from virest.app.run_folder import RunFolder, parse_lines
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.location import is_remote, read_each

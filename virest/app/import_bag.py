@@ -12,7 +12,7 @@ import numpy as np
 
 from virest.app.outputs import output_error, write_picture, write_whole
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import format_profile
+from virest.camera.profile_file import format_profile
 from virest.capture.folder import read_capture
 from virest.capture.profile_source import phone_profile
 from virest.capture.rosbag import Bag, BagCamera

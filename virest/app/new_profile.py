@@ -12,7 +12,8 @@ from virest.app.console import table
 from virest.app.outputs import write_whole
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.phones import READOUTS, Readout, find_readouts
-from virest.camera.profile import CameraProfile, format_profile, profile_mapping
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.profile_source import phone_profile
 from virest.errors import OutputError, SettingsError

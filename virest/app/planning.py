@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.finish import FinishWishes
-from virest.app.jobs import PictureWishes, prepare_worker
-from virest.app.outputs import Mode, RunFolder, check_run, file_facts, plain
+from virest.app.outputs import file_facts, plain
+from virest.app.run_folder import Mode, RunFolder, check_run
+from virest.app.segments import PictureWishes
+from virest.app.worker_processes import prepare_worker
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import CameraProfile, profile_mapping
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile, unpack_hint
 from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME

@@ -14,20 +14,10 @@ from virest.app import console
 from virest.app.account import PARTLY_FAILED, failure_account, run_account, run_totals
 from virest.app.cluster import is_lost
 from virest.app.finish import Finished, finish_pictures, require_finishable
-from virest.app.jobs import PrefetchedCalls, Segment, Workers, cut_frames, make_segment, run_segments
+from virest.app.jobs import PrefetchedCalls, Workers, run_segments
 from virest.app.names import shard_of
 from virest.app.outcome import CaptureOutcome, summary
-from virest.app.outputs import (
-    RunFolder,
-    check_run,
-    finish_run,
-    finished_segments,
-    opened_run,
-    output_error,
-    remove_parts,
-    remove_stray_pictures,
-    write_failure,
-)
+from virest.app.outputs import output_error
 from virest.app.planning import (
     Job,
     Planned,
@@ -38,6 +28,17 @@ from virest.app.planning import (
     say,
     shown,
 )
+from virest.app.run_folder import (
+    RunFolder,
+    check_run,
+    finish_run,
+    finished_segments,
+    opened_run,
+    remove_parts,
+    remove_stray_pictures,
+    write_failure,
+)
+from virest.app.segments import Segment, cut_frames, make_segment
 from virest.capture.location import locate
 from virest.capture.video import MovieIndex
 from virest.errors import CaptureError, OutputError, SettingsError, VirestError

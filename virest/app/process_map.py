@@ -11,7 +11,7 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-from virest.app.jobs import process_pool, submit_uninterrupted
+from virest.app.worker_processes import process_pool, submit_uninterrupted
 from virest.inference.parallel import ParallelMap, one_by_one
 
 log = logging.getLogger(__name__)

@@ -7,26 +7,34 @@ if it is that very movie, by size and sha256.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import re
 import shlex
-import stat
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from virest import __version__
 from virest.app.account import STATUSES
-from virest.app.outputs import RunFolder, file_facts, write_whole
+from virest.app.outputs import file_facts, write_whole
+from virest.app.report_files import (
+    Account,
+    DiagnosisFile,
+    Input,
+    Tile,
+    read_bytes,
+    read_frame_lines,
+    read_model,
+    read_tiles,
+)
+from virest.app.run_folder import RunFolder
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.video import MovieIndex, probe_movie, read_frames
 from virest.errors import CaptureError, OutputError, VirestError
@@ -54,13 +62,11 @@ FRAMES_SHOWN, MOST_FRAMES = 6, 24
 """Of one capture, and of all captures of a page together, where no number is asked for."""
 PICTURE_BYTES = 4_200_000
 """All frames of a page together, as text; with the figures that keeps a page below some 6 MB."""
-MAX_ACCOUNT_BYTES, MAX_PROFILE_BYTES, MAX_PICTURE_BYTES = 64 << 20, 1 << 20, 256 << 20
-MAX_COUNT, MAX_STAMP_NS = 10**9, 1 << 61
+MAX_PROFILE_BYTES, MAX_PICTURE_BYTES = 1 << 20, 256 << 20
 PARTLY_FAILED = 9
 ONLY_AFTER = "the pictures before are not shown"
 
 Json = dict[str, Any]
-Model = TypeVar("Model", bound=BaseModel)
 Picture = NDArray[np.uint8]
 
 
@@ -92,126 +98,6 @@ class _Movie:
 
     path: Path
     index: MovieIndex
-
-
-# ── what run.json, parameters.jsonl and diagnosis.json have to hold ──────────────────────────────────────────────
-
-
-class _Lenient(BaseModel):
-    model_config = ConfigDict(extra="ignore", strict=False)
-
-
-_Count = Annotated[int, Field(ge=0, le=MAX_COUNT)]
-
-
-class _Input(_Lenient):
-    file: str
-    bytes: int
-    sha256: str
-
-
-class _Account(_Lenient):
-    virest_run: int
-    capture: str
-    folder: str | None = None
-    movie: str | None = None
-    version: str = ""
-    command: str = ""
-    profile: dict[str, Any] = Field(default_factory=dict)
-    profile_source: str = ""
-    crop_px: tuple[int, int, int, int] | None = None
-    settings: dict[str, Any] = Field(default_factory=dict)
-    inputs: list[_Input] = Field(default_factory=list)
-    counts: dict[str, _Count]
-    verdict: str
-    warnings: list[str] = Field(default_factory=list)
-    failure: dict[str, Any] | None = None
-    """Of a capture that could not be processed; there are no pictures then."""
-
-
-class _Tile(_Lenient):
-    centre_px: tuple[float, float]
-    angle_rad: float
-    length_px: float
-
-
-class _Blur(_Lenient):
-    length_px: float | None = None
-    tiles: list[_Tile] = Field(default_factory=list)
-
-
-class _Motion(_Lenient):
-    rate_rad_s: tuple[float, float, float] | None = None
-    velocity_m_s: tuple[float, float, float] | None = None
-
-
-class _Shutter(_Lenient):
-    method: str = "none"
-    max_displacement_px: float | None = None
-
-
-class _Deblur(_Lenient):
-    method: str = "none"
-    expected_gain_db: float | None = None
-    neighbours_gain_db: float | None = None
-    noise_grey_levels: float | None = None
-
-
-class _Line(_Lenient):
-    frame: _Count
-    timestamp_ns: int = Field(ge=-MAX_STAMP_NS, le=MAX_STAMP_NS)
-    status: str = Field(pattern="^(restored|copied|skipped|failed)$")
-    exposure_s: float | None = None
-    output: str | None = None
-    warnings: list[str] = Field(default_factory=list)
-    depth_m: float | str | None = None
-    motion: _Motion | None = None
-    blur: _Blur | None = None
-    shutter: _Shutter | None = None
-    deblur: _Deblur | None = None
-    valid_px: tuple[int, int, int, int] | None = None
-
-
-class _Change(_Lenient):
-    nominal: Any = None
-    estimate: Any = None
-    std: Any = None
-
-
-class _HeldOut(_Lenient):
-    quantity: str = ""
-    before: float | str | None = None
-    after: float | str | None = None
-    gain: float | None = None
-
-
-class _Rival(_Lenient):
-    name: str
-    held_out_after: float | str | None = None
-
-
-class _Cause(_Lenient):
-    name: str
-    sentence: str = ""
-    parameters: dict[str, _Change] = Field(default_factory=dict)
-    held_out: _HeldOut = Field(default_factory=_HeldOut)
-    rivals: list[_Rival] = Field(default_factory=list)
-
-
-class _Field(_Lenient):
-    sentence: str = ""
-    reasons: str = ""
-    next: str = ""
-
-
-class _Diagnosis(_Lenient):
-    schema_: str = Field(alias="schema", pattern="^virest/diagnosis/")
-    verdict: str
-    nominal: dict[str, float | str | None] = Field(default_factory=dict)
-    causes: list[_Cause] = Field(default_factory=list)
-    fields: list[_Field] = Field(default_factory=list)
-    unexplained: dict[str, float | str | None] = Field(default_factory=dict)
-    restoration_gain: dict[str, Any] = Field(default_factory=dict)
 
 
 # ── the command ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -295,87 +181,16 @@ def read_folder(folder: Path, options: ReportOptions, among: int) -> CaptureReco
     return CaptureRecord(name, run, diagnosis)
 
 
-# ── files of unknown origin ──────────────────────────────────────────────────────────────────────────────────────
-
-
-def _read_bytes(path: Path, limit: int) -> bytes:
-    """The content of a plain file of bounded size. Raises CaptureError."""
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
-            raise CaptureError(
-                f"{path}: is not a regular file of at most {limit >> 20} MB", hint="was it written by virest?"
-            )
-        return path.read_bytes()
-    except OSError as error:
-        raise CaptureError(f"{path}: {error.strerror}", hint="run virest process again") from None
-
-
-def _read_model(path: Path, model: type[Model], kind: str) -> Model:
-    """A JSON file, checked. Raises CaptureError with the first thing that is wrong."""
-    try:
-        return model.model_validate(json.loads(_read_bytes(path, MAX_ACCOUNT_BYTES)))
-    except ValidationError as error:
-        raise CaptureError(
-            f"{path}: {_complaint(error)}: this is no {kind}", hint="was it written by virest?"
-        ) from None
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path}: is no JSON ({error})", hint="run the command that wrote it again") from None
-
-
-def _complaint(error: ValidationError) -> str:
-    first = error.errors(include_url=False, include_input=False)[0]
-    place = ".".join(str(part) for part in first["loc"])
-    return f"{place + ': ' if place else ''}{first['msg'].lower()}"
-
-
-def _read_lines(folder: Path, expected: int) -> tuple[dict[int, FrameFacts], list[str]]:
-    """What the lines of parameters.jsonl tell, by line number, and a note where some cannot be read.
-
-    Tiles are not kept, a long run has millions; those of the frames shown are read again.
-    """
-    path = folder / "parameters.jsonl"
-    frames: dict[int, FrameFacts] = {}
-    bad: list[int] = []
-    for number, text in _numbered(path):
-        try:
-            frames[number] = _frame_facts(_Line.model_validate_json(text))
-        except ValidationError:
-            bad.append(number)
-    if not frames and (expected or bad):
-        raise CaptureError(f"{path}: none of its {len(bad)} lines can be read", hint="run virest process again")
-    notes = []
-    if bad or len(frames) != expected:
-        which = f"; line {bad[0]} is the first that cannot be read" if bad else ""
-        notes.append(f"parameters.jsonl tells of {len(frames)} of {expected} frames{which}: the page shows those only.")
-        log.warning("%s: %s", folder.name, notes[0])
-    return frames, notes
-
-
-def _read_tiles(folder: Path, numbers: set[int]) -> dict[int, list[_Tile]]:
-    """The tiles of the frames on these lines, by frame."""
-    lines = (_Line.model_validate_json(text) for n, text in _numbered(folder / "parameters.jsonl") if n in numbers)
-    return {line.frame: line.blur.tiles if line.blur else [] for line in lines}
-
-
-def _numbered(path: Path) -> Iterator[tuple[int, bytes]]:
-    try:
-        with path.open("rb") as file:
-            yield from ((number, text) for number, text in enumerate(file, start=1) if text.strip())
-    except OSError as error:
-        raise CaptureError(f"{path}: {error.strerror}", hint="run virest process again") from None
-
-
 # ── a run ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
-    account = _read_model(folder / RUN, _Account, "account of a run")
-    by_line, notes = _read_lines(folder, sum(account.counts.get(status, 0) for status in STATUSES))
+    account = read_model(folder / RUN, Account, "account of a run")
+    by_line, notes = read_frame_lines(folder, sum(account.counts.get(status, 0) for status in STATUSES))
     frames = list(by_line.values())
     chosen = choose_frames(frames, options.frames or max(1, min(FRAMES_SHOWN, MOST_FRAMES // among)))
     numbers = {facts.frame for facts in chosen}
-    tiles = _read_tiles(folder, {n for n, facts in by_line.items() if facts.frame in numbers})
+    tiles = read_tiles(folder, {n for n, facts in by_line.items() if facts.frame in numbers})
     movie, complaint = (None, "") if account.failure else find_movie(account, folder, options.capture)
     notes += [complaint] if complaint else []
     bytes_each = PICTURE_BYTES // among // len(chosen) if chosen else 0
@@ -383,35 +198,10 @@ def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
     return RunRecord(account.model_dump(), frames, shown, tuple(notes))
 
 
-def _frame_facts(line: _Line) -> FrameFacts:
-    blur, motion = line.blur or _Blur(), line.motion or _Motion()
-    shutter, deblur = line.shutter or _Shutter(), line.deblur or _Deblur()
-    velocity = motion.velocity_m_s
-    return FrameFacts(
-        frame=line.frame,
-        timestamp_ns=line.timestamp_ns,
-        state=line.status,
-        warnings=tuple(line.warnings),
-        exposure_s=line.exposure_s,
-        blur_px=blur.length_px,
-        longest_blur_px=max((tile.length_px for tile in blur.tiles), default=blur.length_px),
-        rate_rad_s=motion.rate_rad_s,
-        shift_px=shutter.max_displacement_px,
-        depth_m=line.depth_m if isinstance(line.depth_m, float) else None,
-        speed_m_s=None if velocity is None else float(np.hypot.reduce(velocity)),
-        gain_db=deblur.expected_gain_db,
-        neighbours_gain_db=deblur.neighbours_gain_db,
-        noise_levels=deblur.noise_grey_levels,
-        deblurred=deblur.method != "none",
-        straightened=line.status == "restored" and shutter.method != "none",
-        valid_px=line.valid_px,
-    )
-
-
 def _show(
     folder: Path,
     facts: FrameFacts,
-    tiles: Sequence[_Tile],
+    tiles: Sequence[Tile],
     movie: _Movie | None,
     max_bytes: int,
     crop_px: tuple[int, int, int, int] | None = None,
@@ -443,7 +233,7 @@ def _recorded(movie: _Movie, frame: int) -> Picture | None:
 def read_picture(path: Path) -> Picture | None:
     """An RGB picture of 8 bits; None, and a warning, where it cannot be read."""
     try:
-        data = np.frombuffer(_read_bytes(path, MAX_PICTURE_BYTES), np.uint8)
+        data = np.frombuffer(read_bytes(path, MAX_PICTURE_BYTES), np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
     except (CaptureError, cv2.error) as error:
         log.warning("%s", str(error).strip().splitlines()[-1])
@@ -456,7 +246,7 @@ def read_picture(path: Path) -> Picture | None:
 # ── where the movie is ───────────────────────────────────────────────────────────────────────────────────────────
 
 
-def find_movie(account: _Account, folder: Path, hint: Path | None) -> tuple[_Movie | None, str]:
+def find_movie(account: Account, folder: Path, hint: Path | None) -> tuple[_Movie | None, str]:
     """The movie (or list or folder of pictures) from which the run was made, or None and what to say of that.
 
     A file is taken only if size and sha256 are those in run.json.
@@ -475,20 +265,20 @@ def find_movie(account: _Account, folder: Path, hint: Path | None) -> tuple[_Mov
     return None, f"The capture's movie was not found (--capture says where it is); {ONLY_AFTER}."
 
 
-def _is_same(path: Path, known: _Input) -> bool:
+def _is_same(path: Path, known: Input) -> bool:
     if Path(known.file).name != path.name or not path.is_file() or path.stat().st_size != known.bytes:
         return False
     return bool(file_facts(path)["sha256"] == known.sha256)
 
 
-def _movie_names(account: _Account) -> list[str]:
+def _movie_names(account: Account) -> list[str]:
     """Where the movie may lie inside the capture's folder: as run.json says, else each input that is named as one."""
     if account.folder and account.movie:
         return [os.path.relpath(account.movie, account.folder)]
     return [item.file for item in account.inputs if Path(item.file).suffix.lower() in MOVIE_SUFFIXES]
 
 
-def _places(account: _Account, folder: Path, hint: Path | None) -> Iterator[Path]:
+def _places(account: Account, folder: Path, hint: Path | None) -> Iterator[Path]:
     """Folders in which the capture may lie, the likeliest first."""
     if hint is not None:
         yield from (hint, hint / folder.resolve().name)
@@ -509,10 +299,10 @@ def _places(account: _Account, folder: Path, hint: Path | None) -> Iterator[Path
 
 
 def _read_diagnosis(folder: Path) -> DiagnosisRecord:
-    checked = _read_model(folder / DIAGNOSIS, _Diagnosis, "diagnosis")
+    checked = read_model(folder / DIAGNOSIS, DiagnosisFile, "diagnosis")
     profile = ""
     with suppress(CaptureError):
-        profile = _read_bytes(folder / EXTENDED, MAX_PROFILE_BYTES).decode("utf-8", "replace")
+        profile = read_bytes(folder / EXTENDED, MAX_PROFILE_BYTES).decode("utf-8", "replace")
     return DiagnosisRecord(checked.model_dump(), list(_figures(folder / FIGURES)), profile)
 
 

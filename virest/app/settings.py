@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from virest.camera.profile import explain_validation, load_yaml_mapping
+from virest.camera.yaml_mapping import explain_validation, load_yaml_mapping
 from virest.errors import SettingsError
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS, RestorationSettings
 

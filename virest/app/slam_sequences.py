@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.jobs import Workers
-from virest.app.outputs import read_lines
 from virest.app.process import ProcessOptions, process_capture
+from virest.app.run_folder import read_lines
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.orb_slam import format_orb_slam
-from virest.camera.profile import CameraProfile, read_profile
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import read_profile
 from virest.capture.euroc import format_picture_list
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture

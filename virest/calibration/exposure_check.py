@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.calibration.bracket_samples import BracketSamples
+from virest.inference.robust import robust_std
 
 Array = NDArray[np.float64]
 KNOTS = 18
@@ -67,7 +68,7 @@ def fit_first_curve(samples: BracketSamples) -> FirstCurve:
         g, correction, residual = _solve(basis, weight, log_t, greys)
         g = np.maximum.accumulate(g) + 1e-5 * np.arange(KNOTS)
         normal = np.abs(residual) / (slope * samples.sigma)
-        scale = max(1.4826 * float(np.median(normal[measured])), 0.5)
+        scale = max(robust_std(normal[measured]), 0.5)
         robust = 1.0 / np.maximum(1.0, normal / (2.0 * scale))
     return _untrended(greys, g, correction, log_t)
 
@@ -170,6 +171,6 @@ def outlying(ev: Array) -> NDArray[np.bool_]:
     if len(ev) < MIN_PICTURES:
         return np.zeros(len(ev), bool)
     away = np.abs(ev - np.median(ev))
-    spread = 1.4826 * float(np.median(away))
+    spread = robust_std(away)
     suspect = (away > CONTRADICTS_EV) & (away > ROBUST_Z * spread)
     return suspect if suspect.sum() < 0.5 * len(ev) else np.zeros(len(ev), bool)

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.stats import chi2
 
+from virest.inference.robust import MEDIAN_TO_STD
+
 Array = NDArray[np.float64]
 DARKEST_JUDGED, BRIGHTEST_JUDGED = 4.0, 251.0
 """Greys between which the noise of a square is that of its light, mostly: beyond, it is cut off at 0 or 255."""
@@ -41,7 +43,6 @@ FAIR_SIGMA = 2.0
 """A fortieth of the greys that are fairly inside fall beyond the limit by their noise."""
 ALIKE = 31
 """Places of about one brightness, whose median is good to a fifth of their scatter."""
-MAD = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,7 @@ def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], us
         for k in range(len(middles)):
             inside = of_channel & (place == k)
             if inside.sum() >= FEW_SQUARES:
-                found[c, k] = (MAD * np.median(np.abs((residual * free)[inside]))) ** 2
+                found[c, k] = (MEDIAN_TO_STD * np.median(np.abs((residual * free)[inside]))) ** 2
     return found
 
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from virest.camera.intrinsics import COEFFICIENT_NAMES
 from virest.camera.lens_fit import standard_lens
-from virest.camera.profile import CameraProfile, Extensions, parse_profile
+from virest.camera.profile import CameraProfile, Extensions
+from virest.camera.profile_file import parse_profile
 from virest.errors import SettingsError
 
 Array = NDArray[np.float64]

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from virest.camera.intrinsics import COEFFICIENT_NAMES
 from virest.camera.kalibr import ImuNoise, parse_camchain
-from virest.camera.profile import CameraProfile, load_yaml_mapping, parse_profile
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import parse_profile
+from virest.camera.yaml_mapping import load_yaml_mapping
 from virest.capture.files import is_present, label, scan_text
 from virest.capture.pictures import read_picture_list
 from virest.capture.records import Note

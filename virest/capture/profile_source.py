@@ -10,8 +10,10 @@ import numpy as np
 
 from virest.camera.field import Field
 from virest.camera.kalibr import is_kalibr, parse_camchain
-from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, load_yaml_mapping, parse_profile
+from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile
+from virest.camera.profile_file import parse_profile
 from virest.camera.shutter import Shutter
+from virest.camera.yaml_mapping import load_yaml_mapping
 from virest.capture.files import is_present
 from virest.capture.location import locate
 from virest.capture.logged_focal import corners

@@ -13,7 +13,7 @@ from virest.camera.shutter import STAMP_FRACTION
 from virest.diagnosis import picture_ladder
 from virest.diagnosis.candidates import varies
 from virest.diagnosis.findings import Finding, ParameterChange, Rival
-from virest.diagnosis.geometric_ladder import GeometricVerdict
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 
 Array = NDArray[np.float64]
 COINCIDENCE_SIGMA = 3.5

@@ -15,13 +15,11 @@ from virest.diagnosis.geometric_evidence import (
     Evidence,
     Model,
     capped_rms,
-    distances,
     fit_model,
-    loss,
     relief_loss,
 )
 from virest.image_formation.point_model import TrackTable
-from virest.inference.chance import student_tail
+from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.parallel import ParallelMap
 from virest.inference.time_blocks import halves
 from virest.inference.track_fit import Term
@@ -180,7 +178,7 @@ def judge(
 
 def _judged(evidence: Evidence, candidate: Candidate, table: TrackTable, distance: Array, scale: float) -> Judged:
     mean, block = loss(distance, scale), evidence.block[table.pair]
-    by_pair, by_block = (np.bincount(k, mean) / np.maximum(np.bincount(k), 1) for k in (table.pair, block))
+    by_pair, by_block = (group_means(mean, k) for k in (table.pair, block))
     return Judged(candidate, distance, by_block, by_pair, capped_rms(distance))
 
 
@@ -226,15 +224,3 @@ def lagging_gain(evidence: Evidence, before: Judged, after: Judged) -> Array:
     gain = (before.pair_loss[:both] - after.pair_loss[:both])[moved[:both]]
     parts = np.array_split(gain, max(len(gain) // LAGGING_BLOCK, 1))
     return np.array([part.mean() for part in parts if len(part)])
-
-
-def chance_of(gain: Array) -> float:
-    """Probability (one-sided t test) of so even a gain (blocks,) where there is none."""
-    return student_tail(t_ratio(gain), max(len(gain) - 1, 1))
-
-
-def t_ratio(values: Array) -> float:
-    """Mean over its standard error."""
-    if len(values) < 3:
-        return 0.0
-    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))

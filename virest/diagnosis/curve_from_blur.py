@@ -39,6 +39,7 @@ from virest.image_formation.turning_camera import TurningCamera, turning_camera
 from virest.image_formation.warp import moved_between
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.robust import robust_std
 from virest.motion.trajectory import Trajectory
 
 Gray = NDArray[np.uint8]
@@ -364,7 +365,7 @@ def _tile_scores(levels: list[Array], steps: tuple[Array, ...], free: Array) -> 
     for _ in range(3):
         fit = np.linalg.lstsq(weight[:, None] * design, weight * target, rcond=1e-8)[0]
         left = target - design @ fit
-        noise = 1.4826 * float(np.median(np.abs(left))) + 0.2
+        noise = robust_std(left) + 0.2
         weight = 1 / np.sqrt(1 + (left / (2.5 * noise)) ** 2)
     base = np.linalg.qr(weight[:, None] * free)[0]
     row = [float(np.sum(weight**2)), noise]

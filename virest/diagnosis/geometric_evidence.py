@@ -13,11 +13,26 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, centre, ground, seen_s
 from virest.inference.comparable_noise import noise_distances
+from virest.inference.hold_out import distances, loss
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
 from virest.inference.time_blocks import varied_blocks
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
-from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
+from virest.motion.scene_motion import InertialMotion, Motion
+
+__all__ = [
+    "Evidence",
+    "Model",
+    "base_scene",
+    "capped_rms",
+    "depth_of",
+    "distances",
+    "fit_model",
+    "free_scene",
+    "loss",
+    "make_evidence",
+    "relief_loss",
+]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -108,25 +123,11 @@ def fit_model(
     return fit_tracks(imu, table, model.profile, terms, model.scene, max_iterations=iterations, covariances=covariances)
 
 
-def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
-    """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
-    scene = fitted.scene
-    if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
-        scene = many_directions(table)
-    everywhere = fit_tracks(imu, table, fitted.profile, (), scene, max_iterations=0, known=fitted.ground)
-    return everywhere.distance_at(depth_spread_per_m)
-
-
 def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
     """Number the blocks of time."""
     part = min(len(observed.pairs) / FULL_LENGTH_PAIRS, 1.0)
     lengths = [max(round(part * length), 1) for length in BLOCK_LENGTHS]
     return Evidence(imu, observed, varied_blocks(np.arange(len(observed.pairs)), lengths))
-
-
-def loss(distance: Array, scale: float) -> Array:
-    """Cauchy loss of whitened distances at a scale."""
-    return np.asarray(np.log1p((distance / (CAUCHY * scale)) ** 2))
 
 
 def relief_loss(fitted: TrackFit) -> float:

@@ -31,7 +31,9 @@ from virest.diagnosis.field.brightness import (
 )
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
-from virest.diagnosis.geometric_ladder import MAX_RUNGS, GeometricVerdict, findings_of
+from virest.diagnosis.geometric_findings import findings_of
+from virest.diagnosis.geometric_ladder import MAX_RUNGS
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
 from virest.diagnosis.refit_photometry import settle_light
 from virest.diagnosis.residual_tests import points_left, remaining_structure, residuals

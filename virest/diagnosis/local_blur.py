@@ -42,6 +42,7 @@ from virest.diagnosis.local_blur_spectra import (
 )
 from virest.inference.edges import EdgeSettings
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.robust import robust_std
 from virest.inference.time_blocks import even_blocks
 from virest.motion.trajectory import Trajectory
 
@@ -288,7 +289,7 @@ def _remembered(off: Array, columns: Array) -> Array:
 
 def robust_weights(residual: Array) -> Array:
     """Weights (1 + (r / 2 s)²)⁻², s from the median deviation: whatever lies far out counts ever less."""
-    scale = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 1.0
+    scale = robust_std(residual)
     return np.asarray((1.0 + (residual / (2.0 * max(scale, 1e-9))) ** 2) ** -2)
 
 

@@ -25,6 +25,7 @@ from virest.diagnosis.local_blur import (
 )
 from virest.diagnosis.local_blur_model import predicted_ratios
 from virest.inference.clustered import scatter
+from virest.inference.robust import robust_std
 from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
 
@@ -183,14 +184,14 @@ def _fit(
             break
     residual, jacobian, weight = problem.linearised(theta)
     covariance = problem.covariance(theta, residual, jacobian, weight)
-    return _as_fit(problem, effects, known, theta, covariance, _rms(residual))
+    return _as_fit(problem, effects, known, theta, covariance, robust_std(residual))
 
 
 def judge(observations: BlurObservations, found: BlurFit, trajectory: Trajectory, use: Mask) -> float:
     """Robust rms, px, of the residuals of a mask under a fit made on others."""
     lens, shift = found.nuisance
     moved = _shifted(found.profile, float(shift))
-    return _rms(residuals(observations, moved, trajectory, float(lens))[use])
+    return robust_std(residuals(observations, moved, trajectory, float(lens))[use])
 
 
 def held_out(
@@ -257,7 +258,7 @@ class _Problem:
         weight = np.zeros(len(residual))
         edge = self.observations.is_edge[self.use]
         for kind in (edge, ~edge):
-            weight[kind] = robust_weights(residual[kind]) / max(_rms(residual[kind]), 1e-3) ** 2
+            weight[kind] = robust_weights(residual[kind]) / max(robust_std(residual[kind]), 1e-3) ** 2
         return residual, np.stack(columns, -1), weight
 
     def solve(self, residual: Array, jacobian: Array, weight: Array, theta: Array) -> Array:
@@ -312,8 +313,3 @@ def _as_fit(
 
 def _shifted(profile: CameraProfile, shift_s: float) -> CameraProfile:
     return replace(profile, time_offset_s=(profile.time_offset_s or 0.0) + shift_s)
-
-
-def _rms(residual: Array) -> float:
-    """Root of the mean square, by the median: a tenth of outliers does not move it."""
-    return 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0

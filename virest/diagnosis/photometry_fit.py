@@ -20,6 +20,7 @@ from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
 from virest.inference.chance import chi2_tail, normal_deviate
 from virest.inference.clustered import raised, scatter
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.robust import cauchy_weight
 from virest.inference.time_blocks import halves, varied_blocks
 
 _CAUCHY = 2.5
@@ -304,10 +305,6 @@ def _cost(residual: Array) -> float:
     return float(_CAUCHY**2 * np.sum(np.log1p((residual / _CAUCHY) ** 2)))
 
 
-def _weights(residual: Array) -> Array:
-    return 1 / (1 + (residual / _CAUCHY) ** 2)
-
-
 def _prior(effects: Sequence[PhotometricEffect]) -> Array:
     """Precision of the weak knowledge about each value and the memory, (k + 1,)."""
     spread = [_PRIOR_SCALES * effect.scale for effect in effects]
@@ -355,7 +352,7 @@ def _settled(
     weight = np.ones(len(observations))
     for _ in range(2):
         residual = predict(observations, profile, weight / observations.noise**2).residual / observations.noise
-        weight = _weights(residual)
+        weight = cauchy_weight(residual**2, _CAUCHY)
     return residual, weight
 
 

@@ -15,6 +15,7 @@ from scipy.sparse.linalg import lsmr
 
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import Array, Indices, PhotometricObservations
+from virest.inference.robust import MEDIAN_TO_STD
 
 _MOST_ROW_KNOTS = 17
 """Lamps pulse two or three times in a readout: this many knots follow them."""
@@ -86,7 +87,7 @@ def _medians(group: Indices, values: Array) -> Array:
 
 def _spread(group: Indices, values: Array) -> Array:
     """(groups,) standard deviations, by the median of the sizes."""
-    return 1.4826 * _medians(group, np.abs(values))
+    return MEDIAN_TO_STD * _medians(group, np.abs(values))
 
 
 def _design(

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from virest.diagnosis import picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
-from virest.diagnosis.geometric_ladder import GeometricVerdict
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
 from virest.image_formation.point_model import seen_s
 from virest.inference.chance import chi2_tail, mean_tail
+from virest.inference.robust import cauchy_weight, robust_std
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +128,7 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
         for name, values in observations.covariates(photometric.profile).items()
         if name in ("row", "radius", "brightness", "row_fraction", "x_px", "y_px")
     }
-    weight = 1.0 / (1.0 + (left / (CALM * max(float(np.median(np.abs(left))) / 0.6745, 1.0))) ** 2)
+    weight = cauchy_weight(left**2, CALM * max(robust_std(left), 1.0))
     found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)
     strongest = max(found, key=lambda s: s.size)
     log.debug("light left: %s", found)

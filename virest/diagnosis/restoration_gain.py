@@ -35,6 +35,7 @@ from virest.inference.frame_selection import choose_pairs
 from virest.inference.guidance import GyroGuide, MapBetween, map_between
 from virest.inference.guide_choice import find_guide
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.robust import NORMAL_MEDIAN
 from virest.inference.tracking import Guide, TrackPair, track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
@@ -386,4 +387,4 @@ def _median(lengths: list[Array]) -> float:
 
 def _spread(ratios: list[Array]) -> float:
     values = np.concatenate([np.empty(0), *ratios])
-    return float(np.median(np.abs(values)) / 0.6745) if len(values) else float("nan")
+    return float(np.median(np.abs(values)) / NORMAL_MEDIAN) if len(values) else float("nan")

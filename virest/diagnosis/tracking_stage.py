@@ -16,7 +16,8 @@ from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges, with_d
 from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
-from virest.diagnosis.geometric_ladder import GeometricVerdict, climb
+from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.picture_ladder import Reader
 from virest.image_formation.light import flicker
 from virest.image_formation.row_clock import RowClock

@@ -39,6 +39,18 @@ def gamma_tail(value: Any, shape: Any, scale: Any) -> float:
     return float(special.gammaincc(shape, np.asarray(value, float) / scale))
 
 
+def t_ratio(values: NDArray[np.float64]) -> float:
+    """Mean of values (n,) over its standard error; 0 for fewer than three."""
+    if len(values) < 3:
+        return 0.0
+    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))
+
+
+def chance_of(gain: NDArray[np.float64]) -> float:
+    """Probability (one-sided t test) of so even a gain (blocks,) where there is none."""
+    return student_tail(t_ratio(gain), max(len(gain) - 1, 1))
+
+
 def mean_tail(values: NDArray[np.float64]) -> float:
     """Probability of so large a mean of values (n,) by chance: a one-sided t test against 0; NaN for fewer than two."""
     if len(values) < 2:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from virest.image_formation.point_model import predict
 from virest.inference.observed_tracks import ObservedTracks
-from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.track_fit import ANY_DEPTH, TrackFit
 from virest.inference.track_noise import (
     ORDERS,
@@ -64,7 +64,7 @@ def _flow_beside_relief(pair: TrackPair, way: Array, kept: Array) -> Array:
         left = wanted - rows @ np.linalg.lstsq(matrix, (wanted * root).ravel(), rcond=None)[0]
         squared = (left**2).sum(axis=-1)
         scale = max(float(np.sqrt(np.median(squared))) / NORMAL_MEDIAN / freedom**0.5, 1e-3)
-        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+        weight = cauchy_weight(squared, CAUCHY * scale)
     return np.asarray(np.linalg.norm(left, axis=-1) / np.sqrt(freedom))
 
 

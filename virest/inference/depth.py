@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, TrackTable, predict, turned
-from virest.inference.robust import CAUCHY, NORMAL_MEDIAN
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
@@ -246,7 +246,7 @@ def _robust_plane(rays: Array, inverse: Array, std: Array, start: Array, prior_s
     for _ in range(REWEIGHTINGS):
         squared = (left - rows @ plane) ** 2
         scale = max(float(np.sqrt(np.median(squared))) / NORMAL_MEDIAN, 1.0)
-        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+        weight = cauchy_weight(squared, CAUCHY * scale)
         weighted = rows * (weight / scale**2)[:, None]
         covariance = np.linalg.inv(weighted.T @ rows + information)
         plane = covariance @ (weighted.T @ left + information @ start)

@@ -1,9 +1,25 @@
-"""Constants of robust fits."""
+"""Robust statistics: how wide values scatter whatever lies far out, and how little that then weighs."""
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 CAUCHY = 2.4
 """A value this many standard deviations away has half its weight: 95 % efficient for normal errors (Holland & Welsch
 1977, doi:10.1080/03610927708827533)."""
 NORMAL_MEDIAN, RAYLEIGH_MEDIAN = 0.6745, 1.1774
 """Medians of |x| and of √(x² + y²) for normal x and y of unit variance."""
+MEDIAN_TO_STD = 1.4826
+"""1 / NORMAL_MEDIAN."""
+
+
+def robust_std(values: Array) -> float:
+    """Standard deviation of values about nought, by the median of their sizes; 0 without any."""
+    return MEDIAN_TO_STD * float(np.median(np.abs(values))) if len(values) else 0.0
+
+
+def cauchy_weight(squared: Array, width: float) -> Array:
+    """Weights, 0 to 1, of values by their squares: a half at ``width``."""
+    return np.asarray(1.0 / (1.0 + squared / width**2))

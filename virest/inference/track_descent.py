@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict, with_profile
-from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.term import Term
 from virest.inference.travel_direction import find_directions, without_directions
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
@@ -179,7 +179,7 @@ class Problem:
         squared = (left**2).sum(axis=-1)
         typical = NORMAL_MEDIAN if state.depth_spread == ANY_DEPTH else RAYLEIGH_MEDIAN
         scale = max(float(np.median(np.sqrt(squared))) / typical, SMALLEST_SCALE)
-        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+        weight = cauchy_weight(squared, CAUCHY * scale)
         if isinstance(scene, DirectedMotion):
             noise, flow = table.noise_px[table.pair], np.asarray(look.prediction.per_step)
             rows, left = without_directions(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
+from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def _residual(pair: TrackPair) -> tuple[Array, int]:
         residual = step - basis @ np.linalg.lstsq(basis * root, step * root, rcond=None)[0]
         squared = (residual**2).sum(axis=-1)
         scale = max(float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN, 1e-3)
-        weight = 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
+        weight = cauchy_weight(squared, CAUCHY * scale)
     return residual, basis.shape[1]
 
 

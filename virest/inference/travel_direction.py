@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.inference.robust import CAUCHY, NORMAL_MEDIAN
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -34,7 +34,7 @@ def find_directions(flow: Array, difference: Array, group: Index, groups: int, s
         unit = across / np.maximum(length, 1e-12)[:, None]
         distance = np.abs(np.einsum("ni,ni->n", unit, direction[group]))
         scale = max(float(np.median(distance)) / NORMAL_MEDIAN, 1e-3)
-        weight = 1.0 / (1.0 + (distance / (CAUCHY * scale)) ** 2)
+        weight = cauchy_weight(distance**2, CAUCHY * scale)
         direction = _least(unit * np.sqrt(weight)[:, None], group, groups)
     return direction
 

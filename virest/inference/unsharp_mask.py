@@ -27,6 +27,7 @@ from virest.image_formation.kernels import blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.inference.chance import normal_tail
 from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
+from virest.inference.robust import robust_std
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -171,7 +172,7 @@ def _significance(profiles: Array) -> float:
     """How far they stand above their plateaus, less what bare movies do, in deviations."""
     mean = np.median(profiles, axis=0)
     at = int(np.argmax(np.where(GRID_PX > 0, mean, 0.0)))
-    typical = 1.4826 * np.median(np.abs(profiles[:, at] - mean[at]))
+    typical = robust_std(profiles[:, at] - mean[at])
     noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / ALIKE)
     return float((mean[at] - 1 - BARE_OVERSHOOT) / np.hypot(noise, BARE_STD))
 

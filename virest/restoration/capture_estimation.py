@@ -20,6 +20,7 @@ from virest.capture.imu import ImuSamples
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
 from virest.image_formation.row_motion import FrameTranslation, frame_times_s
+from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
 from virest.inference.coarse_alignment import MIN_EXPLAINED, STEP_S, align_coarsely
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.guide_choice import find_guide
@@ -33,7 +34,7 @@ from virest.inference.synchronisation import (
 )
 from virest.inference.tracking import TrackPair, track_pairs
 from virest.inference.unsharp_mask import MOST_FRAMES
-from virest.inference.visual_inertial import FrameMotion, VisualInertialAlignment, align, choose_runs
+from virest.inference.visual_inertial import align, choose_runs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.restoration.blur_length_check import TilePowers, kept_powers, path_scale, telling

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
+from virest.inference.camera_travel import VisualInertialAlignment
 from virest.inference.coarse_alignment import MIN_PAIRS, SKEWS, align_coarsely
 from virest.inference.observed_tracks import ObservedTracks, guessed_lens, observe_tracks
 from virest.inference.tracking import TrackPair
-from virest.inference.visual_inertial import VisualInertialAlignment
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.plan_notes import NoteCode
 from virest.restoration.profile_conflict import CONTRADICTED, Settled, settle_conflict

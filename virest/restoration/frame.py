@@ -136,7 +136,7 @@ def restore_frame(
     deblurring: Deblurring | None = None
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-        blur = _FrameBlur(motion, anchor, longest_px, covariance_px2, light)
+        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, light)
         restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
@@ -242,7 +242,7 @@ def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: 
 
 
 @dataclass(frozen=True, slots=True)
-class _FrameBlur:
+class _KnownBlur:
     """What is known of a frame's blur before its picture is looked at."""
 
     motion: RowMotion
@@ -274,7 +274,7 @@ class _BlurStatistics:
 
 def _deblurred(
     picture: NDArray[np.uint8],
-    blur: _FrameBlur,
+    blur: _KnownBlur,
     settings: RestorationSettings,
     confirmed: ConfirmedGain | None,
     neighbours: NeighbourFinder | None = None,
@@ -310,7 +310,7 @@ def _deblurred(
 
 
 def _blur_statistics(
-    picture: NDArray[np.uint8], blur: _FrameBlur, settings: RestorationSettings, confirmed: ConfirmedGain | None
+    picture: NDArray[np.uint8], blur: _KnownBlur, settings: RestorationSettings, confirmed: ConfirmedGain | None
 ) -> _BlurStatistics:
     """Noise, detail and kernels of a picture (height, width, 3)."""
     height, width = picture.shape[:2]
@@ -329,7 +329,7 @@ def _blur_statistics(
 
 
 def _part_taken(
-    blur: _FrameBlur,
+    blur: _KnownBlur,
     settings: RestorationSettings,
     blurred: BlurredPicture,
     measured: _BlurStatistics,
@@ -356,7 +356,7 @@ def _part_taken(
 
 
 def _details(
-    blur: _FrameBlur,
+    blur: _KnownBlur,
     settings: RestorationSettings,
     measured: _BlurStatistics,
     joined: JoinedNeighbours,

@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, ground
-from virest.inference.chance import chi2_tail, student_tail
+from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.coarse_alignment import MIN_PAIRS
+from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.profile_terms import CLOCK_SKEW, careful_terms, shift_offset
-from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
+from virest.inference.robust import RAYLEIGH_MEDIAN
+from virest.inference.time_blocks import even_blocks, halves
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.inference.tracking_bias import bias_std
-from virest.motion.scene_motion import DirectedMotion, Motion
+from virest.motion.scene_motion import Motion
 from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
 
 log = logging.getLogger(__name__)
@@ -215,7 +217,7 @@ class _Search:
             without = self._held_out(here, fit) if without is None else without
             scale = min(fit.scale, found.scale)
             gain = self._block_loss(without, scale) - self._block_loss(self._held_out(start, found), scale)
-            if _p_of_mean(gain) < HELD_OUT_P:
+            if chance_of(gain) < HELD_OUT_P:
                 return start, found
         return None
 
@@ -252,28 +254,15 @@ class _Search:
         """Whitened distances (n,) of all points from fits that did not see their block."""
         block = self._block()
         distance = np.empty(len(self.table))
-        for fold in (0, 1):
-            seen = block % 2 != fold
+        for seen in halves(block):
             own = self.fit(start, seen)
-            scene = many_directions(self.table) if isinstance(own.scene, DirectedMotion) else own.scene
-            everywhere = fit_tracks(self.imu, self.table, own.profile, (), scene, max_iterations=0, known=own.ground)
-            distance[~seen] = everywhere.distance_at(fit.depth_spread_per_m)[~seen]
+            distance[~seen] = distances(self.imu, own, self.table, fit.depth_spread_per_m)[~seen]
         return distance
 
     def _block(self) -> NDArray[np.intp]:
         """(n,) number of each point's block of time."""
-        pairs = self.table.n_pairs
-        return np.asarray(self.table.pair * min(BLOCKS, pairs) // pairs)
+        return even_blocks(self.table.pair, self.table.n_pairs, min(BLOCKS, self.table.n_pairs))
 
     def _block_loss(self, distance: Array, scale: float) -> Array:
         """(blocks,) mean Cauchy loss."""
-        block = self._block()
-        loss = np.log1p((distance / (CAUCHY * scale)) ** 2)
-        return np.asarray(np.bincount(block, loss) / np.maximum(np.bincount(block), 1))
-
-
-def _p_of_mean(gain: Array) -> float:
-    """One-sided probability of so large a mean gain by chance."""
-    if len(gain) < 3 or gain.mean() <= 0:
-        return 1.0
-    return student_tail(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-12), len(gain) - 1)
+        return group_means(loss(distance, scale), self._block())

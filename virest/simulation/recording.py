@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.profile import write_profile
+from virest.camera.profile_file import write_profile
 from virest.errors import OutputError, SettingsError
 from virest.simulation.effects import AppliedEffect
 from virest.simulation.session import (

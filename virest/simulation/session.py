@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, require_usable
+from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile
+from virest.camera.profile_file import require_usable
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
 from virest.errors import SettingsError

@@ -26,7 +26,8 @@ from virest.app.calibrate import plan_calibration
 from virest.app.simulate import simulate_command
 from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
-from virest.camera.profile import CameraProfile, read_profile
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import read_profile
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided

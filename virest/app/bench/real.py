@@ -16,7 +16,7 @@ from virest.app.diagnose import climb_as_command, open_source
 from virest.calibration.geometry import calibrate_geometry
 from virest.capture.video import GrayReader, probe_movie
 from virest.diagnosis.findings import Diagnosis
-from virest.diagnosis.geometric_ladder import shown
+from virest.diagnosis.geometric_findings import shown
 from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided
 

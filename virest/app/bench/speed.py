@@ -27,7 +27,7 @@ from virest.app.bench.peers import (
 from virest.app.bench.tables import table
 from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process
 from virest.app.doctor import processor
-from virest.app.jobs import prepare_worker
+from virest.app.worker_processes import prepare_worker
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_gray
 from virest.image_formation import transforms

@@ -124,8 +124,8 @@ def process(
         raise typer.BadParameter("--video: several captures need {capture} in the film's name")
     one_thread_each()
     from virest.app.finish import FinishWishes
-    from virest.app.jobs import PictureWishes
     from virest.app.process import ProcessOptions, process_captures
+    from virest.app.segments import PictureWishes
     from virest.app.settings import compose_settings
     from virest.capture.location import locate
 

@@ -147,7 +147,7 @@ def simulate(
     rest, rest_cutoff_hz = one_or_two("--stabiliser-rest", stabiliser_rest)
     one_thread_each()
     from virest.app.simulate import simulate_command
-    from virest.camera.profile import read_profile
+    from virest.camera.profile_file import read_profile
     from virest.simulation.phone_isp import make_isp
 
     phone = make_isp(

@@ -1,0 +1,129 @@
+"""YAML files of bounded size as plain mappings, and what is said of a wrong one: the key, and its nearest neighbour."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from virest.errors import SettingsError
+
+MAX_PROFILE_BYTES = 1_000_000
+MAX_DEPTH = 20
+OPENCV_HEAD = re.compile(r"\A\ufeff?%YAML:1\.0[^\n]*")
+"""First line of OpenCV's files, which is no YAML directive."""
+MAX_DIGITS = 250
+"""No number of this many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
+NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
+
+
+def load_yaml_mapping(path: Path) -> dict[str, Any]:
+    """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
+    try:
+        if not path.is_file():
+            what = "is not a regular file" if path.exists() else "no such file"
+            raise SettingsError(f"{path}: {what}", hint="pass a YAML file")
+        size = path.stat().st_size
+        if size > MAX_PROFILE_BYTES:
+            raise SettingsError(f"{path.name}: {size} bytes, more than {MAX_PROFILE_BYTES}", hint="is it a profile?")
+        text = OPENCV_HEAD.sub("", path.read_text(encoding="utf-8"), count=1)
+        _require_plain(text, path.name)
+        _require_keys_once(yaml.compose(text, Loader=yaml.SafeLoader), path.name)
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "cannot be read"
+        raise SettingsError(f"{path.name}:{where} is not plain YAML: {problem}", hint="see docs/profile.md") from None
+    except (UnicodeDecodeError, RecursionError):
+        raise SettingsError(f"{path.name}: is not YAML text", hint="is it a profile?") from None
+    except (ValueError, LookupError, AttributeError, OverflowError):  # of the library, for dates and tagged values
+        text = f"{path.name}: a value is not of the kind that it is written as, such as a date that is none"
+        raise SettingsError(text, hint="write plain numbers and words, see docs/profile.md") from None
+    except OSError as error:
+        raise SettingsError(f"{path}: {error.strerror}", hint="check the path and its permissions") from None
+    if not isinstance(content, dict):
+        raise SettingsError(f"{path.name}: no keys at the top level", hint="see docs/profile.md")
+    return content
+
+
+def _require_plain(text: str, name: str) -> None:
+    """Refuse aliases, deep nesting and endless numbers before anything is built of them."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise SettingsError(f"{name}: YAML aliases are not accepted", hint="write the values out")
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_DIGITS and NUMERIC.fullmatch(event.value):
+            shown = f"{event.value[:20]}…"
+            raise SettingsError(f"{name}: {shown} has {len(event.value)} digits", hint=f"at most {MAX_DIGITS} are read")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH:
+            raise SettingsError(f"{name}: nested more than {MAX_DEPTH} deep", hint="is it a profile?")
+
+
+def _require_keys_once(node: yaml.Node | None, name: str) -> None:
+    """Refuse a key that stands twice in one block: the last would hold, and nobody would know."""
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _require_keys_once(item, name)
+    if not isinstance(node, yaml.MappingNode):
+        return
+    seen: set[str] = set()
+    for key, value in node.value:
+        if isinstance(key, yaml.ScalarNode):
+            if key.value in seen:
+                shown = _printable(key.value[:60])
+                line = key.start_mark.line + 1
+                raise SettingsError(f"{name}: line {line}: '{shown}' is written a second time", hint="keep one of them")
+            seen.add(key.value)
+        _require_keys_once(value, name)
+
+
+def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
+    """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
+    first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
+    path = _key_path(first)
+    where = _printable(".".join(path))
+    if first["type"] == "extra_forbidden":
+        known = _keys_at(model, path[:-1])
+        near = _nearest(path[-1], known)
+        hint = f"did you mean '{near}'?" if near else f"known keys: {', '.join(known)}"
+        return SettingsError(f"{name}: unknown key '{where[:80]}', {hint}")
+    found = first.get("input")
+    value = "" if isinstance(found, dict) else ", got null" if found is None else f", got {str(found)[:60]!r}"
+    message = _printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
+    return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see docs/profile.md")
+
+
+def _key_path(fault: Any) -> list[str]:
+    """Where a fault of pydantic lies: its keys, without the names of the forms that pydantic tried between them."""
+    *above, last = map(str, fault["loc"] or ("",))
+    forms = ("_", "literal", "function-", "constrained")
+    is_key = last and not last.startswith(forms)
+    keys = [part for part in above if not part.startswith(forms)]
+    return [*keys, last] if is_key or fault["type"] == "extra_forbidden" else keys  # an unknown key has any name
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _nearest(key: str, known: list[str]) -> str | None:
+    """The known key that is meant: one that begins alike before one that only looks alike."""
+    alike = [k for k in known if k.startswith(key) or key.startswith(k)]
+    return next(iter(alike or difflib.get_close_matches(key, known, n=1, cutoff=0.5)), None)
+
+
+def _keys_at(model: Any, path: list[str]) -> list[str]:
+    for part in path:
+        found = model.model_fields.get(part)
+        if found is None:
+            continue
+        candidates = [found.annotation, *getattr(found.annotation, "__args__", ())]
+        candidates += [inner for c in candidates for inner in getattr(c, "__args__", ())]
+        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), model)
+    return sorted(model.model_fields)

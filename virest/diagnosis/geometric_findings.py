@@ -1,0 +1,80 @@
+"""Causes that move points, as findings: values with their deviations, gains, and sentences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange
+from virest.diagnosis.geometric_evidence import depth_of
+from virest.diagnosis.geometric_verdict import Accepted, GeometricVerdict
+from virest.effects.table import EFFECTS
+from virest.inference.tracking_bias import bias_std
+
+
+def findings_of(verdict: GeometricVerdict) -> list[Finding]:
+    """The accepted causes as findings, strongest first."""
+    found = []
+    for entry in verdict.accepted:
+        changes = changes_of(verdict, entry)
+        held_out = HeldOutGain(GEOMETRY, entry.before, entry.after, verdict.noise_px)
+        sentence = _sentence(entry, changes)
+        found.append(Finding(entry.name, changes, held_out, entry.rivals, entry.p_value, sentence))
+    return sorted(found, key=lambda f: f.held_out.after**2 - f.held_out.before**2)
+
+
+def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
+    """Parameters of one cause, before and after; where the ladder has two ends, with how far those are apart.
+
+    Either end is as likely: the second moment about the value told grows by half the squared difference.
+    """
+    changes = _changes_at(verdict, entry)
+    twin = next((e for e in verdict.rival.accepted if e.name == entry.name), None) if verdict.rival else None
+    if verdict.rival is None or twin is None:
+        return changes
+    there = _changes_at(verdict.rival, twin)
+    return {name: _apart(change, there[name]) for name, change in changes.items()}
+
+
+def _apart(change: ParameterChange, there: ParameterChange) -> ParameterChange:
+    if change.std is None or isinstance(change.estimate, str):
+        return change
+    off = np.subtract(change.estimate, there.estimate) / np.sqrt(2)
+    return replace(change, std=np.hypot(change.std, off).tolist())
+
+
+def _changes_at(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
+    nominal, found = verdict.nominal.profile, verdict.model.profile
+    if entry.name == "scene_depth":
+        depth_m, std = depth_of(verdict.fit, verdict.table)
+        std = float(np.hypot(std, depth_m * bias_std(verdict.fit, "scene_depth", verdict.step_noise_px)[0]))
+        return {"depth_m": ParameterChange(nominal.depth_m, depth_m, std)}
+    if entry.name == "frame_lag":
+        extensions = found.extensions
+        return {
+            "lag_s": ParameterChange(0.0, extensions.frame_lag_s, verdict.lag_std_s),
+            "frames": ParameterChange(0, extensions.frame_lag_frames, None),
+        }
+    effect = entry.effect
+    assert effect is not None
+    if effect.term is None:
+        return effect.changes(nominal, found, None)
+    part = verdict.fit.slices[effect.term.name]
+    floor = bias_std(verdict.fit, effect.name, verdict.step_noise_px)
+    left_open = verdict.left_open.get(effect.name, np.zeros(1))
+    stds = np.sqrt(np.diag(verdict.fit.covariance)[part] + floor**2 + left_open)
+    return effect.changes(nominal, found, stds)
+
+
+def _sentence(entry: Accepted, changes: dict[str, ParameterChange]) -> str:
+    values = {name: shown(change.estimate) for name, change in changes.items()}
+    return EFFECTS[entry.name].sentence.format(**values)
+
+
+def shown(value: Any) -> str:
+    """A value as people read it."""
+    if isinstance(value, list):
+        return "(" + ", ".join(shown(v) for v in value) + ")"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

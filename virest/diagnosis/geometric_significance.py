@@ -1,0 +1,107 @@
+"""Whether a cause that moves points is more than chance, beside those that are in the model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.calibration.physical_limits import is_depth
+from virest.camera.profile import CameraProfile
+from virest.diagnosis.candidates import Candidate
+from virest.diagnosis.cross_validation import JUDGE_POINTS
+from virest.diagnosis.geometric_effects import GeometricEffect
+from virest.diagnosis.geometric_evidence import KNOWN_DEPTH_STD, Evidence, Model, depth_of
+from virest.diagnosis.selection import POINT_LEVELS, WORD_LEVELS
+from virest.image_formation.point_model import TrackTable
+from virest.image_formation.row_clock import right_way_round
+from virest.inference.chance import chance_of, chi2_tail
+from virest.inference.track_fit import TrackFit
+from virest.inference.tracking_bias import bias_std
+
+Array = NDArray[np.float64]
+STABILISER_CUTOFF_HZ = (0.03, 15.0)
+
+
+def refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:
+    """A model with its terms and scene fitted anew to this many points, its readout the right way round."""
+    table = evidence.table(model, points)
+    fitted = evidence.fit(model, model.terms, table)
+    return replace(model, profile=right_way_round(fitted.profile), scene=fitted.scene), fitted
+
+
+def fitted_with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
+    """The model with the candidate in it, fitted anew."""
+    return refitted(evidence, replace(candidate.model, terms=(*candidate.model.terms, *candidate.added)), JUDGE_POINTS)
+
+
+def significant(
+    evidence: Evidence, candidate: Candidate, before: CameraProfile, gain: Array
+) -> tuple[Model | None, float]:
+    """The model with the candidate in it, if its value is significant, and the probability that it is nought.
+
+    A word has no value: its probability is that of so even a gain (blocks,) by chance.
+    """
+    model, fitted = fitted_with(evidence, candidate)
+    if candidate.name != "scene_depth" and (candidate.effect is None or candidate.effect.term is None):
+        p_value = chance_of(gain)
+        return (model if WORD_LEVELS.significant(p_value) else None), p_value
+    if candidate.name == "scene_depth":
+        p_value = depth_p(fitted, evidence.table(model, JUDGE_POINTS), before.depth_m)
+    else:
+        p_value = p_value_of(evidence, fitted, candidate, model.profile, before)
+    return (model if POINT_LEVELS.significant(p_value) else None), p_value
+
+
+def p_value_of(
+    evidence: Evidence, fitted: TrackFit, candidate: Candidate, found: CameraProfile, before: CameraProfile
+) -> float:
+    """Probability that a candidate's value is nought; 1 where no phone is like that."""
+    assert candidate.effect is not None
+    return p_if_plausible(evidence, fitted, candidate.effect, found, before)
+
+
+def p_if_plausible(
+    evidence: Evidence, fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile
+) -> float:
+    """Probability that an effect's value is nought; 1 where it ends at, or beyond, what a phone can be."""
+    if not is_plausible(evidence, effect, found, effect.total_change(before, found)):
+        return 1.0
+    return p_of(fitted, effect, found, before, evidence.typical_px)
+
+
+def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float:
+    """Probability of so large a change of the inverse depth by chance; 1 where the depth ends at its limits."""
+    depth_m, std = depth_of(fitted, table)
+    if not is_depth(depth_m):
+        return 1.0
+    given_m = given_m or np.inf
+    nearer = 1 / depth_m - 1 / given_m
+    certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
+    return chi2_tail((nearer / max(certain, 1e-9)) ** 2, 1)
+
+
+def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
+    """Whether a phone can be like that: a cause at or beyond these bounds compensates for another."""
+    if effect.name in evidence.impossible(found):
+        return False
+    if effect.name == "stabilisation":
+        low, high = STABILISER_CUTOFF_HZ
+        extensions = found.extensions
+        return 0 < extensions.stabilisation_fraction <= 1.1 and low < extensions.stabilisation_cutoff_hz < high
+    assert effect.effect.steps is not None
+    return bool(np.all(np.abs(change) < effect.effect.steps.believable))
+
+
+def p_of(
+    fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile, noise_px: float
+) -> float:
+    """Probability of so large a change by chance: a chi-square of the change, deviations with tracking's own bias."""
+    change = effect.total_change(before, found)
+    floor = bias_std(fitted, effect.name, noise_px)
+    part = fitted.slices[effect.name]
+    covariance = fitted.covariance[part, part] + np.diag(floor**2)
+    if effect.name == "stabilisation":
+        return chi2_tail(change[0] ** 2 / covariance[0, 0], 1)
+    return chi2_tail(change @ np.linalg.solve(covariance, change), len(change))

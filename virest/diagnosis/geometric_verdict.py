@@ -1,0 +1,64 @@
+"""Where the ladder of what moves points ended: the causes that entered, the model with them, and its fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.diagnosis.findings import Rival, Rung
+from virest.diagnosis.geometric_effects import GeometricEffect
+from virest.diagnosis.geometric_evidence import Evidence, Model
+from virest.image_formation.point_model import TrackTable
+from virest.inference.track_fit import TrackFit
+
+Array = NDArray[np.float64]
+FINAL_POINTS = 7000
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A cause that is in the model."""
+
+    name: str
+    effect: GeometricEffect | None
+    word: str
+    before: float
+    after: float
+    p_value: float
+    rivals: tuple[Rival, ...]
+
+
+@dataclass(slots=True)
+class GeometricVerdict:
+    """Where the ladder ended."""
+
+    model: Model
+    fit: TrackFit
+    table: TrackTable
+    accepted: list[Accepted]
+    rungs: list[Rung]
+    nominal: Model
+    nominal_fit: TrackFit
+    nominal_table: TrackTable
+    nominal_rms_px: float
+    final_rms_px: float
+    noise_px: float
+    """What tracking alone makes, as an rms like the two above."""
+    step_noise_px: float
+    """Typical standard deviation of a tracked step, per coordinate."""
+    rival: GeometricVerdict | None = None
+    """Another end of the ladder that held-out points do not tell from this one; None: there is none."""
+    lag_std_s: float | None = None
+    """Of a start-up lag; None without one."""
+    astray: float = 0.0
+    """Part of the points that lie in parts of the picture that move together on their own, and were left out."""
+    notes: list[str] = field(default_factory=list)
+    fields: list[Any] = field(default_factory=list)
+    """Unknown effects that were found beyond the causes: :class:`virest.diagnosis.field.records.FittedField`."""
+    evidence: Evidence | None = None
+    """The pairs that the model was fitted to."""
+    left_open: dict[str, Array] = field(default_factory=dict)
+    """Variance (k,) of causes' values, by name, from further causes that points which stay astray leave open."""

@@ -1,0 +1,351 @@
+"""The camera's travel as it was found: windows of a few seconds, stretches of them, and the motion over one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.image_formation.point_model import IntegratedMotion, TrackTable, centre
+from virest.inference.depth import FrameDepth, TriangulatedPoints, frame_depth
+from virest.inference.profile_terms import GYRO_BIAS, TIME_OFFSET
+from virest.inference.relief import View, WindowRelief
+from virest.inference.track_fit import TrackFit
+from virest.inference.tracking_bias import SHARED_RELIEF
+from virest.motion.displacement import Displacement
+from virest.motion.scene_motion import InertialMotion
+
+Array = NDArray[np.float64]
+OFFSET_FLOOR_S = 3e-5
+"""And its error in time."""
+ACCEL_SCALE_STD = 0.01
+"""How far a phone's accelerometer may be off in scale (makers' tolerance of its sensitivity): lengths go with it."""
+NEAR_WINDOW_S = 1.5
+"""Frames this far beyond a window's tracked points still take its velocity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A few seconds, judged."""
+
+    start_s: float
+    """First tracked frame's stamp, camera clock."""
+    end_s: float
+    scale_std: float
+    """Relative standard deviation of the metric scale: that of the plane's inverse depth along the optical axis."""
+    velocity_std: float
+    """rms standard deviation of the velocity over its rms."""
+    parallax: float
+    """What rotation alone leaves over what is left with translation."""
+    residual: float
+    """Robust standard deviation of what is left, in units of the tracking noise."""
+    reason: str
+    """Why the window's velocity is not known in metres; empty: it is."""
+    spread: float = 0.0
+    """Standard deviation of inverse depths about the plane, part of the plane's."""
+    flow_std: float = 0.0
+    """rms standard deviation of velocity over depth, part of its rms."""
+    over_depth: bool = False
+    """Whether velocity over depth is known although metres are not."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether pictures may be restored by the window's velocity over its depth."""
+        return not self.reason or self.over_depth
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Windows fitted together."""
+
+    fit: TrackFit
+    table: TrackTable
+    windows: tuple[Window, ...]
+    points: TriangulatedPoints
+    velocity_floor_m_s: Array
+    """(windows,) what tracking's own bias makes of the velocity."""
+    nudged: tuple[IntegratedMotion, ...]
+    """The fit's ground with each value of its terms one quotient's step further."""
+    reliefs: tuple[WindowRelief | None, ...] = ()
+    """By window; None: the plane tells held-out points as well as a surface does."""
+
+    @property
+    def scene(self) -> InertialMotion:
+        """The fitted path and planes."""
+        assert isinstance(self.fit.scene, InertialMotion)
+        return self.fit.scene
+
+    def gravity(self) -> tuple[Array, Array]:
+        """Gravity (3,) in world axes, m/s², and its standard deviations."""
+        return self.scene.gravity_m_s2, self._std(slice(0, 3))
+
+    def accel_bias(self) -> tuple[Array, Array]:
+        """The accelerometer's bias (3,) in IMU axes, m/s², and its standard deviations."""
+        return self.scene.accel_bias_m_s2, self._std(slice(3, 6))
+
+    def accel_delay(self) -> tuple[float, float]:
+        """Seconds by which accelerations are older than their stamps, and the standard deviation."""
+        return self.scene.accel_delay_s, float(self._std(slice(6, 7))[0])
+
+    def _std(self, part: slice) -> Array:
+        return np.sqrt(np.maximum(np.diag(self.scene_covariance)[part], 0.0))
+
+    @property
+    def scene_covariance(self) -> Array:
+        """Of the scene's vector."""
+        terms = len(self.fit.change)
+        return self.fit.covariance[terms:, terms:]
+
+    def origin_s(self, window: int) -> float:
+        """Middle of a window, IMU clock."""
+        return float(self.fit.profile.imu_time_s(self.table.origin_s[window]))
+
+    def velocity(self, window: int, time_s: Array) -> Array:
+        """Velocity (n, 3) of the camera's centre in world axes, IMU clock (n,)."""
+        return self._velocity(self.fit.ground, window, time_s)
+
+    def seen_velocity(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
+        """Velocity (n, 3) in the camera's axes at stamps (n,), camera clock, and its covariance (n, 3, 3)."""
+        velocity, _, slope, _ = self._seen(window, stamp_s)
+        covariance = self.fit.doubt.of(slope) + SHARED_RELIEF**2 * self.fit.doubt.by_relief(slope)
+        scale = ACCEL_SCALE_STD**2 * velocity[:, :, None] * velocity[:, None, :]
+        return velocity, covariance + scale + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
+
+    def flow(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
+        """Velocity over depth (n, 3) on the optical axis, 1/s, camera axes at stamps (n,), and its covariance.
+
+        A common scale of velocity and depth cancels, however little is known of it.
+        """
+        velocity, nearness, slope, nearness_slope = self._seen(window, stamp_s)
+        slope = nearness[:, None, None] * slope + velocity[:, :, None] * nearness_slope[:, None, :]
+        floor = self.velocity_floor_m_s[window] * nearness
+        return nearness[:, None] * velocity, self.fit.doubt.of(slope) + (floor**2)[:, None, None] * np.eye(3)
+
+    def _seen(self, window: int, stamp_s: Array) -> tuple[Array, Array, Array, Array]:
+        """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the optical axis, and their slopes.
+
+        Slopes (n, 3, k) and (n, k) are per unit of everything that was fitted.  The terms of the profile count too: a
+        turned IMU turns gravity with it, which costs the velocity nothing.
+        """
+        velocity, nearness, rotation = self._seen_from(self.fit.ground, window, stamp_s)
+        slope = np.zeros((len(stamp_s), 3, len(self.fit.covariance)))
+        nearness_slope = np.zeros((len(stamp_s), slope.shape[-1]))
+        quotients = [step for term in self.fit.terms for step in term.quotient]
+        for k, (nudged, quotient) in enumerate(zip(self.nudged, quotients, strict=True)):
+            moved, nearer, _ = self._seen_from(nudged, window, stamp_s)
+            slope[..., k] = (moved - velocity) / quotient
+            nearness_slope[:, k] = (nearer - nearness) / quotient
+        own = len(quotients) + 7 + 6 * window
+        back = np.swapaxes(rotation, -1, -2)
+        time_s = np.asarray(self.fit.profile.imu_time_s(stamp_s))
+        moves, origin = self.fit.ground.displacement, np.array([self.origin_s(window)])
+        assert moves is not None
+        slope[..., len(quotients) : len(quotients) + 7] = back @ _velocity_slope(moves, time_s, origin)
+        slope[..., own : own + 3] = back
+        nearness_slope[:, own + 3 : own + 6] = rotation[..., 2]
+        return velocity, nearness, slope, nearness_slope
+
+    def _seen_from(self, known: IntegratedMotion, window: int, stamp_s: Array) -> tuple[Array, Array, Array]:
+        """Velocity in camera axes, inverse depth on the optical axis, and R_world_cam, (n, 3), (n,), (n, 3, 3)."""
+        time_s = np.asarray(known.profile.imu_time_s(stamp_s))
+        rotation = known.trajectory.orientation(time_s)
+        velocity = np.einsum("nji,nj->ni", rotation, self._velocity(known, window, time_s))
+        return velocity, np.maximum(rotation[..., 2] @ self.scene.plane_per_m[window], 1e-6), rotation
+
+    def _velocity(self, known: IntegratedMotion, window: int, time_s: Array) -> Array:
+        moves, scene = known.displacement, self.scene
+        assert moves is not None
+        origin = np.array([float(known.profile.imu_time_s(self.table.origin_s[window]))])
+        slope = _velocity_slope(moves, time_s, origin)
+        own = np.concatenate([scene.gravity_m_s2, scene.accel_bias_m_s2, [scene.accel_delay_s]])
+        velocity = scene.velocity_m_s[window] + moves.path(time_s, 1) - moves.path(origin, 1)
+        # the IMU's distance from the camera adds −R (ω × p_cam_imu)
+        turning = np.cross(known.trajectory.rate_rad_s(time_s), moves.arm_cam_m)
+        arm = np.einsum("nij,nj->ni", known.trajectory.orientation(time_s), turning)
+        return np.asarray(velocity + slope @ own - arm)
+
+    def plane_std_per_m(self, window: int) -> float:
+        """Standard deviation of the plane's inverse depth along the optical axis at the window's middle."""
+        _, nearness, _, slope = self._seen(window, self.table.origin_s[[window]])
+        return float(np.hypot(np.sqrt(self.fit.doubt.of(slope[:, None, :])[0, 0, 0]), ACCEL_SCALE_STD * nearness[0]))
+
+    def place(self, window: int, time_s: Array) -> Array:
+        """Camera's centre (n, 3) from its place at the window's middle, world axes."""
+        moves = self.fit.ground.displacement
+        assert moves is not None
+        velocity = np.broadcast_to(self.scene.velocity_m_s[window], (len(time_s), 3))
+        return centre(moves, self.scene, velocity, time_s, np.full(len(time_s), self.origin_s(window)))[0]
+
+    def plane(self, window: int, time_s: float) -> Array:
+        """The window's plane (3,) in camera axes at a time: the inverse depth of a ray r with z = 1 is plane · r."""
+        plane = self.scene.plane_per_m[window]
+        distance = max(1 - float(plane @ self.place(window, np.array([time_s]))[0]), 0.05)
+        return np.asarray(self.fit.ground.trajectory.orientation(time_s).T @ plane / distance)
+
+    def depth(self, window: int, time_s: float) -> FrameDepth:
+        """The scene before the camera at a time, IMU clock: a plane, and a surface on it where the window has one."""
+        found = self.frame_plane(window, time_s)
+        relief = self.reliefs[window] if self.reliefs else None
+        if relief is None:
+            return found
+        surface = relief.surface(self.view(window, time_s, found.plane_per_m))
+        if surface is None:
+            return found
+        lens = self.fit.ground.lens
+        middle = lens.rays(0.5 * np.array([lens.lens.width - 1.0, lens.lens.height - 1.0]), time_s)
+        return found.with_relief(surface, middle, self.windows[window].scale_std)
+
+    def frame_plane(self, window: int, time_s: float) -> FrameDepth:
+        """The plane through the points about a time."""
+        return frame_depth(
+            self.points,
+            window,
+            time_s,
+            self.fit.ground.trajectory.orientation(time_s),
+            self.place(window, np.array([time_s]))[0],
+            self.fit.ground.lens,
+            self.plane(window, time_s),
+            self.fit.depth_spread_per_m,
+            self.windows[window].scale_std,
+        )
+
+    def view(self, window: int, time_s: float, plane_per_m: Array) -> View:
+        """The camera's pose at a time before a plane."""
+        place = self.place(window, np.array([time_s]))[0]
+        return View(time_s, self.fit.ground.trajectory.orientation(time_s), place, plane_per_m)
+
+
+def _velocity_slope(moves: Displacement, time_s: Array, origin_s: Array) -> Array:
+    """Change (n, 3, 7) of the velocity since an origin (1,) per unit of gravity, accelerometer bias and delay."""
+    per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin_s, 1)).reshape(-1, 3, 3)
+    per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin_s, 1)
+    since = (time_s - origin_s)[:, None, None] * np.eye(3)
+    return np.concatenate([since, -per_bias, per_delay[..., None]], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameMotion:
+    """The camera's centre over one frame, and what it looked at; camera axes at the frame's reference time."""
+
+    velocity_m_s: Array
+    """(3,) at the reference time."""
+    reference_s: float
+    """Camera clock."""
+    acceleration_m_s2: Array
+    """(3,) mean over the frame, without gravity."""
+    depth: FrameDepth
+    unscaled: str = ""
+    """Why only velocity over depth is known, not metres; empty: metres are."""
+
+
+@dataclass(frozen=True, slots=True)
+class VisualInertialAlignment:
+    """Velocity, gravity, scale and accelerometer bias along a capture, as far as its motion determines them."""
+
+    stretches: tuple[Stretch, ...]
+    reason: str
+    """Why nothing could be fitted at all; empty otherwise."""
+
+    @property
+    def windows(self) -> tuple[Window, ...]:
+        """All windows in order of time."""
+        return tuple(window for stretch in self.stretches for window in stretch.windows)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether any window's velocity is known in metres."""
+        return any(not window.reason for window in self.windows)
+
+    @property
+    def refused(self) -> str:
+        """Why not all windows' velocities are known in metres, the commonest reason first; empty if all are."""
+        if self.reason:
+            return self.reason
+        reasons = [window.reason for window in self.windows if window.reason]
+        return max(reasons, key=reasons.count) if reasons else ""
+
+    def find(self, camera_time_s: float, *, over_depth: bool = False) -> tuple[Stretch, int] | str:
+        """The window that an instant (camera clock) belongs to, or why there is none.
+
+        over_depth: windows that know velocity over depth only will do.
+        """
+        at = [(s, k, _distance(w, camera_time_s), w) for s in self.stretches for k, w in enumerate(s.windows)]
+        near = [entry for entry in at if entry[2] <= NEAR_WINDOW_S]
+        if not near:
+            return self.reason or "no tracked points about this frame"
+        good = [entry for entry in near if not entry[3].reason or (over_depth and entry[3].over_depth)]
+        if not good or min(entry[2] for entry in good) > min(entry[2] for entry in near) + 0.5 * NEAR_WINDOW_S:
+            return min(near, key=lambda entry: entry[2])[3].reason
+        stretch, window, _, _ = min(good, key=lambda entry: entry[2])
+        return stretch, window
+
+    def frame(self, reference_s: float, start_s: float, end_s: float) -> FrameMotion | str:
+        """Motion over a frame that is taken from start_s to end_s, camera clock; or why it is not known."""
+        found = self.find(0.5 * (start_s + end_s))
+        unscaled = found if isinstance(found, str) else ""
+        if unscaled:
+            found = self.find(0.5 * (start_s + end_s), over_depth=True)
+        if isinstance(found, str):
+            return found
+        stretch, window = found
+        known = stretch.fit.ground
+        time_s = np.asarray(known.profile.imu_time_s(np.array([reference_s, start_s, max(end_s, start_s + 1e-3)])))
+        velocity = stretch.velocity(window, time_s)
+        rotation = known.trajectory.orientation(time_s[0])
+        acceleration = (velocity[2] - velocity[1]) / (time_s[2] - time_s[1])
+        depth = stretch.depth(window, float(time_s[0]))
+        return FrameMotion(velocity[0] @ rotation, reference_s, acceleration @ rotation, depth, unscaled)
+
+    def velocity_std_m_s(self, camera_time_s: Array) -> Array:
+        """Standard deviations (n, 3) of the velocity in camera axes at times (n,); NaN where metres are not known.
+
+        Each takes the velocity a dozen times, all of a window's at once: for one frame after the other that is slow.
+        """
+        places = [self.find(float(time_s)) for time_s in camera_time_s]
+        known = [(None, -1) if isinstance(place, str) else place for place in places]
+        found = np.full((len(places), 3), np.nan)
+        for stretch in self.stretches:
+            for window in range(len(stretch.windows)):
+                here = np.array([one is stretch and number == window for one, number in known])
+                if here.any():
+                    covariance = stretch.seen_velocity(window, camera_time_s[here])[1]
+                    found[here] = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        return found
+
+    def clock(self) -> tuple[float, float] | None:
+        """Time offset and its standard deviation over the stretches with usable windows; None: there are none."""
+        found = [s for s in self.stretches if any(w.usable for w in s.windows)]
+        if not found:
+            return None
+        offset = np.array([s.fit.profile.time_offset_s or 0.0 for s in found])
+        std = np.array([_std_with_relief(s.fit, TIME_OFFSET.name)[0] for s in found])
+        mean, spread = _mean(offset, np.maximum(std, 1e-6))
+        return mean, float(np.hypot(spread, OFFSET_FLOOR_S))
+
+    def gyro_bias(self) -> tuple[Array, Array] | None:
+        """Gyroscope bias (3,) and its standard deviations over the stretches with usable windows."""
+        found = [s for s in self.stretches if any(w.usable for w in s.windows)]
+        if not found:
+            return None
+        values = np.array([s.fit.profile.gyro_bias_rad_s for s in found])
+        stds = np.maximum([_std_with_relief(s.fit, GYRO_BIAS.name) for s in found], 1e-7)
+        pairs = [_mean(values[:, k], stds[:, k]) for k in range(3)]
+        return np.array([value for value, _ in pairs]), np.array([std for _, std in pairs])
+
+
+def _std_with_relief(fit: TrackFit, name: str) -> Array:
+    """Standard deviations (k,) of a term's values, with what relief that stands in its place does to them."""
+    return np.hypot(fit.std(name), SHARED_RELIEF * fit.by_relief[fit.slices[name]])
+
+
+def _distance(window: Window, time_s: float) -> float:
+    return max(window.start_s - time_s, time_s - window.end_s, 0.0)
+
+
+def _mean(value: Array, std: Array) -> tuple[float, float]:
+    """Weighted mean and its standard deviation, widened where the values disagree."""
+    weight = std**-2.0
+    mean = float((weight * value).sum() / weight.sum())
+    disagreement = float((((value - mean) / std) ** 2).sum()) / max(len(value) - 1, 1)
+    return mean, float(np.sqrt(max(disagreement, 1.0) / weight.sum()))

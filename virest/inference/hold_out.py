@@ -1,0 +1,31 @@
+"""Tracked points judged by fits that did not see their block of time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.capture.imu import ImuSamples
+from virest.image_formation.point_model import TrackTable
+from virest.inference.robust import CAUCHY
+from virest.inference.track_fit import TrackFit, fit_tracks, for_table
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
+    """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
+    scene = for_table(fitted.scene, table)
+    everywhere = fit_tracks(imu, table, fitted.profile, (), scene, max_iterations=0, known=fitted.ground)
+    return everywhere.distance_at(depth_spread_per_m)
+
+
+def loss(distance: Array, scale: float) -> Array:
+    """Cauchy loss of whitened distances at a scale."""
+    return np.asarray(np.log1p((distance / (CAUCHY * scale)) ** 2))
+
+
+def group_means(values: Array, group: Index) -> Array:
+    """(groups,) means of values (n,) by the number of their group."""
+    return np.asarray(np.bincount(group, values) / np.maximum(np.bincount(group), 1))
