@@ -475,7 +475,7 @@ def test_a_batch_says_and_writes_the_same_for_any_number_of_jobs(virest: Virest,
     for name in names[1:]:
         shutil.copytree(tiny, tiny.parent / name)
     (tiny.parent / "b/movie.mp4").write_bytes(b"")
-    (tiny.parent / "d/camera.yaml").unlink()
+    (tiny.parent / "d/movie_metadata.csv").unlink()
     said = {}
     for jobs in (1, 2):
         result = virest("process", *names, "--out", f"out{jobs}", *FAST[:2], "--jobs", jobs, cwd=tiny.parent)
