@@ -144,10 +144,10 @@ def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def long_swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As ``swing``, but of 32 frames: several segments for each of two workers."""
+    """As ``swing``, but of 24 frames: more segments than two workers begin at once."""
     from virest.app.simulate import simulate_command
 
     folder = tmp_path_factory.mktemp("captures") / "swing"
-    simulate_command(folder, width=240, height=176, frames=32, exposure_ms=12.0, readout_ms=24.0,
+    simulate_command(folder, width=240, height=176, frames=24, exposure_ms=12.0, readout_ms=24.0,
                      rate_rad_s=2.5, seed=8, bitrate_bits_per_px=2.0)  # fmt: skip
     return folder

@@ -80,7 +80,7 @@ def record_canvas(
 
 
 def _sources_px(camera: TurningCamera) -> list[NDArray[np.float32]]:
-    """Where on a canvas each pixel looks at each instant of its row's exposure, (h, w, 2); those of two cameras are kept."""
+    """Where on a canvas each pixel looks at each instant of its row, (h, w, 2); those of two cameras are kept."""
     key = repr(camera)
     if key not in _SOURCES:
         profile, motion = camera.profile, camera.motion
