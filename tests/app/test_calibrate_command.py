@@ -41,7 +41,7 @@ UNITS = {"time_offset_s": 2e-3, "readout_time_s": 2e-3, "rotation_rad": 6e-3, "g
 def _shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("calibrated") / "shaken"
     simulate_command(folder, width=320, height=240, frames=60, exposure_ms=6, rate_rad_s=1.3, readout_ms=18,
-                     effects=HIDDEN, crf=18, seed=41)  # fmt: skip
+                     effects=HIDDEN, crf=18, seed=41, truth_frames=False)  # fmt: skip
     return folder
 
 
