@@ -10,7 +10,7 @@ import pytest
 import yaml
 from story import Result, process
 
-from virest.app.bench.diagnosis import diagnose_folder
+from virest.app.diagnose import climb_as_command, open_source
 from virest.capture.video import probe_movie, read_frames
 from virest.diagnosis.findings import UNEXPLAINED
 from virest.evaluation.fidelity import point_distances_px
@@ -78,7 +78,7 @@ def test_a_slow_clock_behind_a_stabiliser_is_named(realdata: Path):
     Held-out points do not tell its stabiliser from a principal point elsewhere; they are better off with the
     stabiliser, so that is told and the other named beside it.  Much is left, as hand and scene are near.
     """
-    diagnosis = diagnose_folder(realdata / "nexus5_162941")
+    diagnosis = climb_as_command(open_source(realdata / "nexus5_162941"))
     found = {cause.name: cause.parameters for cause in diagnosis.causes}
     assert "time_offset" not in found
     assert found["clock_skew"]["clock_skew"].estimate == pytest.approx(0.005, abs=0.001)
