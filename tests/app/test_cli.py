@@ -1,6 +1,7 @@
 """The program as its users meet it: exit codes, one line for an error, results on standard output only."""
 
 import errno
+import itertools
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 from run_content import content
 
+from virest.app import outputs
 from virest.app.cli import run
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -364,23 +366,6 @@ def test_an_output_below_a_file_is_refused(virest: Virest, tiny: Path) -> None:
     assert (tiny.parent / "file").read_text() == "mine"
 
 
-INJECTED = """
-import errno, os, sys
-from virest.app import outputs
-from virest.app.cli import run
-honest, count = outputs._write_bytes, 0
-def injected(path, data):
-    global count
-    count += 1
-    if count > {after}:
-        path.write_bytes(data[: len(data) // 2])
-        raise OSError(errno.{code}, os.strerror(errno.{code}))
-    honest(path, data)
-outputs._write_bytes = injected
-sys.exit(run(sys.argv[1:]))
-"""
-
-
 @pytest.fixture(scope="session")
 def undisturbed(virest: Virest, _tiny_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What a run of ``tiny`` leaves that straightens it from beginning to end."""
@@ -393,17 +378,25 @@ def undisturbed(virest: Virest, _tiny_capture: Path, tmp_path_factory: pytest.Te
 
 @pytest.mark.parametrize(("code", "after"), [("ENOSPC", 0), ("ENOSPC", 3), ("EDQUOT", 13), ("EROFS", 0)])
 def test_a_disk_that_takes_no_more(
-    virest: Virest, tiny: Path, undisturbed: dict[str, Any], code: str, after: int
+    virest_here: Virest, tiny: Path, undisturbed: dict[str, Any], code: str, after: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Full, over quota, read-only: exit 8, one line, no half-written file, and --resume goes on afterwards."""
     arguments = ["process", str(tiny), "--out", str(tiny.parent / "out"), "--jobs", "1", "--deblur", "none"]
-    command = [sys.executable, "-c", INJECTED.format(code=code, after=after), *arguments]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert_refused(result, 8, os.strerror(getattr(__import__("errno"), code)))
+    number, honest, written = getattr(errno, code), outputs._write_bytes, itertools.count(1)
+
+    def injected(path: Path, data: bytes) -> None:
+        if next(written) > after:
+            path.write_bytes(data[: len(data) // 2])
+            raise OSError(number, os.strerror(number))
+        honest(path, data)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(outputs, "_write_bytes", injected)
+        assert_refused(virest_here(*arguments), 8, os.strerror(number))
     assert not [name for name in below(tiny.parent / "out") if name.endswith((".part", ".lock", "run.json"))]
     if after < 10:
         assert not (tiny.parent / "out/tiny").exists()
-    assert virest(*arguments, "--resume").returncode == 0
+    assert virest_here(*arguments, "--resume").returncode == 0
     assert content(tiny.parent / "out/tiny") == undisturbed
 
 
