@@ -60,6 +60,13 @@ def calibrate(virest: Any, capture: Path, folder: Path, *arguments: object) -> d
     return facts
 
 
+@pytest.fixture(scope="session")
+def calibrated(virest: Any, turned: Path, work: Path) -> tuple[dict[str, Any], Path]:
+    """What a calibration of ``turned`` by its own profile says, and the profile that it wrote."""
+    folder = work / "calibrated_turned"
+    return calibrate(virest, turned, folder), folder / "calibrated.yaml"
+
+
 def start_from(capture: Path, folder: Path, **changes: Any) -> Path:
     """Write a profile like the capture's own with ``section__key`` changed, and return it."""
     content = yaml.safe_load((capture / "camera.yaml").read_text())
@@ -139,10 +146,12 @@ def test_a_camera_that_also_travels_is_calibrated(virest: Any, walked: Path, tmp
     assert facts["residual_px"] < 1.5 * facts["noise_px"]
 
 
-def test_a_calibrated_profile_is_good_for_processing(virest: Any, turned: Path, tmp_path: Path) -> None:
+def test_a_calibrated_profile_is_good_for_processing(
+    virest: Any, turned: Path, calibrated: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
     """``process --config`` takes what ``calibrate`` wrote, and uses its offset and readout."""
-    assert calibrate(virest, turned, tmp_path / "cal")["translation"] == "none"
-    arguments = ("--config", tmp_path / "cal" / "calibrated.yaml", "--deblur", "none", "--frames", "20:22", "--jobs", 1)
+    assert calibrated[0]["translation"] == "none"
+    arguments = ("--config", calibrated[1], "--deblur", "none", "--frames", "20:22", "--jobs", 1)
     done = virest("process", turned, "--out", tmp_path / "run", "--json", *arguments)
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
@@ -241,9 +250,11 @@ def test_the_readout_of_a_phone_in_a_car_is_found(virest: Any, realdata: Path, t
     assert facts["translation"] != "none"
 
 
-def test_clocks_that_drift_apart_are_noticed_unasked(virest: Any, turned: Path, tmp_path: Path) -> None:
+def test_clocks_that_drift_apart_are_noticed_unasked(
+    virest: Any, calibrated: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
     """One offset would look well known and be right at one instant only; clocks that keep together stay so."""
-    right = calibrate(virest, turned, tmp_path)
+    right = calibrated[0]
     assert not [v for v in right["values"] if v["name"] == "clock_skew"]
     assert not [note for note in right["notes"] if "held fixed" in note]
     drifting = tmp_path / "drifting"
