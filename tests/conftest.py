@@ -1,10 +1,12 @@
 """What all tests share: real captures where there are any, the program as a process, fast tests first."""
 
+import importlib
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +16,23 @@ ROOT = Path(__file__).resolve().parent.parent
 RunVirest = Callable[..., subprocess.CompletedProcess[str]]
 
 
-SHARING = {"calibrate_command", "calibrate_stories", "cluster", "evaluate_command", "evaluate_slam", "export_command",
-           "export_scenes", "guided_tracking", "local_blur", "log_against_truth", "neighbours", "restoration_gain",
-           "run_folder", "translation"}  # fmt: skip
+SHARING = {"calibrate_command", "calibrate_stories", "calibration_bench", "cluster", "edge_overshoot",
+           "evaluate_command", "evaluate_slam", "export_command", "export_scenes", "guided_tracking", "local_blur",
+           "log_against_truth", "neighbours", "recorder_stall", "report_command", "restoration_gain", "run_folder",
+           "translation", "undistort"}  # fmt: skip
 """Files whose tests share captures that take seconds to simulate: each file runs in one process."""
+
+
+def pytest_configure() -> None:
+    """Give each of xdist's processes, and all that it starts, a core of its own: they are the parallelism already.
+
+    A program that shares its work out over the cores it finds would start and load processes of its own in every test;
+    those that test this say so.
+    """
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker and hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -27,11 +42,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return item.get_closest_marker("scenario") is not None, item.path.parent.name != "scenarios"
 
     items.sort(key=order)
-    for item in items:
-        name = item.path.stem.removeprefix("test_")
-        if name in SHARING:
-            kind = "scenarios" if item.get_closest_marker("scenario") else "fast"
-            item.add_marker(pytest.mark.xdist_group(f"{name} {kind}"))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Hand a file whose tests share captures to one process, all other tests one by one."""
+    if config.getvalue("dist") != "loadgroup":
+        return None
+    scheduler = importlib.import_module("xdist.scheduler")
+
+    class WholeFiles(scheduler.LoadScopeScheduling):  # type: ignore[misc, name-defined]
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.split("::")[0]
+            return file if Path(file).stem.removeprefix("test_") in SHARING else nodeid
+
+    return WholeFiles(config, log)
 
 
 @pytest.fixture(scope="session")

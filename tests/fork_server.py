@@ -6,6 +6,7 @@ What a start itself does (lazy imports, variables that libraries read as they lo
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import importlib
@@ -17,9 +18,10 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, NoReturn
 
 
 class ForkServer:
@@ -87,8 +89,22 @@ def become(arguments: list[str], cwd: str, streams: list[str]) -> None:
         setattr(sys, name, stream)
         setattr(sys, f"__{name}__", stream)
     sys.argv = ["virest", *arguments]
-    runpy.run_module("virest", run_name="__main__", alter_sys=True)
-    sys.exit()
+    try:
+        runpy.run_module("virest", run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            raise
+        leave(end.code or 0)
+    leave(0)
+
+
+def leave(code: int) -> NoReturn:
+    """End as the interpreter does, but for taking apart all that is loaded: that is a tenth of a second."""
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """``virest calibrate`` as its users meet it: tables, JSON, files and exit codes."""
 
 import json
+import os
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -15,13 +16,14 @@ import yaml
 from virest.app import calibrate as command
 from virest.app.calibrate import CalibrationOutput, describe, plan_calibration, run_calibration, unknown_extra
 from virest.app.cli.calibrate import CALIBRATED_EXTRAS
+from virest.app.outputs import json_line
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile, write_profile
 from virest.capture.folder import read_capture
 from virest.capture.profile_source import read_any_profile
 from virest.errors import CalibrationError, OutputError
-from virest.inference import frame_selection
+from virest.inference import frame_selection, tracking
 
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 OFFSET_S, READOUT_S, ROTATION, BIAS = 0.031, 0.0236, (0.012, -0.017, 0.021), (0.018, -0.011, 0.006)
@@ -40,7 +42,7 @@ UNITS = {"time_offset_s": 2e-3, "readout_time_s": 2e-3, "rotation_rad": 6e-3, "g
 def _shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("calibrated") / "shaken"
     simulate_command(folder, width=320, height=240, frames=60, exposure_ms=6, rate_rad_s=1.3, readout_ms=18,
-                     effects=HIDDEN, crf=18, seed=41)  # fmt: skip
+                     effects=HIDDEN, crf=18, seed=41, truth_frames=False)  # fmt: skip
     return folder
 
 
@@ -116,6 +118,17 @@ def test_the_program_prints_one_json_object_and_writes_the_profile(virest: Vires
     profile = read_profile(shaken.parent / "found.yaml")
     assert facts["profile"]["imu"]["time_offset_s"] == pytest.approx(profile.time_offset_s, rel=1e-9)
     assert set(profile.estimates) >= {*TRUTH, "readout_direction"}
+
+
+def test_two_processes_find_what_one_does(
+    virest_here: Virest, shaken: Path, done: tuple[Path, dict[str, Any], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program shares its work out over the cores it may use; the digits stay."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr(tracking, "PART_FRAMES", 30)
+    result = virest_here("calibrate", shaken, "--json", "--out", "found.yaml")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["values"] == json.loads(json_line(done[1]))["values"]
 
 
 def test_the_written_profile_reads_back_with_its_estimates(done: tuple[Path, dict[str, Any], str]) -> None:

@@ -66,7 +66,7 @@ def wrong_lens(tmp_path_factory: pytest.TempPathFactory) -> tuple[GeometryCalibr
     hidden = ("time_offset=0.006", "focal_length=0.94", "radial_distortion=-0.1")
     simulate_command(
         folder, width=320, height=240, frames=45, exposure_ms=8, noise_levels=1.0, bitrate_bits_per_px=1.0, seed=21,
-        effects=hidden,
+        effects=hidden, truth_frames=False,
     )  # fmt: skip
     plan = plan_calibration(folder, None, ("focal", "distortion"))
     movie = plan.capture.movie

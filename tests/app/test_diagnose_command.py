@@ -260,8 +260,9 @@ def test_what_cannot_be_read_is_said(tiny: Path, tmp_path: Path, ladder) -> None
 
 @pytest.mark.scenario
 def test_a_readout_that_is_half_as_long_is_found(tmp_path: Path, monkeypatch) -> None:
-    """From a simulated capture to the right cause, its size within its deviation, and neighbours that agree."""
+    """From a capture to the right cause by two processes, its size within its deviation, and neighbours that agree."""
     monkeypatch.setattr(diagnose, "draw_figures", DRAW_FIGURES)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
     size = {"width": 256, "height": 192, "frames": 24, "readout_ms": 24.0, "rate_rad_s": 1.1, "noise_levels": 1.0}
     simulate_command(tmp_path / "trip", **size, effects=["readout_time=0.012"], seed=3)  # type: ignore[arg-type]
     assert run(tmp_path / "trip", "--out", tmp_path / "out", "--check", "-q") == 10

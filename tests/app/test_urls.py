@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -257,7 +258,7 @@ def test_a_run_from_bucket_to_bucket_is_the_local_run(virest: Virest, bucket: st
     ]
     with subprocess.Popen([*command, "--jobs", "2"], stderr=subprocess.PIPE) as process:
         while process.poll() is None and not (run / ".segments").is_dir():
-            pass
+            time.sleep(0.05)
         process.kill()
         process.communicate()
     assert not (run / "run.json").exists()

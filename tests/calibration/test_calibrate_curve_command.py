@@ -105,7 +105,7 @@ def test_a_still_capture_under_auto_exposure_gives_the_curve(
 ) -> None:
     """Exposure and ISO change by steps or by a walk, through H.264 at the recorder's bit rate: within 2 grey levels."""
     simulate_command(tmp_path / "trip", width=320, height=240, exposure_ms=5, rate_rad_s=0.0, readout_ms=10,
-                     response=truth, seed=3, **exposures)  # fmt: skip
+                     response=truth, seed=3, truth_frames=False, **exposures)  # fmt: skip
     facts, _ = calibrate_curve(tmp_path / "trip")
     block = {k: tuple(v) if isinstance(v, list) else v for k, v in facts["response"].items()}
     found, covered = ResponseCurve(**block), tuple(facts["covered_exposure"])

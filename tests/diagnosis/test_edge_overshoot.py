@@ -78,7 +78,8 @@ def test_few_edges_tell_nothing(rng):
 
 def opened(folder: Path, **options) -> tuple[Source, Trajectory]:
     """Simulate a capture, and its motion by the capture's own profile."""
-    simulate_command(folder, width=480, height=360, frames=20, seed=3, exposure_ms=5.0, rate_rad_s=0.8, **options)
+    simulate_command(folder, width=480, height=360, frames=20, seed=3, exposure_ms=5.0, rate_rad_s=0.8,
+                     truth_frames=False, **options)  # fmt: skip
     source = open_source(folder)
     return source, integrate_gyro(source.capture.imu, source.profile)
 

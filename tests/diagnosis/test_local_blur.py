@@ -37,7 +37,7 @@ def observed(folder: Path, seed: int, *effects: str, bits_per_px: float = 0.5) -
     """A short simulated capture, its nominal profile, and what its pictures show."""
     simulate_command(
         folder, width=448, height=336, frames=42, exposure_ms=[13.0, 8.0, 10.0], rate_rad_s=1.3, seed=seed,
-        bitrate_bits_per_px=bits_per_px, effects=effects,
+        bitrate_bits_per_px=bits_per_px, effects=effects, truth_frames=False,
     )  # fmt: skip
     capture = read_capture(folder, look_at_pictures=False)
     profile = read_profile(folder / "camera.yaml")

@@ -280,7 +280,7 @@ def observe(tmp_path: Path) -> Observe:
         folder = tmp_path / "capture"
         simulate_command(
             folder, width=320, height=240, frames=30, effects=effects, overwrite=True, seed=41,
-            **{"bitrate_bits_per_px": 1.0, **options},  # type: ignore[arg-type]
+            **{"bitrate_bits_per_px": 1.0, "truth_frames": False, **options},  # type: ignore[arg-type]
         )  # fmt: skip
         capture = read_capture(folder, look_at_pictures=False)
         nominal, true = read_profile(folder / "camera.yaml"), read_profile(folder / "truth" / "camera.yaml")
@@ -336,7 +336,7 @@ def test_blur_shows_the_curve_at_constant_exposure(tmp_path: Path) -> None:
     folder = tmp_path / "capture"
     simulate_command(
         folder, width=400, height=320, focal_px=420, frames=30, exposure_ms=10, rate_rad_s=1.2, seed=53,
-        effects=["response_curve=1.3"], bitrate_bits_per_px=1.0,
+        effects=["response_curve=1.3"], bitrate_bits_per_px=1.0, truth_frames=False,
     )  # fmt: skip
     capture = read_capture(folder, look_at_pictures=False)
     index = probe_movie(capture.movie)

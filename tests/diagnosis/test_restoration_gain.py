@@ -32,7 +32,7 @@ def simulated(tmp_path_factory):
     def read(name, effect):
         folder: Path = tmp_path_factory.mktemp("gain") / name
         size = {"width": 320, "height": 240, "frames": 14, "exposure_ms": 14.0, "readout_ms": 24.0}
-        simulate_command(folder, **size, rate_rad_s=1.6, seed=8, effects=[effect], crf=14.0)
+        simulate_command(folder, **size, rate_rad_s=1.6, seed=8, effects=[effect], crf=14.0, truth_frames=False)
         capture = read_capture(folder)
         return capture, resolve_profile(capture)[0], read_profile(folder / "truth/camera.yaml")
 

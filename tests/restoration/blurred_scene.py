@@ -32,6 +32,7 @@ class Recorded:
 
 
 _RECORDED: dict[str, Recorded] = {}
+_SOURCES: dict[str, list[NDArray[np.float32]]] = {}
 
 
 def camera(
@@ -67,20 +68,31 @@ def record_canvas(
     camera: TurningCamera, canvas: NDArray[np.float32], noise_channels: int = 1, noise_levels: float = 1.0
 ) -> Recorded:
     """Record light on a canvas (height + 2 MARGIN, width + 2 MARGIN, 3); noise in as many channels."""
-    profile, motion = camera.profile, camera.motion
+    profile = camera.profile
     width, height = profile.width, profile.height
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    pixels = np.stack([x, y], -1).reshape(-1, 2).astype(float)
-    start_s = camera.row_start_s(pixels, motion.start_s)
     light = np.zeros((height, width, 3))
-    for part in (np.arange(INSTANTS) + 0.5) / INSTANTS:
-        seen = camera.seen(pixels, start_s + part * motion.exposure_s, motion.reference_s, motion.reference_s)
-        source = (seen + MARGIN).astype(np.float32).reshape(height, width, 2)
+    for source in _sources_px(camera):
         light += cv2.remap(canvas, source, None, cv2.INTER_CUBIC) / INSTANTS
     rng = np.random.default_rng(1)
     noise = rng.normal(0, noise_levels, (height, width, noise_channels))
     inner = canvas[MARGIN : MARGIN + height, MARGIN : MARGIN + width]
     return Recorded(camera, _stored(light, profile.response, noise), _stored(inner, profile.response, 0))
+
+
+def _sources_px(camera: TurningCamera) -> list[NDArray[np.float32]]:
+    """Where on a canvas each pixel looks at each instant of its row, (h, w, 2); those of two cameras are kept."""
+    key = repr(camera)
+    if key not in _SOURCES:
+        profile, motion = camera.profile, camera.motion
+        x, y = np.meshgrid(np.arange(profile.width), np.arange(profile.height))
+        pixels = np.stack([x, y], -1).reshape(-1, 2).astype(float)
+        start_s = camera.row_start_s(pixels, motion.start_s)
+        times_s = (start_s + (k + 0.5) / INSTANTS * motion.exposure_s for k in range(INSTANTS))
+        seen = (camera.seen(pixels, time_s, motion.reference_s, motion.reference_s) for time_s in times_s)
+        for old in list(_SOURCES)[:-1]:
+            del _SOURCES[old]
+        _SOURCES[key] = [(one + MARGIN).astype(np.float32).reshape(*x.shape, 2) for one in seen]
+    return _SOURCES[key]
 
 
 def _canvas(height: int, width: int, grey: bool) -> NDArray[np.float32]:

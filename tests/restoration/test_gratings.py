@@ -112,20 +112,23 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("rate", [1.0, 0.5])
 @pytest.mark.parametrize("scene", [pytest.param(s, id=n) for n, s in SCENES.items()])
-@pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
-def test_no_grating_gets_worse(scene: Scene, settings: RestorationSettings, rate: float) -> None:
+@pytest.mark.parametrize("rate", [1.0, 0.5])
+def test_no_grating_gets_worse(scene: Scene, rate: float) -> None:
     """Restored gratings are at most 0.1 dB worse than the straightened recorded ones, whichever way they lie."""
     turning = camera(tuple(rate * r for r in RATE_RAD_S), 0.02, width=WIDTH, height=HEIGHT)
     recorded = record_canvas(turning, _canvas(scene), noise_levels=3.0)
-    restored, straight = (
-        restore_frame(FRAME, recorded.picture, turning.motion, turning.trajectory, s).picture
-        for s in (settings, replace(settings, deblur="none"))
-    )
-    assert restored is not None
-    assert straight is not None
-    assert psnr_db(restored, recorded.truth, 50) > psnr_db(straight, recorded.truth, 50) - 0.1
+
+    def likeness_db(settings: RestorationSettings) -> float:
+        restored = restore_frame(FRAME, recorded.picture, turning.motion, turning.trajectory, settings)
+        assert restored.picture is not None
+        return psnr_db(restored.picture, recorded.truth, 50)
+
+    gains_db = {
+        name: likeness_db(settings) - likeness_db(replace(settings, deblur="none"))
+        for name, settings in PRESETS.items()
+    }
+    assert min(gains_db.values()) > -0.1, gains_db
 
 
 # ── tiles around the centre of a turn ────────────────────────────────────────────────────────────────────────────

@@ -34,7 +34,7 @@ def capture_with(folder: Path, **options: Any) -> Path:
         "gyro_bias={},{},{}".format(*BIAS),
     ]
     simulate_command(folder, frames=75, exposure_ms=7, rate_rad_s=1.2, direction=DIRECTION, crf=20, effects=hidden,
-                     **SIZE, **options)  # fmt: skip
+                     truth_frames=False, **SIZE, **options)  # fmt: skip
     return folder
 
 
@@ -58,6 +58,13 @@ def calibrate(virest: Any, capture: Path, folder: Path, *arguments: object) -> d
     assert done.returncode == 0, done.stderr
     facts: dict[str, Any] = json.loads(done.stdout)
     return facts
+
+
+@pytest.fixture(scope="session")
+def calibrated(virest: Any, turned: Path, work: Path) -> tuple[dict[str, Any], Path]:
+    """What a calibration of ``turned`` by its own profile says, and the profile that it wrote."""
+    folder = work / "calibrated_turned"
+    return calibrate(virest, turned, folder), folder / "calibrated.yaml"
 
 
 def start_from(capture: Path, folder: Path, **changes: Any) -> Path:
@@ -139,10 +146,12 @@ def test_a_camera_that_also_travels_is_calibrated(virest: Any, walked: Path, tmp
     assert facts["residual_px"] < 1.5 * facts["noise_px"]
 
 
-def test_a_calibrated_profile_is_good_for_processing(virest: Any, turned: Path, tmp_path: Path) -> None:
+def test_a_calibrated_profile_is_good_for_processing(
+    virest: Any, turned: Path, calibrated: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
     """``process --config`` takes what ``calibrate`` wrote, and uses its offset and readout."""
-    assert calibrate(virest, turned, tmp_path / "cal")["translation"] == "none"
-    arguments = ("--config", tmp_path / "cal" / "calibrated.yaml", "--deblur", "none", "--frames", "20:22", "--jobs", 1)
+    assert calibrated[0]["translation"] == "none"
+    arguments = ("--config", calibrated[1], "--deblur", "none", "--frames", "20:22", "--jobs", 1)
     done = virest("process", turned, "--out", tmp_path / "run", "--json", *arguments)
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
@@ -241,14 +250,17 @@ def test_the_readout_of_a_phone_in_a_car_is_found(virest: Any, realdata: Path, t
     assert facts["translation"] != "none"
 
 
-def test_clocks_that_drift_apart_are_noticed_unasked(virest: Any, turned: Path, tmp_path: Path) -> None:
+def test_clocks_that_drift_apart_are_noticed_unasked(
+    virest: Any, calibrated: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
     """One offset would look well known and be right at one instant only; clocks that keep together stay so."""
-    right = calibrate(virest, turned, tmp_path)
+    right = calibrated[0]
     assert not [v for v in right["values"] if v["name"] == "clock_skew"]
     assert not [note for note in right["notes"] if "held fixed" in note]
     drifting = tmp_path / "drifting"
     hidden = ["time_offset=0.02", "clock_skew=0.003"]
-    simulate_command(drifting, frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=63, **SIZE)
+    simulate_command(drifting, frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=63,
+                     truth_frames=False, **SIZE)  # fmt: skip
     facts = calibrate(virest, drifting, tmp_path / "out")
     for name, truth in (("time_offset_s", 0.02), ("clock_skew", 0.003)):
         found = value_of(facts, name)
@@ -260,9 +272,8 @@ def test_clocks_that_drift_apart_are_noticed_unasked(virest: Any, turned: Path, 
 def test_a_lens_that_was_held_fixed_and_is_wrong_is_named(virest: Any, tmp_path: Path) -> None:
     """Neither is fitted unasked: the points tell both, and how far off they are."""
     hidden, seed = ["focal_length=0.96", "radial_distortion=0.05"], 64
-    simulate_command(
-        tmp_path / "lens", frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=seed, **SIZE
-    )
+    simulate_command(tmp_path / "lens", frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=seed,
+                     truth_frames=False, **SIZE)  # fmt: skip
     (note,) = [n for n in calibrate(virest, tmp_path / "lens", tmp_path / "out")["notes"] if "held fixed" in n]
     assert "--with focal,distortion," in note
     off = float(note.split("focal (")[1].split("%")[0])

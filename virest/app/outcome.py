@@ -9,7 +9,8 @@ from pathlib import Path
 from virest.app import console
 from virest.app.account import PARTLY_FAILED, STATUSES
 
-MOST_NAME, MOST_VERDICT = 26, 24
+NUMBERS = (*STATUSES, "frames/s")
+WIDTH, MOST_VERDICT = 80, 21
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +38,16 @@ class CaptureOutcome:
 
 def summary(outcomes: list[CaptureOutcome]) -> str:
     """A table of the captures, where the results are, and what to do next."""
+    verdicts = [o.verdict if len(outcomes) == 1 else _cut(o.verdict, MOST_VERDICT) for o in outcomes]
+    verdicts = [verdict.partition(":")[0] for verdict in verdicts]
+    longest = min(max(map(len, verdicts), default=0), MOST_VERDICT)
+    most_name = WIDTH - sum(len(head) + 2 for head in NUMBERS) - 2 - longest
     rows = []
-    for outcome in outcomes:
+    for outcome, verdict in zip(outcomes, verdicts, strict=True):
         counts = [str(outcome.counts.get(status, 0)) for status in STATUSES]
         rate = sum(map(int, counts)) / outcome.seconds if outcome.seconds else 0.0
-        verdict = outcome.verdict if len(outcomes) == 1 else _cut(outcome.verdict, MOST_VERDICT)
-        rows.append([_cut(outcome.name, MOST_NAME), *counts, f"{rate:.1f}" if rate else "-", verdict.partition(":")[0]])
-    lines = [console.table(["capture", *STATUSES, "frames/s", "verdict"], rows, words=1)]
+        rows.append([_cut(outcome.name, most_name), *counts, f"{rate:.1f}" if rate else "-", verdict])
+    lines = [console.table(["capture", *NUMBERS, "verdict"], rows, words=1)]
     lines += [f"wrote {outcome.folder}" for outcome in outcomes]
     lines += [f"wrote {outcome.film}" for outcome in outcomes if outcome.film is not None]
     return "\n".join([*lines, *next_steps(outcomes)])

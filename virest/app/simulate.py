@@ -57,6 +57,7 @@ def simulate_command(
     bitrate_bits_per_px: float = 0.25,
     crf: float | None = None,
     reference: str = "exposure-start",
+    truth_frames: bool = True,
     overwrite: bool = False,
     profile: CameraProfile | None = None,
     hidden: Hidden = NOTHING,
@@ -76,8 +77,9 @@ def simulate_command(
     for infinity.
     effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), hidden from everything but ``truth/``.
     hidden: effects that have no name, for tests.
-    reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  profile: use this camera as the nominal
-    one; width, height, focal_px, distortion, readout_ms, direction and response are then taken from it.
+    reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  truth_frames: whether truth/frames is
+    written.  profile: use this camera as the nominal one; width, height, focal_px, distortion, readout_ms, direction
+    and response are then taken from it.
     isp: the phone's own processing; truth/ shows its global curves, the capture's profile nothing of it.
     """
     if reference not in ("exposure-start", "frame-middle"):
@@ -118,7 +120,7 @@ def simulate_command(
     )
     session = plan_session(nominal, isp.true_profile(true), settings, hidden=hidden)
     bits_per_px = isp.bits_per_px or bitrate_bits_per_px
-    options = RecordingOptions(layout, clock, bits_per_px, crf, middle_truth=reference == "frame-middle")
+    options = RecordingOptions(layout, clock, bits_per_px, crf, reference == "frame-middle", truth_frames)
     folder = write_recording(
         session, Path(out), applied=applied, options=options, overwrite=overwrite, progress=progress
     )  # fmt: skip

@@ -133,7 +133,10 @@ def table_curve(p: Array, greys: Array, top: float) -> ResponseCurve:
 
 @dataclass(frozen=True, slots=True)
 class LogLookup:
-    """Grey level over the logarithm of light and back, for tens of thousands of pixels at a time."""
+    """Grey level over the logarithm of light and back, for tens of thousands of pixels at a time.
+
+    Values (samples, pictures) are looked up picture by picture: samples in their order of light are found the soonest.
+    """
 
     log_light: Array
     """(m,) rising."""
@@ -144,15 +147,15 @@ class LogLookup:
 
     def level(self, log_light: Array) -> Array:
         """Grey level of light."""
-        return np.interp(log_light, self.log_light, self.grey)
+        return np.interp(log_light.T, self.log_light, self.grey).T
 
     def rise(self, log_light: Array) -> Array:
         """Levels per unit of log light."""
-        return np.interp(log_light, self.log_light, self.slope, left=0.0, right=0.0)
+        return np.interp(log_light.T, self.log_light, self.slope, left=0.0, right=0.0).T
 
     def light(self, grey: Array) -> Array:
         """Log light of a grey level."""
-        return np.interp(grey, self.grey, self.log_light)
+        return np.interp(grey.T, self.grey, self.log_light).T
 
 
 def log_lookup(curve: ResponseCurve) -> LogLookup:

@@ -42,7 +42,7 @@ def project(lookup: LogLookup, samples: BracketSamples, log_t: Array, rounds: in
     log_light = (weight * (linear - log_t)).sum(axis=1) / weight.sum(axis=1)
     inverse = np.where(samples.measured, 1.0 / samples.sigma**2, 0.0)
     for _ in range(rounds):
-        at = log_light[:, None] + log_t
+        at = (log_light + log_t[:, None]).T
         slope = lookup.rise(at)
         pull = (inverse * slope * (samples.grey - lookup.level(at))).sum(axis=1)
         step = pull / np.maximum((inverse * slope**2).sum(axis=1), 1e-9)
@@ -53,7 +53,7 @@ def project(lookup: LogLookup, samples: BracketSamples, log_t: Array, rounds: in
 def residual_of(lookup: LogLookup, samples: BracketSamples, correction_ev: Array) -> Array:
     """Grey levels by which measurement and model differ, (samples, pictures); censored ones where they contradict."""
     log_t = np.log(samples.exposure) + LN2 * correction_ev
-    level = lookup.level(project(lookup, samples, log_t)[:, None] + log_t)
+    level = lookup.level((project(lookup, samples, log_t) + log_t[:, None]).T)
     left = samples.grey - level
     lowest, highest = samples.limits
     slack = 0.0 if samples.fair is None else FAIR_SIGMA * samples.sigma
@@ -106,7 +106,7 @@ def require_possible(first: FirstCurve, samples: BracketSamples) -> None:
 def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDArray[np.bool_],
               evaluations: int = 30) -> tuple[Array, Array]:  # fmt: skip
     """(curve parameters, corrections in EV) of least cost, the sizes of the residuals held down (soft L1)."""
-    shape = len(family.start)
+    samples, shape = samples.by_light(), len(family.start)
     belief = np.where(suspect, FREE_EV, TRUSTED_EV)
     rows = _trend_rows(samples.exposure, suspect)[: 1 + family.bends]
     no_trend = np.eye(len(suspect)) - rows.T @ rows

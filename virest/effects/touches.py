@@ -6,6 +6,7 @@ A value that no line here names touches everything, so that a forgotten one cost
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 from virest.camera.profile import CameraProfile
@@ -61,9 +62,14 @@ def touched(before: CameraProfile, after: CameraProfile) -> Touched:
 def _changed(before: Any, after: Any) -> set[str]:
     if before is after:
         return set()
-    names = (entry.name for entry in fields(before))
-    pairs = ((name, getattr(before, name), getattr(after, name)) for name in names)
+    pairs = ((name, getattr(before, name), getattr(after, name)) for name in _names(before.__class__))
     return {name for name, one, other in pairs if one is not other and one != other}
+
+
+@cache
+def _names(kind: Any) -> tuple[str, ...]:
+    """A dataclass's fields."""
+    return tuple(entry.name for entry in fields(kind))
 
 
 def _changed_kinds(before: CameraProfile, after: CameraProfile) -> set[str]:

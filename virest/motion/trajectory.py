@@ -83,7 +83,10 @@ def turned_angle(pieces: Array, since_s: Array) -> Array:
 
 def _cross(u: Array, v: Array) -> Array:
     """u × v of vectors (3, ...)."""
-    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    cross = np.empty_like(u)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[i] = u[j] * v[k] - u[k] * v[j]
+    return cross
 
 
 def _vectors(parts: Array) -> Array:

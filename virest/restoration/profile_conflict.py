@@ -179,10 +179,12 @@ class _Search:
         return start_scene(self.imu, known, self.table, 1 / depth_m if depth_m else START_INVERSE_DEPTH_PER_M)
 
     def fit(self, start: _Start, use: NDArray[np.bool_] | None = None) -> TrackFit:
-        """Fit the nuisances and the causes, on some of the points."""
+        """Fit the nuisances and the causes; on some of the points, where only values count, without covariances."""
         table = self.table if use is None else self.table.chosen(use)
         terms = (*self.nuisances, *(cause.term for cause in start.causes))
-        return fit_tracks(self.imu, table, start.profile, terms, start.scene, max_iterations=MAX_ITERATIONS)
+        return fit_tracks(
+            self.imu, table, start.profile, terms, start.scene, max_iterations=MAX_ITERATIONS, covariances=use is None
+        )
 
     def climbed(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
         """Causes that enter one after the other, and the fit with all of them."""

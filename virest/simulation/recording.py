@@ -44,6 +44,11 @@ _SLEPT_NS = 22_319_432_485_000
 """Boot-time clock less monotonic clock: how long the phone has slept."""
 _EPOCH_JITTER_NS = 8_301
 _TRAJECTORY_STEP_S = 1e-3
+_PNG_OPTIONS = [
+    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG,
+]  # fmt: skip
+"""As small as with all of level 1's filters tried, in three fifths of the time."""
 FOCUS_DIOPTRES = 0.16422288
 """Logged where the focus rests."""
 _EDGE_HEADER = """\
@@ -240,7 +245,7 @@ def _add_stream(container: Any, width: int, height: int, fps: float, options: Re
 
 
 def _write_png(path: Path, picture: Picture) -> None:
-    if not cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+    if not cv2.imwrite(str(path), picture[..., ::-1], _PNG_OPTIONS):
         raise OutputError(f"{path} cannot be written", hint="check space and permissions")
 
 
