@@ -264,8 +264,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="list the blocks and run nothing")
     options = parser.parse_args(arguments)
     for page in options.pages:
-        if not (page.is_file() and page.resolve().is_relative_to(ROOT)):
-            parser.error(f"no page of this repository: {page}")
+        if not page.is_file():
+            parser.error(f"no such page: {page}")
     if options.list:
         console.emit(_listing([block for page in options.pages or pages() for block in blocks(page.resolve())]))
         return 0
