@@ -16,10 +16,10 @@ ROOT = Path(__file__).resolve().parent.parent
 RunVirest = Callable[..., subprocess.CompletedProcess[str]]
 
 
-SHARING = {"calibrate_command", "calibrate_stories", "calibration_bench", "cluster", "edge_overshoot",
-           "evaluate_command", "evaluate_slam", "export_command", "export_scenes", "guided_tracking", "local_blur",
-           "log_against_truth", "neighbours", "recorder_stall", "report_command", "restoration_gain", "run_folder",
-           "translation", "undistort"}  # fmt: skip
+SHARING = {"blur_length_check", "calibrate_command", "calibrate_stories", "calibration_bench", "cluster",
+           "edge_overshoot", "evaluate_command", "evaluate_slam", "export_command", "export_scenes", "guided_tracking",
+           "local_blur", "log_against_truth", "neighbours", "recorder_stall", "report_command", "restoration_gain",
+           "run_folder", "translation", "undistort"}  # fmt: skip
 """Files whose tests share captures that take seconds to simulate: each file runs in one process."""
 
 

@@ -61,6 +61,7 @@ class ForkServer:
 
 def serve(calls: IO[str], answers: IO[str]) -> None:
     """Fork a program for each line, and answer its status."""
+    importlib.import_module("pandas")  # loaded only once a table is read
     package = importlib.import_module("virest")
     for module in pkgutil.walk_packages(package.__path__, "virest."):
         if not module.name.endswith("__main__"):

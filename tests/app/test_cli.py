@@ -554,8 +554,8 @@ def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
     number: signal.Signals,
 ) -> None:
     """Exit 130 (143 for SIGTERM), one line, no parts, no lock; --resume ends with the files of an undisturbed run."""
-    arguments = ("process", swing, *slow, "--jobs", jobs, "--out")
-    with start(*arguments, tmp_path / "out") as process:
+    arguments = ("process", swing, *slow, "--out", tmp_path / "out", "--jobs")
+    with start(*arguments, jobs) as process:
         wait_for(lambda: len(below(tmp_path / "out/swing/frames")) > 2, process)
         os.killpg(process.pid, number)
         output, errors = process.communicate(timeout=300)
@@ -563,7 +563,7 @@ def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
     assert output == ""
     assert "Traceback" not in errors
     assert not [name for name in below(tmp_path / "out") if name.endswith((".part", ".lock", "run.json"))]
-    assert virest(*arguments, tmp_path / "out", "--resume").returncode == 0
+    assert virest(*arguments, 1, "--resume").returncode == 0
     assert content(tmp_path / "out/swing") == undisturbed_swing
 
 

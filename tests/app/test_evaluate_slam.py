@@ -171,7 +171,7 @@ def test_structure_from_motion_profits_from_restored_frames(tmp_path: Path):
     """Nine tenths of the error that the rolling shutter adds are gone, on a short walk before a tilted wall."""
     pytest.importorskip("pycolmap", reason="the extra [slam] is not installed")
     wall = dataclasses.replace(SEQUENCES[0], name="walk", near_m=None, seed=77, fps=12.0, rate_rad_s=1.1)
-    plan = smaller(wall, 16)
+    plan = smaller(wall, 12)
     capture = make_capture(plan, tmp_path / "walk")
     facts, _, code = run_slam([capture], SlamOptions(seeds=1, preset="fast"))
     (row,) = facts["results"]

@@ -13,9 +13,9 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from virest.capture.files import TextScan, label, read_small_text, scan_text
@@ -38,6 +38,9 @@ from virest.capture.tables import (
     whole_numbers,
 )
 from virest.errors import CaptureError, ClockError, ImuError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MICROSECOND_GAP_LIMIT = 1_000_000
 """Stamps without a header: a median step below this is in microseconds (no camera runs at 1000 frames/s here)."""

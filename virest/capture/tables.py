@@ -12,14 +12,16 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from virest.capture.files import label, scan_text
 from virest.errors import CaptureError, ClockError, ImuError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ROWS_AT_ONCE = 100_000
 MAX_FIELDS = 16
@@ -103,6 +105,8 @@ def text_chunks(path: Path, separator: str = ",", fields: int = MAX_FIELDS) -> I
 
     separator: a comma, or ``\s+`` for any white space.
     """
+    import pandas as pd  # a quarter of a worker's start, and workers read no tables
+
     options: dict[str, Any] = {
         "header": None,
         "sep": separator,
@@ -135,6 +139,8 @@ def text_chunks(path: Path, separator: str = ",", fields: int = MAX_FIELDS) -> I
 
 def numbers(column: Any) -> Float64:
     """Text to float64; ``null``, text and infinities become NaN."""
+    import pandas as pd
+
     values = pd.to_numeric(column.str.strip(), errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
     return np.where(np.isfinite(values), values, np.nan)
 
