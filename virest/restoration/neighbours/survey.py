@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image
+from virest.image_formation.kernels import blur_chords
 from virest.image_formation.neighbour import neighbour_view
 from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
@@ -78,24 +79,42 @@ def survey_gain(
     """What deblurring gains by the neighbours' account.
 
     tried: a frame's luma in light, as recorded and as restored, at the middle of its exposures and reduced; None: it is
-    left alone.  The first inner frame of each run is restored and held against both its neighbours.
+    left alone.  Lively frames are restored, each held against both its neighbours.
     """
     found = []
-    for run in runs:
-        around = [sights[n] for n in run if n in sights and sights[n].usable]
-        for before, here, after in zip(around, around[1:], around[2:], strict=False):
-            assert here.motion is not None
-            refined = neighbours.refined((before,), here, (after,))
-            motion = here.motion if refined is None else refined.motion
-            pictures = tried(here.picture, motion, refined)
-            if pictures is None:
-                continue
-            for other in (before, after):
-                assert other.motion is not None
-                further = None if refined is None else refined.further
-                view = neighbour_view(motion, other.motion, trajectory, lens, further=further)
-                judged = judged_change(view, *pictures, neighbours.light(other))
-                if judged is not None:
-                    found.append(judged)
-            break
+    path_px = {n: path_length_px(s.motion) for n, s in sights.items() if s.usable and s.motion is not None}
+    for number in lively_frames(runs, path_px):
+        before, here, after = (sights[number + step] for step in (-1, 0, 1))
+        assert here.motion is not None
+        refined = neighbours.refined((before,), here, (after,))
+        motion = here.motion if refined is None else refined.motion
+        pictures = tried(here.picture, motion, refined)
+        if pictures is None:
+            continue
+        for other in (before, after):
+            assert other.motion is not None
+            further = None if refined is None else refined.further
+            view = neighbour_view(motion, other.motion, trajectory, lens, further=further)
+            judged = judged_change(view, *pictures, neighbours.light(other))
+            if judged is not None:
+                found.append(judged)
     return confirmed_gain(found)
+
+
+def lively_frames(runs: Sequence[Sequence[int]], path_px: Mapping[int, float]) -> list[int]:
+    """Numbers of frames that lie between two others: the most blurred of each run, and where runs are few one more.
+
+    A frame that was hardly blurred tells little: what restoring it changes is finer than the compared pictures show.
+    path_px: length of the blur path of each usable frame.
+    """
+    inner = [n for n in path_px if n - 1 in path_px and n + 1 in path_px]
+    ranked = sorted(inner, key=lambda n: (-path_px[n], n))
+    first = [next((n for n in ranked if n in run), None) for run in runs]
+    chosen = [n for n in dict.fromkeys(first) if n is not None]
+    return (chosen + [n for n in ranked if n not in chosen])[: min(len(runs) + 1, MOST_RUNS)]
+
+
+def path_length_px(motion: RowMotion) -> float:
+    """Length of the blur path in the picture's middle."""
+    middle_px = 0.5 * np.array([[motion.profile.width, motion.profile.height]])
+    return float(np.linalg.norm(blur_chords(motion, middle_px)[0]))
