@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import logging
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -67,6 +68,10 @@ CENTRED_CHROMA = {"mjpeg", "mpeg1video"}
 HDR_CURVES = {16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}
 """Transfer curves that no response curve here describes."""
 PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
+STEP_AT_QP_0, QP_OF_TWICE = 0.625, 6.0
+"""Of H.264 (ITU-T H.264, 8.5.9): its quantiser's step in grey levels, and how much more QP doubles it."""
+H264_PARAMETERS, QP_PLACE = 1, 4
+"""AV_VIDEO_ENC_PARAMS_H264, and where a block's QP stands after its place and size."""
 FIXED_POINT = 64
 """Steps of a grey level in the 16-bit sums: luma and chroma together stay below 2^15."""
 
@@ -188,12 +193,15 @@ def index_pictures(path: Path, found: PictureList) -> MovieIndex:
     return MovieIndex(width, height, Fraction(1, 10**9), found.time_ns, every, every, codec, pictures=found.names)
 
 
-def read_frames(path: Path, index: MovieIndex, first: int, last: int) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+def read_frames(
+    path: Path, index: MovieIndex, first: int, last: int, steps: dict[int, float] | None = None
+) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     """Stream frames ``first`` to ``last`` (both included, ends clipped) as (frame index, RGB (h, w, 3) or None).
 
     None: the frame, or one that it depends on, cannot be decoded; later ones still come.  One is in memory at a time.
+    steps: takes each frame's :func:`coding_step` before the frame comes, where there is one.
     """
-    yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb)
+    yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb, steps)
 
 
 def read_gray(path: Path, index: MovieIndex, frames: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
@@ -314,7 +322,11 @@ def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> 
 
 
 def _read(
-    path: Path, index: MovieIndex, frames: Iterable[int], convert: Callable[..., NDArray[np.uint8]]
+    path: Path,
+    index: MovieIndex,
+    frames: Iterable[int],
+    convert: Callable[..., NDArray[np.uint8]],
+    steps: dict[int, float] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     if index.pictures:
         base, size = path if path.is_dir() else path.parent, (index.width, index.height)
@@ -328,12 +340,32 @@ def _read(
                 stream = _video_stream(container, path)
                 stream.thread_type = "NONE"
                 stream.codec_context.thread_count = 1
-                stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+                told = {} if steps is None else {"export_side_data": "venc_params"}
+                stream.codec_context.options = {"max_pixels": str(MAX_PIXELS), **told}
                 for frame_index, frame in _in_order(run, _decoded(container, stream, index, run[0])):
                     usable = frame is not None and (frame.width, frame.height) == (index.width, index.height)
+                    step = coding_step(frame) if usable and steps is not None else None
+                    if step is not None and steps is not None:
+                        steps[frame_index] = step
                     yield frame_index, convert(frame, centred=centred) if usable else None
         except (av.FFmpegError, UnicodeError) as fault:
             raise VideoError(f"{label(path)}: cannot be read ({_reason(fault)})", hint="copy the movie again") from None
+
+
+def coding_step(frame: Any) -> float | None:
+    """The step of the coder's quantiser, grey levels: mean over the blocks of a decoded frame; None: not told.
+
+    FFmpeg's decoder tells it for H.264 (``AVVideoEncParams``: a head, then blocks with what their QP is more).
+    """
+    for told in frame.side_data:
+        if told.type.name != "VIDEO_ENC_PARAMS":
+            continue
+        data = bytes(told)
+        count, start, size, kind, qp = struct.unpack_from("=I4xQQii", data)
+        if kind == H264_PARAMETERS and count and start + count * size <= len(data):
+            blocks = np.frombuffer(data, np.int32, count * size // 4, start).reshape(count, -1)
+            return float(np.mean(STEP_AT_QP_0 * 2 ** ((qp + blocks[:, QP_PLACE]) / QP_OF_TWICE)))
+    return None
 
 
 def _runs(index: MovieIndex, frames: Iterable[int]) -> Iterator[range | list[int]]:

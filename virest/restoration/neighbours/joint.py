@@ -80,6 +80,8 @@ class NeighbourPlace:
     """Of the same size: where it has a picture."""
     std_px: Array
     """(n,) how well it is known where it lies in those tiles, each axis."""
+    finer: float = 1.0
+    """The frame's noise over its own, where both are a coder's: more than 1 where it was coded with finer steps."""
 
     @property
     def longest_px(self) -> float:
@@ -89,7 +91,7 @@ class NeighbourPlace:
     @property
     def weight(self) -> float:
         """Mean over the picture."""
-        return float(self.trust.mean())
+        return self.finer * float(self.trust.mean())
 
     def passed(self, frequency: Array) -> Array:
         """(RINGS,) mean |K|² over some of the places, times the mean weight and what its uncertain place leaves of it.
