@@ -24,6 +24,7 @@ from virest.restoration.neighbours.joint import (
     NeighbourPicture,
     NeighbourPlace,
     half_size,
+    is_detailed,
     most_telling,
     neighbour_picture,
     neighbour_place,
@@ -157,7 +158,8 @@ class FrameNeighbours:
                 if other not in found and abs(other - here.frame.index) >= apart:
                     passed[other] = passed[other] * share
             passed[number] = measured
-        return tuple(neighbour_picture(found[n], *self._full_of(sights[n])) for n in sorted(taken))
+        detailed = {n: is_detailed(replace(luma, passed=self._passed[n])) for n in taken}
+        return tuple(neighbour_picture(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
 
     def _place(
         self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
