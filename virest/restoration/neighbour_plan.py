@@ -43,7 +43,7 @@ def with_neighbours_asked(
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
     plan, sights = _unmasked(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
-    missing = survey_turns(runs, sights, neighbours)
+    missing = survey_turns(runs, sights, neighbours, trajectory)
     if missing is not None:
         said = (
             f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "

@@ -113,7 +113,7 @@ class FrameNeighbours:
         if self._missing is None:
             return None
         turns = [self.turn(first, second) for first, second in pairwise((*before, here, *after))]
-        return self._missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :])
+        return self._missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :], self._trajectory)
 
     def pictures(
         self,

@@ -57,7 +57,7 @@ def kept_lumas(
 
 
 def survey_turns(
-    runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours
+    runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours, trajectory: Trajectory
 ) -> MissingTurn | None:
     """What the predicted turns lack by these runs of frames; None: nothing of significance, or it cannot be told."""
     motions: list[RowMotion] = [s.motion for s in sights.values() if s.usable and s.motion is not None]
@@ -65,7 +65,7 @@ def survey_turns(
         [neighbours.turn(sights[a], sights[b]) if a in sights and b in sights else None for a, b in pairwise(run)]
         for run in runs
     ]
-    return missing_turn(turns, motions)
+    return missing_turn(turns, motions, trajectory)
 
 
 def survey_gain(
