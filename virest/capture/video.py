@@ -13,7 +13,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import logging
-import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.capture.coding_step import coding_step
 from virest.capture.files import label, require_regular_file
 from virest.capture.location import RemotePath, unreachable
 from virest.capture.pictures import PictureList, first_size, is_picture_source, read_picture_list, read_pictures
@@ -68,10 +68,6 @@ CENTRED_CHROMA = {"mjpeg", "mpeg1video"}
 HDR_CURVES = {16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}
 """Transfer curves that no response curve here describes."""
 PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
-STEP_AT_QP_0, QP_OF_TWICE = 0.625, 6.0
-"""Of H.264 (ITU-T H.264, 8.5.9): its quantiser's step in grey levels, and how much more QP doubles it."""
-H264_PARAMETERS, QP_PLACE = 1, 4
-"""AV_VIDEO_ENC_PARAMS_H264, and where a block's QP stands after its place and size."""
 FIXED_POINT = 64
 """Steps of a grey level in the 16-bit sums: luma and chroma together stay below 2^15."""
 
@@ -199,7 +195,7 @@ def read_frames(
     """Stream frames ``first`` to ``last`` (both included, ends clipped) as (frame index, RGB (h, w, 3) or None).
 
     None: the frame, or one that it depends on, cannot be decoded; later ones still come.  One is in memory at a time.
-    steps: takes each frame's :func:`coding_step` before the frame comes, where there is one.
+    steps: takes each frame's :func:`coding_step`, where there is one, before the frame comes.
     """
     yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb, steps)
 
@@ -350,22 +346,6 @@ def _read(
                     yield frame_index, convert(frame, centred=centred) if usable else None
         except (av.FFmpegError, UnicodeError) as fault:
             raise VideoError(f"{label(path)}: cannot be read ({_reason(fault)})", hint="copy the movie again") from None
-
-
-def coding_step(frame: Any) -> float | None:
-    """The step of the coder's quantiser, grey levels: mean over the blocks of a decoded frame; None: not told.
-
-    FFmpeg's decoder tells it for H.264 (``AVVideoEncParams``: a head, then blocks with what their QP is more).
-    """
-    for told in frame.side_data:
-        if told.type.name != "VIDEO_ENC_PARAMS":
-            continue
-        data = bytes(told)
-        count, start, size, kind, qp = struct.unpack_from("=I4xQQii", data)
-        if kind == H264_PARAMETERS and count and start + count * size <= len(data):
-            blocks = np.frombuffer(data, np.int32, count * size // 4, start).reshape(count, -1)
-            return float(np.mean(STEP_AT_QP_0 * 2 ** ((qp + blocks[:, QP_PLACE]) / QP_OF_TWICE)))
-    return None
 
 
 def _runs(index: MovieIndex, frames: Iterable[int]) -> Iterator[range | list[int]]:

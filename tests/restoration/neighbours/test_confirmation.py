@@ -96,8 +96,9 @@ def test_a_pair_that_changed_little_does_not_decide():
     assert found.share > 0.8
 
 
-def test_the_liveliest_frames_are_asked():
-    """The most blurred frame of each run that has two neighbours, and one more; those without both tell nothing."""
+def test_lively_frames_are_asked():
+    """The first frame of each run that was blurred enough, then the others; those without two neighbours never."""
     path_px = dict(enumerate([1.0, 2.0, 3.0, 9.0, 8.0, 2.0, 1.0, 12.0]))
-    assert lively_frames([(0, 1, 2, 3), (4, 5, 6, 7)], path_px) == [3, 4, 2]
+    assert lively_frames([(0, 1, 2, 3), (4, 5, 6, 7)], path_px) == [2, 4, 3, 1, 5, 6]
+    assert lively_frames([(0, 1, 2, 3)], {n: path_px[n] / 4 for n in range(4)}) == [2, 1]
     assert lively_frames([(4, 5, 6, 7)], {n: path_px[n] for n in (4, 5, 7)}) == []

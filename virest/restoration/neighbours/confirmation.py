@@ -22,8 +22,6 @@ LEAST_PAIRS = 2
 """A single one has no scatter."""
 LEAST_SEEN_DB = 0.1
 """Least improvement in predicting neighbours, in dB; a frame is not deblurred for less either."""
-LEAST_FREEDOM = 0.1
-"""Of a mean in which one pair weighs nearly all: it tells next to nothing."""
 USUAL_SHARE, USUAL_SHARE_STD = 1.0, 0.5
 """The share before any pair is asked: 1 is that of a right restoration.  On 8 simulated captures that were looked at,
 obedient ones and phones, it scattered by 0.3 from capture to capture; models that are wrong are to be found out, so
@@ -106,7 +104,7 @@ def confirmed_gain(found: Sequence[tuple[float, float, float, float]]) -> Confir
         return None
     measured, weight = gained.sum() / changed.sum(), changed / changed.sum()
     scatter = float(np.sqrt(weight @ (gained / changed - measured) ** 2))
-    freedom = max(1 / float(weight @ weight) - 1, LEAST_FREEDOM)
+    freedom = len(found) - 1
     of_mean = student_deviation(freedom) / np.sqrt(freedom)
     usual = (of_mean * scatter) ** 2 / ((of_mean * scatter) ** 2 + USUAL_SHARE_STD**2)
     share = usual * USUAL_SHARE + (1 - usual) * measured
