@@ -55,7 +55,7 @@ def decoder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Put a decoder in place that cannot decode certain frames, or ends early."""
 
     def install(broken: tuple[int, ...] = (), ends_at: int | None = None) -> None:
-        def read(path: Path, index: MovieIndex, first: int, last: int) -> Iterator[tuple[int, Any]]:
+        def read(path: Path, index: MovieIndex, first: int, last: int, *_: Any) -> Iterator[tuple[int, Any]]:
             for i in range(first, last + 1):
                 if i == ends_at:
                     raise VideoError("movie.mp4: ends")
