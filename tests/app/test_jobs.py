@@ -56,7 +56,7 @@ def decoder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Put a decoder in place that cannot decode certain frames, or ends early."""
 
     def install(broken: tuple[int, ...] = (), ends_at: int | None = None) -> None:
-        def read(path: Path, index: MovieIndex, first: int, last: int) -> Iterator[tuple[int, Any]]:
+        def read(path: Path, index: MovieIndex, first: int, last: int, *_: Any) -> Iterator[tuple[int, Any]]:
             for i in range(first, last + 1):
                 if i == ends_at:
                     raise VideoError("movie.mp4: ends")
@@ -68,7 +68,7 @@ def decoder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return install
 
 
-def restore_all(frames: Any, imu: ImuSamples, plan: RestorationPlan, only: Any = None) -> Iterator[RestoredFrame]:
+def restore_all(frames: Any, imu: ImuSamples, plan: RestorationPlan, *_: Any) -> Iterator[RestoredFrame]:
     """Stand in for the restoration: brighter by 100."""
     for frame, picture in frames:
         yield RestoredFrame(frame, "restored", picture + 100, valid_px=(0, 0, WIDTH, HEIGHT), seconds={"deblur": 0.5})
@@ -198,7 +198,7 @@ def test_a_frame_that_cannot_be_restored_fails_alone(
 ) -> None:
     """Even when the restoration had taken later frames already."""
 
-    def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan, only: Any = None) -> Iterator[RestoredFrame]:
+    def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan, *_: Any) -> Iterator[RestoredFrame]:
         for frame, picture in list(frames) if look_ahead else frames:
             if frame.index == 5:
                 raise RestorationError("kernel is singular")
@@ -255,7 +255,7 @@ def test_a_fault_of_ours_fails_one_segment_and_the_rest_goes_on(
 ) -> None:
     """The frames' lines say what happened."""
 
-    def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan, only: Any = None) -> Iterator[RestoredFrame]:
+    def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan, *_: Any) -> Iterator[RestoredFrame]:
         for frame, picture in frames:
             yield from restore_all([(frame, picture)], imu, plan)
             if frame.index == 1:

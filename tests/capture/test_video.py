@@ -41,6 +41,18 @@ def test_index_holds_size_times_and_key_frames(movie):
     np.testing.assert_array_equal(index.pts_ns, STEPS)
 
 
+@pytest.mark.parametrize("qp", [22, 28])
+def test_steps_of_the_quantiser_are_those_that_the_movie_was_coded_with(tmp_path, qp):
+    """Six QP more make twice the step; the pictures are the same whether it is asked for or not."""
+    path = tmp_path / "movie.mp4"
+    write_movie(path, moving_pictures(4), STEPS[:4], qmin=str(qp), qmax=str(qp))
+    index, steps = probe_movie(path), {}
+    told = dict(read_frames(path, index, 0, 3, steps))
+    assert steps == pytest.approx(dict.fromkeys(range(4), 0.625 * 2 ** (qp / 6)))
+    for number, picture in read_frames(path, index, 0, 3):
+        np.testing.assert_array_equal(picture, told[number])
+
+
 def test_b_frames_come_in_presentation_order(tmp_path):
     """With B-frames the index is sorted by time and each frame is still the one of its time."""
     pictures = moving_pictures(24)

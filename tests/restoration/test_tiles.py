@@ -296,6 +296,7 @@ def _joined(
     sharpness: float = 1.0,
     ratio: float = 1e-3,
     trust: Image | None = None,
+    weight: float = 1.0,
 ) -> TileDeconvolution:
     """Tiles of a picture to which a further one was joined; trust: None: everywhere."""
     grid = tile_grid(*picture.shape, 64, 16)
@@ -303,7 +304,7 @@ def _joined(
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], count, 0), 16)
     sharp, noise = (np.full((deconvolution.size,) * 2, value, np.float32) for value in (sharpness, ratio))
     trust = np.ones_like(picture) if trust is None else trust
-    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), [sharp] * count, trust)
+    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), [sharp] * count, trust, weight)
     deconvolution.join([picture], [other], noise)
     return deconvolution
 
@@ -323,6 +324,16 @@ def test_a_picture_joined_with_itself_says_nothing_new() -> None:
     np.testing.assert_allclose(twice.powers, once.powers, rtol=1e-4, atol=1e-9)
     projected = once.back_projected(picture)
     np.testing.assert_allclose(twice.back_projected(picture), projected, atol=1e-5 * np.abs(projected).max())
+
+
+def test_a_picture_coded_with_finer_steps_counts_for_more() -> None:
+    """Of two pictures blurred alike the data term is their mean by the weight of the other."""
+    kernel, (first, second) = _lopsided_kernel(), (texture(100, 150).astype(np.float32) * gain for gain in (1.0, 1.2))
+    joined = _joined(first, kernel, second, kernel, weight=3.0)
+    once = TileDeconvolution(joined.grid, np.repeat(kernel[None], len(joined.grid.centres_px), 0), 16)
+    np.testing.assert_allclose(joined.powers, once.powers, rtol=1e-4, atol=1e-9)
+    projected = once.back_projected(0.25 * first + 0.75 * second)
+    np.testing.assert_allclose(joined.back_projected(first), projected, atol=1e-5 * np.abs(projected).max())
 
 
 def test_a_picture_blurred_along_another_path_tells_what_the_first_lost() -> None:

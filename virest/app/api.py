@@ -99,11 +99,13 @@ class Capture:
         if frame.skip_reason is not None:
             return RestoredFrame(frame, "skipped", None, (frame.skip_reason,))
         around = range(max(number - plan.reach, 0), min(number + plan.reach + 1, len(self)))
-        decoded = dict(self.read_frames(around[0], around[-1] + 1))
+        steps: dict[int, float] = {}
+        read = read_frames(self.record.movie, self._movie(), around[0], around[-1], steps)
+        decoded = {n: picture for n, picture in read if picture is not None}
         if number not in decoded:
             raise CaptureError(f"{self.name}: frame {number} cannot be decoded", hint="inspect the capture")
         near = [(self.frames[k], decoded[k]) for k in sorted(decoded) if k == number or not self.frames[k].skip_reason]
-        return next(restore_frames(near, self.imu, plan, {number}))
+        return next(restore_frames(near, self.imu, plan, {number}, steps))
 
     def plan(self, preset: str = "balanced", **settings: Any) -> RestorationPlan:
         """What restoring this capture takes: the profile with unknown values filled in, translations, warnings."""

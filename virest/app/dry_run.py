@@ -103,13 +103,14 @@ def _restored(
     """Seconds, bytes of the PNG, blur in pixels and predicted gain of a frame; None where it cannot be decoded."""
     frames = {f.index: f for f in at_true_times(job.capture.frames, plan.profile, job.capture.repeats)}
     first, last = max(frame.index - plan.reach, 0), min(frame.index + plan.reach, len(frames) - 1)
-    decoded = {n: p for n, p in read_frames(job.capture.movie, index, first, last) if p is not None}
+    steps: dict[int, float] = {}
+    decoded = {n: p for n, p in read_frames(job.capture.movie, index, first, last, steps) if p is not None}
     if frame.index not in decoded:
         return None
     near = [(frames[n], decoded[n]) for n in sorted(decoded) if n != frame.index and not frames[n].skip_reason]
     near = sorted([*near, (frame, decoded[frame.index])], key=lambda pair: pair[0].index)
     began = time.perf_counter()
-    restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}), None)
+    restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}, steps), None)
     if restored is None or restored.picture is None or restored.degradation is None:
         return None
     size = len(png_bytes(restored.picture))

@@ -42,12 +42,15 @@ class TrueCapture:
     usable: tuple[Frame, ...]
     """All frames of the movie that are not skipped, in order."""
 
-    def recorded(self, reach: int = 0) -> Iterator[tuple[Frame, Picture]]:
-        """The judged frames and up to ``reach`` of the movie before and after each, with their pictures, RGB."""
+    def recorded(self, reach: int = 0, steps: dict[int, float] | None = None) -> Iterator[tuple[Frame, Picture]]:
+        """The judged frames and up to ``reach`` of the movie before and after each, with their pictures, RGB.
+
+        steps: takes those of the coder's quantiser.
+        """
         judged = {frame.index for frame in self.frames}
         near = {number + step for number in judged for step in range(-reach, reach + 1)}
         wanted = {frame.index: frame for frame in self.usable if frame.index in near}
-        for number, picture in read_frames(self.capture.movie, self.index, min(wanted), max(wanted)):
+        for number, picture in read_frames(self.capture.movie, self.index, min(wanted), max(wanted), steps):
             if number in wanted and picture is not None:
                 yield wanted[number], picture
 
@@ -62,7 +65,8 @@ class TrueCapture:
     def restored(self, plan: RestorationPlan) -> Iterator[RestoredFrame]:
         """What ``virest process`` makes of the judged frames."""
         judged = {frame.index for frame in self.frames}
-        return restore_frames(self.recorded(plan.reach), self.capture.imu, plan, judged)
+        steps: dict[int, float] = {}
+        return restore_frames(self.recorded(plan.reach, steps), self.capture.imu, plan, judged, steps)
 
     def motions(self, plan: RestorationPlan) -> dict[int, RowMotion]:
         """The motion over each usable frame, as the plan has it."""

@@ -170,13 +170,15 @@ def _without_picture(frame: Frame, status: str, reason: str) -> RestoredFrame:
     return RestoredFrame(frame, status, None, warnings=(reason,), valid_px=(0, 0, 0, 0), seconds={})
 
 
-def _decoded(segment: Segment, seconds: dict[int, float]) -> Iterator[tuple[Frame, Picture | None]]:
+def _decoded(
+    segment: Segment, seconds: dict[int, float], steps: dict[int, float]
+) -> Iterator[tuple[Frame, Picture | None]]:
     """The segment's usable frames and their neighbours in order, each with its picture, or None where it has none."""
     usable = [frame for frame in segment.frames if frame.skip_reason is None]
     wanted = deque(sorted((*usable, *segment.around), key=lambda frame: frame.index))
     if not usable:
         return
-    source = read_frames(segment.movie, segment.index, wanted[0].index, wanted[-1].index)
+    source = read_frames(segment.movie, segment.index, wanted[0].index, wanted[-1].index, steps)
     began = time.perf_counter()
     try:
         for index, picture in source:
@@ -199,6 +201,7 @@ def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[Restored
     fed: deque[tuple[Frame, Picture]] = deque()
     due = {frame.index for frame in segment.frames if frame.skip_reason is None}
     undecodable: list[Frame] = []
+    steps: dict[int, float] = {}
 
     def feed(source: Iterable[tuple[Frame, Picture | None]]) -> Iterator[tuple[Frame, Picture | None]]:
         for frame, picture in source:
@@ -208,10 +211,10 @@ def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[Restored
             elif frame.index in due:
                 undecodable.append(frame)
 
-    source: Iterator[tuple[Frame, Picture | None]] = _decoded(segment, decode_s)
+    source: Iterator[tuple[Frame, Picture | None]] = _decoded(segment, decode_s, steps)
     while True:
         try:
-            for restored in restore_frames(feed(source), segment.imu, segment.plan, due.copy()):
+            for restored in restore_frames(feed(source), segment.imu, segment.plan, due.copy(), steps):
                 due.discard(restored.frame.index)
                 while fed and fed[0][0].index < restored.frame.index - segment.plan.reach:
                     fed.popleft()

@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.capture.coding_step import coding_step
 from virest.capture.files import label, require_regular_file
 from virest.capture.location import RemotePath, unreachable
 from virest.capture.pictures import PictureList, first_size, is_picture_source, read_picture_list, read_pictures
@@ -188,12 +189,15 @@ def index_pictures(path: Path, found: PictureList) -> MovieIndex:
     return MovieIndex(width, height, Fraction(1, 10**9), found.time_ns, every, every, codec, pictures=found.names)
 
 
-def read_frames(path: Path, index: MovieIndex, first: int, last: int) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+def read_frames(
+    path: Path, index: MovieIndex, first: int, last: int, steps: dict[int, float] | None = None
+) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     """Stream frames ``first`` to ``last`` (both included, ends clipped) as (frame index, RGB (h, w, 3) or None).
 
     None: the frame, or one that it depends on, cannot be decoded; later ones still come.  One is in memory at a time.
+    steps: takes each frame's :func:`coding_step`, where there is one, before the frame comes.
     """
-    yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb)
+    yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb, steps)
 
 
 def read_gray(path: Path, index: MovieIndex, frames: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
@@ -314,7 +318,11 @@ def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> 
 
 
 def _read(
-    path: Path, index: MovieIndex, frames: Iterable[int], convert: Callable[..., NDArray[np.uint8]]
+    path: Path,
+    index: MovieIndex,
+    frames: Iterable[int],
+    convert: Callable[..., NDArray[np.uint8]],
+    steps: dict[int, float] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     if index.pictures:
         base, size = path if path.is_dir() else path.parent, (index.width, index.height)
@@ -328,9 +336,13 @@ def _read(
                 stream = _video_stream(container, path)
                 stream.thread_type = "NONE"
                 stream.codec_context.thread_count = 1
-                stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+                told = {} if steps is None else {"export_side_data": "venc_params"}
+                stream.codec_context.options = {"max_pixels": str(MAX_PIXELS), **told}
                 for frame_index, frame in _in_order(run, _decoded(container, stream, index, run[0])):
                     usable = frame is not None and (frame.width, frame.height) == (index.width, index.height)
+                    step = coding_step(frame) if usable and steps is not None else None
+                    if step is not None and steps is not None:
+                        steps[frame_index] = step
                     yield frame_index, convert(frame, centred=centred) if usable else None
         except (av.FFmpegError, UnicodeError) as fault:
             raise VideoError(f"{label(path)}: cannot be read ({_reason(fault)})", hint="copy the movie again") from None

@@ -24,6 +24,11 @@ def student_tail(value: Any, freedom: Any) -> float:
     return float(special.stdtr(freedom, -np.asarray(value, float)))
 
 
+def student_deviation(freedom: float) -> float:
+    """What Student's t exceeds as seldom as a normal deviate exceeds 1: 1.84 at one degree of freedom, 1.11 at 5."""
+    return float(special.stdtrit(freedom, special.ndtr(1.0)))
+
+
 def normal_tail(value: Any) -> float:
     """Probability of a larger normal deviate."""
     return float(special.ndtr(-np.asarray(value, float)))

@@ -120,13 +120,14 @@ def restore_frames(
     imu: ImuSamples,
     plan: RestorationPlan,
     only: Collection[int] | None = None,
+    steps: Mapping[int, float] | None = None,
 ) -> Iterator[RestoredFrame]:
     """Restore frames one by one; ``imu`` covers them. Frames without a picture are passed over.
 
     frames: in the movie's order.  only: numbers of those that are restored, the others being there as their neighbours;
-    None: all.
+    None: all.  steps: of the coder's quantiser, by number, known when a frame comes; missing: not known.
     """
-    profile = plan.profile
+    profile, steps = plan.profile, {} if steps is None else steps
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
     lens = moving_lens(trajectory, profile) if trajectory is not None else None
     translations, neighbours, undistort = plan.translations or {}, None, plan.settings.undistort
@@ -142,8 +143,8 @@ def restore_frames(
         outside = outside_reason(motion.start_s, motion.end_s, imu.time_s, plan.imu_gaps_s)
         why = outside[1] if outside else ""
         if plan.mask is None or plan.copy_reason is not None:
-            return Sight(frame, picture, motion, why)
-        return Sight(frame, without_mask(picture, plan.mask), motion, why, picture)
+            return Sight(frame, picture, motion, why, coding_step=steps.get(frame.index))
+        return Sight(frame, without_mask(picture, plan.mask), motion, why, picture, steps.get(frame.index))
 
     sights = (sight(frame, picture) for frame, picture in frames if picture is not None)
     for before, here, after in with_neighbours(sights, plan.reach):

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from virest.capture.folder import Capture
 from virest.capture.join import outside_reason
 from virest.image_formation.blur import Image
-from virest.image_formation.kernels import blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.inference.unsharp_mask import MOST_FRAMES, seen_mask, without_mask
 from virest.motion.integration import integrate_gyro
@@ -19,7 +18,7 @@ from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
-from virest.restoration.neighbours.survey import survey_gain, survey_turns
+from virest.restoration.neighbours.survey import path_length_px, survey_gain, survey_turns
 from virest.restoration.settings import PRESETS
 from virest.restoration.trial import tried
 
@@ -44,7 +43,7 @@ def with_neighbours_asked(
         sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
     plan, sights = _unmasked(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
-    missing = survey_turns(runs, sights, neighbours)
+    missing = survey_turns(runs, sights, neighbours, trajectory)
     if missing is not None:
         said = (
             f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
@@ -68,7 +67,7 @@ def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[Resto
     if plan.settings.deblur == "none":
         return plan, dict(sights)
     usable = [(one.picture, one.motion) for one in sights.values() if one.usable and one.motion is not None]
-    mask = seen_mask(sorted(usable, key=lambda one: float(np.linalg.norm(_path_px(one[1]))))[:MOST_FRAMES])
+    mask = seen_mask(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
     if mask is None:
         return plan, dict(sights)
     said = (
@@ -77,9 +76,3 @@ def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[Resto
     )
     plan = replace(plan, mask=mask, notes=(*plan.notes, said))
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}
-
-
-def _path_px(motion: RowMotion) -> NDArray[np.float64]:
-    """(2,) blur path in the picture's middle."""
-    middle_px = 0.5 * np.array([[motion.profile.width, motion.profile.height]])
-    return np.asarray(blur_chords(motion, middle_px)[0])

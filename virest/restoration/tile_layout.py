@@ -134,7 +134,7 @@ def join_neighbours(
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
         if lamps is not None:
             trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
-        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust))
+        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, one.finer))
     deconvolution.join(own, further, ratio)
 
 

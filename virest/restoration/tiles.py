@@ -46,6 +46,8 @@ class FurtherPicture:
     """What its uncertain place leaves of it on average in each tile, a packed real factor s."""
     trust: Image
     """(height, width) 0 to 1."""
+    weight: float = 1.0
+    """Of all that is trusted."""
 
 
 LEAST_RATIO = 1e-12
@@ -299,7 +301,7 @@ class _Joining:
         """Tiles that it is joined to."""
         self.whole = [least > 0 for least, _ in bounds]
         """Those without a place where it is left out."""
-        self._weights, self._most = means, [most for _, most in bounds]
+        self._weights, self._most = [picture.weight * mean for mean in means], [most for _, most in bounds]
         chosen = picture.kernels[np.array(self.used, bool)]
         self._spectra = _kernel_spectra(chosen, tiles.size, repeat(np.empty_like(tiles.powers[0])))
 

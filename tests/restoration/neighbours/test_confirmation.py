@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
+from virest.restoration.neighbours.survey import lively_frames
 
 FRAMES, PLACES = 2000, 16
 
@@ -71,3 +72,33 @@ def test_neighbours_that_lack_something_else_confirm_nothing():
     assert unlike.share == 0.0
     assert alike is not None
     assert alike.share == pytest.approx(5.0)
+
+
+def _pairs(*shares: float) -> list[tuple[float, float, float, float]]:
+    """Pairs of such shares, each of a change of 1; neighbours are predicted better where the share is positive."""
+    return [(share, 1.0, 0.1 * 10 ** (0.05 * share), 0.1) for share in shares]
+
+
+def test_few_pairs_that_contradict_each_other_do_not_outweigh_what_is_usual():
+    """Two pairs at -4.4 and -8.8 say little about a capture; eight that agree on a loss are believed."""
+    scattered, agreed = confirmed_gain(_pairs(-4.4, -8.8)), confirmed_gain(_pairs(*np.linspace(-0.9, -0.5, 8)))
+    assert scattered is not None
+    assert agreed is not None
+    assert 0.3 < scattered.share < 1.0
+    assert agreed.share == pytest.approx(-0.7, abs=0.05)
+
+
+def test_a_pair_that_changed_little_does_not_decide():
+    """Calm frames predict their neighbours no better; the blurred one that gained tells."""
+    calm = [(-0.001, 0.001, 0.05, 0.0505)] * 3
+    found = confirmed_gain([*calm, (1.0, 1.0, 0.2, 0.1), (0.9, 1.0, 0.2, 0.1)])
+    assert found is not None
+    assert found.share > 0.8
+
+
+def test_lively_frames_are_asked():
+    """The first frame of each run that was blurred enough, then the others; those without two neighbours never."""
+    path_px = dict(enumerate([1.0, 2.0, 3.0, 9.0, 8.0, 2.0, 1.0, 12.0]))
+    assert lively_frames([(0, 1, 2, 3), (4, 5, 6, 7)], path_px) == [2, 4, 3, 1, 5, 6]
+    assert lively_frames([(0, 1, 2, 3)], {n: path_px[n] / 4 for n in range(4)}) == [2, 1]
+    assert lively_frames([(4, 5, 6, 7)], {n: path_px[n] for n in (4, 5, 7)}) == []

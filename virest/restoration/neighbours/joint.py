@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -52,6 +53,8 @@ LOOKED_AT = 6
 HUBER, ROBUST_STEPS = 1.5, 6
 BESIDE = 1.1
 """Tiles no further apart than this, over their side, lie side by side; across a corner they are 1.3 to 1.4 apart."""
+CUBIC = -0.75
+"""Slope at one pixel of the kernel of OpenCV's cubic interpolation."""
 HALF = 2
 """Colour is brought at this many times less resolution: a movie stores no more of it."""
 
@@ -80,6 +83,8 @@ class NeighbourPlace:
     """Of the same size: where it has a picture."""
     std_px: Array
     """(n,) how well it is known where it lies in those tiles, each axis."""
+    finer: float = 1.0
+    """The frame's noise over its own, where both are a coder's: more than 1 where it was coded with finer steps."""
 
     @property
     def longest_px(self) -> float:
@@ -89,7 +94,7 @@ class NeighbourPlace:
     @property
     def weight(self) -> float:
         """Mean over the picture."""
-        return float(self.trust.mean())
+        return self.finer * float(self.trust.mean())
 
     def passed(self, frequency: Array) -> Array:
         """(RINGS,) mean |K|² over some of the places, times the mean weight and what its uncertain place leaves of it.
@@ -151,14 +156,38 @@ def neighbour_place(
     )
 
 
-def neighbour_picture(place: NeighbourPlace, light: Image, half_light: Image) -> NeighbourPicture:
-    """Bring a neighbour's luma of light (height, width), and its light at half that size, to the frame's pixels."""
+def neighbour_picture(place: NeighbourPlace, light: Image, half_light: Image, detailed: bool) -> NeighbourPicture:
+    """Bring a neighbour's luma of light (height, width), and its light at half that size, to the frame's pixels.
+
+    detailed: see :func:`is_detailed`; the luma is then read by eight points along each axis, at four times the cost.
+    """
     source = place.view.map_px(lambda points_px: points_px - _at(place.affine, points_px))
-    brought = cv2.remap(light, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    reading = cv2.INTER_LANCZOS4 if detailed else cv2.INTER_CUBIC
+    brought = cv2.remap(light, source, None, reading, borderMode=cv2.BORDER_REPLICATE)
     brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     for one in (brought, brought_half):
         one *= np.float32(1 / place.gain)
     return NeighbourPicture(place, brought, brought_half)
+
+
+def is_detailed(luma: PictureStatistics) -> bool:
+    """Whether cubic interpolation takes more of some ring of a picture than its noise is."""
+    return bool(np.any(np.interp(luma.frequency, *_cubic_error()) * luma.passed * luma.signal > luma.noise))
+
+
+@lru_cache(maxsize=1)
+def _cubic_error() -> tuple[Array, Array]:
+    """Frequencies along an axis, cycles per pixel, and the part of their power that cubic interpolation makes wrong.
+
+    Mean over all shifts of |1 − H|², with H the spectrum of the four weights about the place that is read.
+    """
+    frequency, shift = np.linspace(0, 0.5, 51), (np.arange(32) + 0.5) / 32
+    distance = np.abs(np.arange(-1, 3)[:, None] - shift)
+    near = (CUBIC + 2) * distance**3 - (CUBIC + 3) * distance**2 + 1
+    far = CUBIC * (distance**3 - 5 * distance**2 + 8 * distance - 4)
+    waves = np.exp(2j * np.pi * frequency[:, None, None] * (np.arange(-1, 3)[:, None] - shift))
+    passed = (np.where(distance <= 1, near, far) * waves).sum(axis=1)
+    return frequency, (np.abs(1 - passed) ** 2).mean(axis=1)
 
 
 def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independent_error: float) -> tuple[Image, Image]:

@@ -2,14 +2,14 @@
 
 An offset, a stabiliser's rest, a gyroscope's low pass, a focal length: whatever is wrong with the profile, the picture
 moves otherwise than predicted, and the shift between two frames measures by how much, on average from the one to the
-other.  Between the middles of intervals the missing rate is taken as linear in time.  How large it usually is, and
-how far it is from linear, is measured once a capture.
+other.  What follows from the predicted rate is fitted once a capture.  Between the middles of intervals the rest
+is taken as linear in time; how large it usually is, and how far from linear, is measured once a capture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from virest.image_formation.neighbour import turn_jacobian_px
 from virest.image_formation.row_motion import FurtherTurn, RowMotion
 from virest.inference.chance import chi2_median, chi2_tail
+from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.registration import PairTurn
 
 Array = NDArray[np.float64]
@@ -31,27 +32,66 @@ HALF_SPACING = 0.25
 """Of the error of linear interpolation at twice the spacing, which falls with its square."""
 
 
+LAG_STD_S, PART_STD = 0.003, 0.1
+"""What is usual of both: recorders stamp frames and samples to some milliseconds, and what a stabiliser or a low pass
+keeps from the picture or from the log is about a tenth."""
+NODE_S = 0.004
+"""Spacing of instants between which the missing rate is linear: hands shake at up to some 12 Hz."""
+
+
+@dataclass(frozen=True, slots=True)
+class FollowingTurn:
+    """What of the missing rate follows from the predicted one ω: lag · dω/dt + part · ω.
+
+    That is an offset of the clocks, and a scale, a stabiliser's rest or a low pass.
+    """
+
+    lag_s: float = 0.0
+    part: float = 0.0
+
+    def at(self, trajectory: Trajectory, time_s: Array) -> Array:
+        """(n, 3) rad/s at instants (n,)."""
+        return np.asarray(
+            self.lag_s * trajectory.angular_acceleration_rad_s2(time_s) + self.part * trajectory.rate_rad_s(time_s)
+        )
+
+    def left_of(self, turn: PairTurn, trajectory: Trajectory) -> PairTurn:
+        """What it does not explain of a turn."""
+        change, mean = _change_and_mean(turn, trajectory)
+        return replace(turn, rate_rad_s=turn.rate_rad_s - self.lag_s * change - self.part * mean)
+
+
 @dataclass(frozen=True, slots=True)
 class MissingTurn:
     """What the prediction of a capture usually lacks, by pairs of its frames."""
 
     rate_rad_s: float
     """One standard deviation of the missing turn rate, each axis."""
+    rest_rad_s: float
+    """The same of what does not follow from the predicted rate."""
     bend_rad_s: float
-    """One standard deviation of what linear interpolation between neighbouring intervals leaves of it."""
+    """One standard deviation of what linear interpolation between neighbouring intervals leaves of that rest."""
     scatter_px_s: float
     """One standard deviation, each axis, of the speeds of parts of the picture about the common turn."""
     pairs: int
+    following: FollowingTurn = FollowingTurn()
 
     def refined(
-        self, motion: RowMotion, before: Sequence[PairTurn | None], after: Sequence[PairTurn | None]
+        self,
+        motion: RowMotion,
+        before: Sequence[PairTurn | None],
+        after: Sequence[PairTurn | None],
+        trajectory: Trajectory,
     ) -> RefinedMotion:
         """The motion of a frame with the missing turn, by the pairs of frames before and after it, nearest first.
 
         Those next to it tell its own motion; those beyond, as far as they follow without a gap, that of its neighbours.
         """
-        prior = self.rate_rad_s**2 * np.eye(3)
-        chains = [self._unbroken(turns) for turns in (before, after)]
+        prior = self.rest_rad_s**2 * np.eye(3)
+        chains = [
+            self._unbroken([None if turn is None else self.following.left_of(turn, trajectory) for turn in turns])
+            for turns in (before, after)
+        ]
         if not any(chains):
             return RefinedMotion(motion, prior, self.scatter_px_s)
         known = [_shrunk(turn, prior) for turn in (*reversed(chains[0]), *chains[1])]
@@ -64,7 +104,11 @@ class MissingTurn:
         else:
             covariance, bend = covariances[-1 if chains[0] else 0], self.bend_rad_s / HALF_SPACING
         scatter = float(np.mean([chain[0].scatter_px_s for chain in chains if chain]))
-        further = FurtherTurn(times_s, rates)
+        around_s = float(np.abs(times_s - motion.middle_s).max()) + motion.end_s - motion.start_s
+        steps = np.arange(-int(np.ceil(around_s / NODE_S)), int(np.ceil(around_s / NODE_S)) + 1)
+        nodes_s: Array = motion.middle_s + NODE_S * steps.astype(float)
+        rest = np.stack([np.interp(nodes_s, times_s, along) for along in rates.T], -1)
+        further = FurtherTurn(nodes_s, rest + self.following.at(trajectory, nodes_s))
         return RefinedMotion(motion.turned(further), covariance + bend**2 * np.eye(3), scatter, further)
 
     def _unbroken(self, turns: Sequence[PairTurn | None]) -> list[PairTurn]:
@@ -73,7 +117,7 @@ class MissingTurn:
         return [turn for turn in known[: known.index(None) if None in known else None] if turn is not None]
 
     def _likely(self, turn: PairTurn) -> bool:
-        spread = turn.covariance + self.rate_rad_s**2 * np.eye(3)
+        spread = turn.covariance + self.rest_rad_s**2 * np.eye(3)
         return float(turn.rate_rad_s @ np.linalg.solve(spread, turn.rate_rad_s)) < FARTHEST**2
 
 
@@ -98,10 +142,12 @@ class RefinedMotion:
         return np.asarray(spread * self.motion.exposure_s**2)
 
 
-def missing_turn(runs: Sequence[Sequence[PairTurn | None]], motions: Sequence[RowMotion]) -> MissingTurn | None:
+def missing_turn(
+    runs: Sequence[Sequence[PairTurn | None]], motions: Sequence[RowMotion], trajectory: Trajectory
+) -> MissingTurn | None:
     """Measure it on runs of consecutive pairs; None where the pairs agree with the prediction, or are too few.
 
-    motions: of frames whose exposures are typical.
+    motions: of frames whose exposures are typical.  trajectory: as predicted.
     """
     turns = [turn for run in runs for turn in run if turn is not None]
     if len(turns) < 2 or not motions:
@@ -109,25 +155,53 @@ def missing_turn(runs: Sequence[Sequence[PairTurn | None]], motions: Sequence[Ro
     squares = [t.rate_rad_s @ np.linalg.solve(t.covariance, t.rate_rad_s) for t in turns]
     if chi2_tail(np.sum(squares), 3 * len(turns)) > FALSE_ALARM:
         return None
-    noise = np.mean([np.trace(t.covariance) / 3 for t in turns])
-    variance = np.median([t.rate_rad_s @ t.rate_rad_s for t in turns]) / chi2_median(3) - noise
+    variance = _variance(turns)
     if variance <= 0:
         return None
+    following = following_turn(turns, trajectory)
+    runs = [[None if turn is None else following.left_of(turn, trajectory) for turn in run] for run in runs]
+    rest = max(_variance([turn for run in runs for turn in run if turn is not None]), 0.0)
     bends = [
         (here.rate_rad_s - (a.rate_rad_s + b.rate_rad_s) / 2, here.covariance + (a.covariance + b.covariance) / 4)
         for run in runs
         for a, here, b in zip(run, run[1:], run[2:], strict=False)
         if a is not None and here is not None and b is not None
     ]
-    bend = np.mean([max(e @ e - np.trace(c), 0.0) / 3 for e, c in bends]) if bends else variance
+    bend = np.mean([max(e @ e - np.trace(c), 0.0) / 3 for e, c in bends]) if bends else rest
     found = MissingTurn(
         float(np.sqrt(variance)),
+        float(np.sqrt(rest)),
         float(HALF_SPACING * np.sqrt(bend)),
         float(np.median([t.scatter_px_s for t in turns])),
         len(turns),
+        following,
     )
     longest = max(_path_change_px(motion, found.rate_rad_s) for motion in motions)
     return found if longest > NEGLIGIBLE_PX else None
+
+
+def following_turn(turns: Sequence[PairTurn], trajectory: Trajectory) -> FollowingTurn:
+    """The lag and the part that explain turns best, weighed against what is usual of both (ridge regression)."""
+    design = np.concatenate([np.stack(_change_and_mean(turn, trajectory), -1) for turn in turns])
+    rates = np.concatenate([turn.rate_rad_s for turn in turns])
+    left = rates - design @ np.linalg.lstsq(design, rates, rcond=None)[0]
+    variance = max(float(left @ left) / max(len(left) - 2, 1), 1e-12)
+    usual = np.diag([1 / LAG_STD_S**2, 1 / PART_STD**2])
+    lag_s, part = np.linalg.solve(design.T @ design / variance + usual, design.T @ rates / variance)
+    return FollowingTurn(float(lag_s), float(part))
+
+
+def _change_and_mean(turn: PairTurn, trajectory: Trajectory) -> tuple[Array, Array]:
+    """(3,) rad/s² that the predicted rate changes by over a turn's time, and (3,) rad/s its mean."""
+    rate_rad_s = trajectory.rate_rad_s(np.linspace(turn.start_s, turn.end_s, 17))
+    mean = (rate_rad_s[1:] + rate_rad_s[:-1]).mean(axis=0) / 2
+    return np.asarray((rate_rad_s[-1] - rate_rad_s[0]) / (turn.end_s - turn.start_s)), np.asarray(mean)
+
+
+def _variance(turns: Sequence[PairTurn]) -> float:
+    """Of the rates about 0, each axis, beyond that of their own errors."""
+    noise = np.mean([np.trace(t.covariance) / 3 for t in turns])
+    return float(np.median([t.rate_rad_s @ t.rate_rad_s for t in turns]) / chi2_median(3) - noise)
 
 
 def _path_change_px(motion: RowMotion, rate_rad_s: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -24,6 +24,7 @@ from virest.restoration.neighbours.joint import (
     NeighbourPicture,
     NeighbourPlace,
     half_size,
+    is_detailed,
     most_telling,
     neighbour_picture,
     neighbour_place,
@@ -59,6 +60,8 @@ class Sight:
     """Why its motion is not known, where it reaches beyond the inertial data."""
     recorded: NDArray[np.uint8] | None = None
     """As it was recorded, where ``picture`` is without the phone's sharpening; None: ``picture`` is."""
+    coding_step: float | None = None
+    """Step of the coder's quantiser, grey levels; None: not known."""
 
     @property
     def usable(self) -> bool:
@@ -110,7 +113,7 @@ class FrameNeighbours:
         if self._missing is None:
             return None
         turns = [self.turn(first, second) for first, second in pairwise((*before, here, *after))]
-        return self._missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :])
+        return self._missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :], self._trajectory)
 
     def pictures(
         self,
@@ -135,7 +138,7 @@ class FrameNeighbours:
         found: dict[int, NeighbourPlace] = {}
         taken: list[int] = []
         sights = dict(left)
-        passed = {number: self._passed_of(other, here) for number, other in left.items()}
+        passed = {n: _finer(other, here) * self._passed_of(other, here) for n, other in left.items()}
         while tiles is not None and left and len(taken) < most:
             sum_taken = np.sum([np.zeros(RINGS), *(passed[number] for number in taken)], axis=0)
             number = list(left)[most_telling([passed[n] for n in left], sum_taken, luma)]
@@ -155,7 +158,8 @@ class FrameNeighbours:
                 if other not in found and abs(other - here.frame.index) >= apart:
                     passed[other] = passed[other] * share
             passed[number] = measured
-        return tuple(neighbour_picture(found[n], *self._full_of(sights[n])) for n in sorted(taken))
+        detailed = {n: is_detailed(replace(luma, passed=self._passed[n])) for n in taken}
+        return tuple(neighbour_picture(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
 
     def _place(
         self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
@@ -172,7 +176,8 @@ class FrameNeighbours:
         level = 255 * float(curve.encode(np.array(agreement.light)))
         slope = float(np.interp(level, np.arange(256), curve.slope_table()))
         error = agreement.expected_error(luma.frequency, luma.noise, slope)
-        return neighbour_place(view, along, other.frame.index, agreement, error)
+        place = neighbour_place(view, along, other.frame.index, agreement, error)
+        return None if place is None else replace(place, finer=_finer(other, here))
 
     def knowing(self, missing: MissingTurn | None) -> FrameNeighbours:
         """The same, and what was found already, with what the capture lacks."""
@@ -219,6 +224,17 @@ class FrameNeighbours:
         for kept in (self._light, self._full, self._passed, self._turns):
             for old in [n for n in kept if n < number]:
                 del kept[old]  # type: ignore[attr-defined]
+
+
+def _finer(other: Sight, here: Sight) -> float:
+    """The noise of a frame over that of another, by the steps with which both were coded; 1 where they are not known.
+
+    What a coder leaves wrong grew as its step to the power of 1.15 from frame to frame on five simulated captures at
+    0.25 bits a pixel (40 frames, correlation 0.86): less than as its square, for what lies below the step is dropped.
+    """
+    if here.coding_step is None or other.coding_step is None:
+        return 1.0
+    return here.coding_step / other.coding_step
 
 
 def light_of(sight: Sight) -> Image:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image
+from virest.image_formation.kernels import blur_chords
 from virest.image_formation.neighbour import neighbour_view
 from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
@@ -21,6 +22,9 @@ from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 RUN_FRAMES = 4
 """Three pairs: what linear interpolation leaves of the middle one shows."""
 MOST_RUNS = 4
+TELLING_PX = 3.0
+"""Paths of this length cancel a third of a cycle per pixel, and frames are compared up to a quarter.  On eleven
+simulated captures 36 of 38 shares of frames with longer paths were positive, of those with 1 to 2.5 px 12 of 40."""
 Picture = NDArray[np.uint8]
 
 
@@ -56,7 +60,7 @@ def kept_lumas(
 
 
 def survey_turns(
-    runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours
+    runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours, trajectory: Trajectory
 ) -> MissingTurn | None:
     """What the predicted turns lack by these runs of frames; None: nothing of significance, or it cannot be told."""
     motions: list[RowMotion] = [s.motion for s in sights.values() if s.usable and s.motion is not None]
@@ -64,7 +68,7 @@ def survey_turns(
         [neighbours.turn(sights[a], sights[b]) if a in sights and b in sights else None for a, b in pairwise(run)]
         for run in runs
     ]
-    return missing_turn(turns, motions)
+    return missing_turn(turns, motions, trajectory)
 
 
 def survey_gain(
@@ -78,24 +82,48 @@ def survey_gain(
     """What deblurring gains by the neighbours' account.
 
     tried: a frame's luma in light, as recorded and as restored, at the middle of its exposures and reduced; None: it is
-    left alone.  The first inner frame of each run is restored and held against both its neighbours.
+    left alone.  Lively frames are restored, one for each run and where runs are few one more, each held against both
+    its neighbours; one that neither judges gives its place to the next.
     """
-    found = []
-    for run in runs:
-        around = [sights[n] for n in run if n in sights and sights[n].usable]
-        for before, here, after in zip(around, around[1:], around[2:], strict=False):
-            assert here.motion is not None
-            refined = neighbours.refined((before,), here, (after,))
-            motion = here.motion if refined is None else refined.motion
-            pictures = tried(here.picture, motion, refined)
-            if pictures is None:
-                continue
-            for other in (before, after):
-                assert other.motion is not None
-                further = None if refined is None else refined.further
-                view = neighbour_view(motion, other.motion, trajectory, lens, further=further)
-                judged = judged_change(view, *pictures, neighbours.light(other))
-                if judged is not None:
-                    found.append(judged)
+    found: list[tuple[float, float, float, float]] = []
+    path_px = {n: path_length_px(s.motion) for n, s in sights.items() if s.usable and s.motion is not None}
+    asked, most = 0, min(len(runs) + 1, MOST_RUNS)
+    for number in lively_frames(runs, path_px)[: 2 * most]:
+        if asked == most:
             break
+        before, here, after = (sights[number + step] for step in (-1, 0, 1))
+        assert here.motion is not None
+        refined = neighbours.refined((before,), here, (after,))
+        motion = here.motion if refined is None else refined.motion
+        pictures = tried(here.picture, motion, refined)
+        if pictures is None:
+            continue
+        before_this = len(found)
+        for other in (before, after):
+            assert other.motion is not None
+            further = None if refined is None else refined.further
+            view = neighbour_view(motion, other.motion, trajectory, lens, further=further)
+            judged = judged_change(view, *pictures, neighbours.light(other))
+            if judged is not None:
+                found.append(judged)
+        asked += len(found) > before_this
     return confirmed_gain(found)
+
+
+def lively_frames(runs: Sequence[Sequence[int]], path_px: Mapping[int, float]) -> list[int]:
+    """Numbers of frames that lie between two others: the first telling one of each run, then the others.
+
+    A frame that was hardly blurred tells little: what restoring it changes is finer than the compared pictures show.
+    Those that tell come in the movie's order, then the most blurred.  path_px: length of each usable frame's blur path.
+    """
+    inner = [n for n in sorted(path_px) if n - 1 in path_px and n + 1 in path_px]
+    ranked = sorted(inner, key=lambda n: -min(path_px[n], TELLING_PX))
+    first = [next((n for n in ranked if n in run), None) for run in runs]
+    chosen = [n for n in dict.fromkeys(first) if n is not None]
+    return chosen + [n for n in ranked if n not in chosen]
+
+
+def path_length_px(motion: RowMotion) -> float:
+    """Length of the blur path in the picture's middle."""
+    middle_px = 0.5 * np.array([[motion.profile.width, motion.profile.height]])
+    return float(np.linalg.norm(blur_chords(motion, middle_px)[0]))

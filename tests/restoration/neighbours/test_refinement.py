@@ -1,0 +1,61 @@
+"""What of the turn that a prediction lacks follows from the predicted one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from virest.motion.trajectory import Trajectory
+from virest.restoration.neighbours.refinement import FollowingTurn, following_turn
+from virest.restoration.neighbours.registration import PairTurn
+
+PERIOD_S = 1 / 30
+FREQUENCY_HZ, PHASE_RAD = np.array([3.1, 4.3, 5.7]), np.array([0.3, 1.7, 2.9])
+
+
+class _Waving(Trajectory):
+    """A turn rate that is known in closed form."""
+
+    def __init__(self) -> None:
+        pass
+
+    def rate_rad_s(self, time_s: np.ndarray) -> np.ndarray:
+        return np.sin(2 * np.pi * FREQUENCY_HZ * np.asarray(time_s)[..., None] + PHASE_RAD)
+
+    def angular_acceleration_rad_s2(self, time_s: np.ndarray) -> np.ndarray:
+        angle = 2 * np.pi * FREQUENCY_HZ * np.asarray(time_s)[..., None] + PHASE_RAD
+        return 2 * np.pi * FREQUENCY_HZ * np.cos(angle)
+
+
+def _turns(lag_s: float, part: float, noise: float, rng: np.random.Generator) -> list[PairTurn]:
+    """Twelve pairs of frames of a camera whose turn is later, and by a part larger, than predicted."""
+    found = []
+    for start_s in PERIOD_S * np.arange(12):
+        instants_s = np.linspace(start_s, start_s + PERIOD_S, 400)
+        waving = _Waving()
+        lacking = lag_s * waving.angular_acceleration_rad_s2(instants_s) + part * waving.rate_rad_s(instants_s)
+        rate = lacking.mean(axis=0) + rng.normal(0, noise, 3)
+        found.append(PairTurn(start_s, start_s + PERIOD_S, rate, noise**2 * np.eye(3), 1.0, 12))
+    return found
+
+
+@pytest.mark.parametrize(("lag_s", "part"), [(0.002, 0.0), (-0.001, 0.08), (0.0, -0.1)])
+def test_a_lag_and_a_scale_come_back(rng: np.random.Generator, lag_s: float, part: float) -> None:
+    """Both are found from a few noisy pairs, and what they leave of these is their noise."""
+    turns, waving = _turns(lag_s, part, 0.005, rng), _Waving()
+    found = following_turn(turns, waving)
+    assert found.lag_s == pytest.approx(lag_s, abs=3e-4)
+    assert found.part == pytest.approx(part, abs=0.01)
+    left = [found.left_of(turn, waving).rate_rad_s for turn in turns]
+    assert np.std(left) < 0.008
+    assert found.at(waving, np.zeros(1)) == pytest.approx(
+        found.lag_s * waving.angular_acceleration_rad_s2(np.zeros(1)) + found.part * waving.rate_rad_s(np.zeros(1))
+    )
+
+
+def test_turns_that_follow_nothing_are_not_explained(rng: np.random.Generator) -> None:
+    """Of turns that are unrelated to the predicted rate next to nothing is put down to it."""
+    found = following_turn(_turns(0.0, 0.0, 0.05, rng), _Waving())
+    assert abs(found.lag_s) < 1.5e-3
+    assert abs(found.part) < 0.03
+    assert FollowingTurn().left_of(_turns(0.0, 0.0, 0.05, rng)[0], _Waving()).rate_rad_s.any()
