@@ -16,6 +16,33 @@ from virest.errors import SettingsError
 
 ROWS = (0.0, 0.2, 0.45, 0.8, 1.0)
 LATE = Field("delay", ("row",), (ROWS,), tuple((0.006 * r * (1 - r) + 0.001 * r,) for r in ROWS))
+TIMES = (0.0, 0.5, 1.0)
+PAIRS = (
+    Field(
+        "delay",
+        ("row", "time"),
+        ((0.0, 0.5, 1.0), TIMES),
+        tuple((1e-3 * r * t,) for r in (0, 1, 2) for t in (0, 1, 3)),
+        (),
+        77,
+    ),
+    Field(
+        "scale",
+        ("radius", "time"),
+        ((0.0, 200.0, 400.0), TIMES),
+        tuple((0.01 * r * t,) for r in (0, 1, 3) for t in (0, 1, 2)),
+        (),
+        77,
+    ),
+    Field(
+        "rate",
+        ("rate_x", "time"),
+        ((-2.0, 2.0), TIMES),
+        tuple((0.02 * r * t, 0.0, 0.0) for r in (-1, 1) for t in (0, 1, 2)),
+        (),
+        77,
+    ),
+)
 LENS = Intrinsics(640, 480, 510.0, 505.0, 322.0, 236.0, "radtan", (-0.05, 0.01, 0.001, -0.002, 0.0))
 
 
@@ -32,7 +59,7 @@ def every_kind() -> list[Field]:
     rate = Field("rate", ("accel_y",), ((-20.0, 20.0),), ((-0.1, 0.02, 0.03), (0.1, -0.02, -0.03)))
     drift = Field("delay", ("time",), ((0.0, 1.0, 2.0),), ((0.0,), (0.002,), (-0.001,)), (), 77)
     light = Field("gain", ("x", "y"), ((0.0, 639.0), (0.0, 479.0)), ((0.0,), (0.1,), (-0.05,), (0.0,)))
-    return [LATE, bent(), zoom, rate, drift, light]
+    return [LATE, bent(), zoom, rate, drift, light, *PAIRS]
 
 
 def camera() -> CameraProfile:
@@ -76,7 +103,7 @@ def test_a_profile_with_fields_is_read_as_it_was_written() -> None:
         ({"covariates": ["focus"]}, "covariates are"),
         ({"knots": [[0.0, 0.5, 0.5, 0.8, 1.0]]}, "rising knots"),
         ({"values": [[0.0]]}, "1 numbers for each knot"),
-        ({"version": 2}, "version"),
+        ({"version": 3}, "version"),
     ],
 )
 def test_a_field_that_cannot_be_is_refused_with_its_place(change: dict[str, object], said: str) -> None:
@@ -119,3 +146,12 @@ def test_times_can_be_counted_from_later() -> None:
     """The same instants keep their values."""
     field = every_kind()[2]
     assert field.later(0.3).at_time(0.4) == pytest.approx(field.at_time(0.7))
+    late, drawn, _ = PAIRS
+    assert late.later(0.3).at(0.7, 0.4) == pytest.approx(late.at(0.7, 0.7))
+    assert drawn.later(0.3).at_time(0.4, 150.0) == pytest.approx(drawn.at_time(0.7, 150.0))
+
+
+def test_entries_over_pairs_of_covariates_say_their_version() -> None:
+    """A program that knows no pairs refuses the file instead of reading it wrongly."""
+    content = yaml.safe_load(format_profile(camera().with_fields([LATE, *PAIRS])))
+    assert [entry["version"] for entry in content["extensions"]["field"]] == [1, 2, 2, 2]

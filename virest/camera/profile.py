@@ -163,12 +163,17 @@ class CameraProfile:
     def camera_time_s(self, imu_time_s: Any) -> Any:
         """Camera clock of an IMU time: the inverse of :meth:`imu_time_s`."""
         found = even_s = (imu_time_s - (self.time_offset_s or 0.0)) / (1.0 + self.clock_skew)
-        for _ in range(3 if any(f.kind == "delay" for f in self.extensions.field) else 0):
+        for _ in range(3 if self._wanders else 0):
             found = even_s - self._late_s(found) / (1.0 + self.clock_skew)
         return found
 
+    @property
+    def _wanders(self) -> list[ModelField]:
+        """Delays over time alone: of whole frames."""
+        return [f for f in self.extensions.field if (f.kind, f.covariates) == ("delay", ("time",))]
+
     def _late_s(self, camera_time_s: Any) -> Any:
-        late = [f.at_time(camera_time_s)[..., 0] for f in self.extensions.field if f.kind == "delay"]
+        late = [f.at_time(camera_time_s)[..., 0] for f in self._wanders]
         return sum(late) if late else 0.0
 
     def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:
@@ -336,7 +341,7 @@ class _Defocus(_Strict):
 
 
 class _Field(_Strict):
-    version: Literal[1] = 1
+    version: Literal[1, 2] = 1
     kind: Literal["delay", "displacement", "scale", "rate", "gain"]
     covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
     knots: Annotated[list[Annotated[list[Number], Field(max_length=200)]], Field(min_length=1, max_length=2)]
@@ -739,7 +744,11 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
 
 
 def _field_block(entry: ModelField) -> dict[str, Any]:
-    block: dict[str, Any] = {"version": 1, "kind": entry.kind, "covariates": list(entry.covariates)}
+    block: dict[str, Any] = {
+        "version": 2 if entry.is_pair else 1,
+        "kind": entry.kind,
+        "covariates": list(entry.covariates),
+    }
     for name in ("knots", "values", "std"):
         if rows := getattr(entry, name):
             block[name] = [list(row) for row in rows]

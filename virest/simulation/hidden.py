@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,14 @@ class Hidden:
 
     row_delay_s: Callable[[Array], Array] | None = None
     """Of the fraction of the readout (rows,): how much later than evenly each row starts."""
+    row_delay_at: Callable[[float, Array], Array] | None = None
+    """The same of the time of a frame's first row, and of the fraction."""
     clock_s: Callable[[float], float] | None = None
     """Of a stamp: how much later than the clocks say the frame is taken."""
     focal_scale: Callable[[Array], Array] | None = None
     """Of time: factor on the focal length."""
+    radial_scale: Callable[[Array, Array], Array] | None = None
+    """Of time and of the seen distance from the principal point, px: another."""
     gyro: Callable[[Array, Array, Array], Array] | None = None
     """Of time (n,), reading (n, 3) and specific force (n, 3): what is logged instead of the reading."""
     light: Callable[[Array, Array], Array] | None = None
@@ -39,12 +44,18 @@ class Hidden:
 NOTHING = Hidden()
 
 
-def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array) -> Array:
-    """How much later than evenly rows start (rows,), by their fraction of the readout."""
+def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array, first_row_s: float) -> Array:
+    """How much later than evenly rows start (rows,), by their fraction of the readout; first_row_s: IMU clock."""
     late = np.zeros(len(fraction))
     if profile.shutter.uneven is not None:
         late = late + profile.shutter.uneven.at(fraction)[:, 0]
-    return late if hidden.row_delay_s is None else late + hidden.row_delay_s(fraction)
+    begun = fraction + late / (profile.shutter.readout_time_s or 1.0)
+    for field in profile.extensions.field:
+        if field.kind == "delay" and field.covariates == ("row", "time"):
+            late = late + field.at(begun, profile.camera_time_s(first_row_s))[:, 0]
+    for hide in (hidden.row_delay_s, hidden.row_delay_at and partial(hidden.row_delay_at, first_row_s)):
+        late = late if hide is None else late + hide(fraction)
+    return late
 
 
 def shaded(hidden: Hidden, light: Any) -> Any:
@@ -56,23 +67,34 @@ def shaded(hidden: Hidden, light: Any) -> Any:
     return light * hidden.light(x, y)[..., None].astype(np.float32)
 
 
-def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any) -> Any:
-    """Factor on the profile's focal length at times (...)."""
+def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any, radius_px: Any) -> Any:
+    """Factor on the profile's focal length at times (...), for points seen this far (...) from the principal point."""
     time_s = np.asarray(time_s, float)
     scale = 1 + profile.extensions.focal_drift_per_s * time_s
     for field in profile.extensions.field:
         if field.kind == "scale":
             # what the camera logs runs on its clock
             own_s = time_s if field.log is None else profile.camera_time_s(time_s)
-            scale = scale + field.at_time(own_s)[..., 0]
-    return scale if hidden.focal_scale is None else scale * hidden.focal_scale(time_s)
+            first = (radius_px,) if "radius" in field.covariates else ()
+            scale = scale + field.at_time(own_s, *first)[..., 0]
+    if hidden.focal_scale is not None:
+        scale = scale * hidden.focal_scale(time_s)
+    return scale if hidden.radial_scale is None else scale * hidden.radial_scale(time_s, radius_px)
+
+
+def seen_radius_px(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:
+    """Distance (...) of pixels from the principal point."""
+    lens = profile.intrinsics
+    assert lens is not None
+    return np.hypot(x_px - lens.cx_px, y_px - lens.cy_px)
 
 
 def focal_changes(profile: CameraProfile, hidden: Hidden) -> bool:
     """Whether the focal length is another at another time."""
     extensions = profile.extensions
     own = any(field.kind == "scale" for field in extensions.field)
-    return bool(extensions.focal_drift_per_s or own or hidden.focal_scale is not None)
+    asked = hidden.focal_scale is not None or hidden.radial_scale is not None
+    return bool(extensions.focal_drift_per_s or own or asked)
 
 
 def missing_rate_rad_s(profile: CameraProfile, time_s: Array, reading: Array, force_m_s2: Array | None) -> Array:
@@ -84,7 +106,7 @@ def missing_rate_rad_s(profile: CameraProfile, time_s: Array, reading: Array, fo
             continue
         known = {"time": time_s, **dict(zip(RATES, reading.T, strict=True))}
         known |= {} if force_m_s2 is None else dict(zip(FORCES, np.nan_to_num(force_m_s2).T, strict=True))
-        total = total + field.at(known[name])
+        total = total + field.at(*(known[name] for name in field.covariates))
     return total
 
 

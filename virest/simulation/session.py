@@ -46,6 +46,8 @@ FASTEST_HAND_RAD_S = 100.0
 NEAREST_M, FARTHEST_M = 0.001, 1e6
 FOCAL_OF_LONG_SIDE = (0.05, 100.0)
 """What the renderer takes; beyond, arrays outgrow the memory or numbers lose their digits."""
+WHOLE_FRAMES = ("delay", ("time",))
+"""Fields that make all rows of a frame late."""
 _IMU_LEAD_S = 0.6
 _SCENE_MARGIN = 1.12
 
@@ -349,7 +351,9 @@ def _stamp_s(index: int, fps: float) -> float:
 
 def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: float) -> float:
     start_cam = stamp_s - STAMP_PLACE[true.shutter.timestamp] * true_exposure_s
-    late_s = sum(float(f.at_time(start_cam)[0]) for f in true.extensions.field if f.kind == "delay")
+    late_s = sum(
+        float(f.at_time(start_cam)[0]) for f in true.extensions.field if (f.kind, f.covariates) == WHOLE_FRAMES
+    )
     return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0) + late_s
 
 

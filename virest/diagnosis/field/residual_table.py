@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.field import Field, cardinal_weights
-from virest.diagnosis.field.screening import MAX_P, score_forms, select
+from virest.diagnosis.field.screening import MAX_P, Design, score_forms, select
 from virest.diagnosis.field.words import PATTERNS, SAMPLES, curve_shape, lens_words, shape_of
 from virest.errors import CaptureError
 
@@ -117,11 +117,11 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
         scale = _scale(current)
         weight = 1 / (1 + (current**2).sum(axis=-1) / (CAUCHY * scale) ** 2)
         open_forms = [form for form in forms if form.name not in {known[0].name for known in found}]
-        designs = [(form.name, form.design / scale, form.over_time) for form in open_forms]
+        designs = [Design(form.name, form.design / scale, form.over_time) for form in open_forms]
         selection = select(score_forms(current / scale, weight, tangent, designs, block), float(weight.sum()))
         if selection is None or selection.size * scale < MIN_SIZE_PX:
             break
-        form = next(form for form in open_forms if form.name == selection.best.name)
+        form = open_forms[selection.best.place]
         tangent = np.concatenate([tangent, form.design], axis=-1)
         after = float(np.sqrt(max(scale**2 - (selection.size * scale) ** 2, 0.0)))
         found.append((form, selection.best.p_value, selection.rivals, scale, after))

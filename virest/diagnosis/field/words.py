@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from virest.camera.field import FORCES, Field
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.field.forms import FORCE_REACH_M_S2, STEP_EDGE_S
+from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
 from virest.diagnosis.field.stretches import axis_names
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
@@ -80,6 +80,26 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "the gyroscope reads a rate in proportion to the acceleration, {size} per m/s²: it is sensitive to g",
         "a micromechanical gyroscope's mass moves under gravity and shocks",
         "log the phone at rest on each of its six sides: the rates differ by 2 g times the sensitivity",
+    ),
+    ("delay", ("row", "time")): Pattern(
+        "rows are {lateness} by up to {size} in some frames and not in others, {shape}: the readout changes as it runs",
+        "a sensor that changes its mode or clock while it films, or a picture that is cropped and scaled as it goes",
+        "film a lamp that flickers at a known rate: its bands grow closer where the readout takes longer",
+    ),
+    ("scale", ("radius", "time")): Pattern(
+        "the lens draws up to {size} longer outwards at some times and not at others, {shape}: its distortion changes",
+        "a lens that warms up or refocuses without logging it, or a phone that corrects distortion frame by frame",
+        "film a still board for a minute, once with the focus locked: a distortion that then stays is the focus's",
+    ),
+    ("scale", ("radius", "focus")): Pattern(
+        "the lens draws up to {size} longer outwards as it focuses, {shape}: its distortion changes with the focus",
+        "focusing moves lens elements, and distortion moves along",
+        "calibrate the lens with a board at several focus distances",
+    ),
+    ("rate", ("rate", "time")): Pattern(
+        "the gyroscope's scale changes over the capture, {shape}: up to {size} are missing at its highest rates",
+        "a sensor that warms up or changes its range, or a phone that corrects its scale while it logs",
+        "turn the phone on a table by a known angle, again and again from a cold start",
     ),
     ("rate", ("time",)): Pattern(
         "the gyroscope's bias changes by up to {size} over the capture",
@@ -175,11 +195,26 @@ def shape_of(field: Field) -> str:
     """What the values do along one covariate, or over the picture."""
     if field.covariates == ("x", "y"):
         return _shape_over_picture(field)
+    if len(field.covariates) > 1:
+        return _shape_of_pair(field)
     if is_sudden(field):
         return "a step"
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     values = field.at(along)
     return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates == ("time",))
+
+
+def _shape_of_pair(field: Field) -> str:
+    """What the product of two curves that is nearest to a field over two covariates does along each of them."""
+    first, second = (np.linspace(k[0], k[-1], SAMPLES) for k in field.knots)
+    values = field.at(first[:, None], second[None, :])
+    part = values[..., int(np.argmax(np.ptp(values, axis=(0, 1))))]
+    along, sizes, over = np.linalg.svd(part, full_matrices=False)
+    if sizes[0] ** 2 < ALIKE * float((sizes**2).sum()):
+        return "not a product of two curves"
+    curves = zip((along[:, 0], over[0]), field.covariates, strict=True)
+    each = (f"{curve_shape(c, n == 'time')} of the {SENSORS.get(n, n)}" for c, n in curves)
+    return " times ".join(each)
 
 
 def is_sudden(field: Field) -> bool:
