@@ -1,13 +1,14 @@
 """Fields: smooth corrections of the model along recorded covariates, for effects that have no name of their own.
 
 A field is given by its values at knots; between them runs the interpolating cubic spline (of lower degree below four
-knots), and beyond the first and last knot the end values hold.  Two covariates make a tensor product.  Five kinds:
+knots), and beyond the first and last knot the end values hold.  Two covariates make a tensor product.  Six kinds:
 
 - ``delay`` (s): a row starts this much later than an even readout has it, or a frame than its stamp (camera clock); of
   row and time, the time is that of the frame's first row.
 - ``displacement`` (px): a point is seen this far from where the lens puts it.
 - ``scale`` (1): the focal length is longer by this part; over the radius, for points that are seen there.
 - ``gain`` (1): at this place more light, by this part, reaches the sensor.
+- ``blur`` (px): the standard deviation of a Gaussian on the light, beside an even defocus.
 - ``rate`` (rad/s, IMU axes): the true rate is larger than the gyroscope's, less bias and over scale.
 """
 
@@ -32,6 +33,7 @@ KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
     "displacement": ("px", 2, (("x", "y"),)),
     "scale": ("1", 1, (("time",), ("focus",), ("focal",), ("radius", "time"), ("radius", "focus"))),
     "gain": ("1", 1, (("x", "y"),)),
+    "blur": ("px", 1, (("time",), ("focus",), ("radius",))),
     "rate": ("rad/s", 3, (("time",), *((name,) for name in (*RATES, *FORCES)), *((name, "time") for name in RATES))),
 }
 """Unit, number of components and possible covariates of each kind."""

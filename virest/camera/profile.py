@@ -136,6 +136,8 @@ class CameraProfile:
             raise SettingsError(
                 "extensions.field: one delay over the row and one displacement at most", hint="add their values up"
             )
+        if any((f.kind, f.covariates) == ("blur", ("radius",)) for f in fields):
+            raise SettingsError("extensions.field: blur over the radius is not followed", hint="leave the entry out")
         uneven, displaced = (next(iter(held[kind]), None) for kind in ("delay", "displacement"))
         lens = self.intrinsics
         if lens is None and displaced is not None:
@@ -342,7 +344,7 @@ class _Defocus(_Strict):
 
 class _Field(_Strict):
     version: Literal[1, 2] = 1
-    kind: Literal["delay", "displacement", "scale", "rate", "gain"]
+    kind: Literal["delay", "displacement", "scale", "rate", "gain", "blur"]
     covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
     knots: Annotated[list[Annotated[list[Number], Field(max_length=200)]], Field(min_length=1, max_length=2)]
     values: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)]

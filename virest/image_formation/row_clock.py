@@ -7,7 +7,7 @@ and skew; readout and true exposure last as long as the profile says, in seconds
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,13 @@ def row_time_s(
 
 
 def of_frame(profile: CameraProfile, stamp_s: float, logged_exposure_s: float) -> CameraProfile:
-    """The profile with the readout of one frame, where the readout differs from frame to frame."""
+    """The profile with the readout and the defocus of one frame, where these differ from frame to frame."""
+    blurs = [field for field in profile.extensions.field if field.kind == "blur"]
+    if blurs:
+        even = profile.extensions.defocus_sigma_px
+        sigma_px = float(np.hypot.reduce([even, *(float(field.at_time(stamp_s)[0]) for field in blurs)]))
+        profile = replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=sigma_px))
+        profile = profile.with_fields([field for field in profile.fields if field not in blurs])
     changing, shutter = _changing_rows(profile), profile.shutter
     if not changing:
         return profile

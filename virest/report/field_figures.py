@@ -17,7 +17,13 @@ from virest.report.figures import as_file, canvas, literal
 
 Array = NDArray[np.float64]
 SAMPLES, ARROWS, BINS, MIN_IN_BIN = 200, 13, 20, 8
-UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.0, "%"), "rate": (1.0, "rad/s")}
+UNIT_SCALES = {
+    "delay": (1e3, "ms"),
+    "displacement": (1.0, "px"),
+    "scale": (100.0, "%"),
+    "rate": (1.0, "rad/s"),
+    "blur": (1.0, "px"),
+}
 NAMES = {
     "row": "fraction of the readout",
     "time": "time",

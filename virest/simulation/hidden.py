@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,11 +38,16 @@ class Hidden:
     """Of time (n,), reading (n, 3) and specific force (n, 3): what is logged instead of the reading."""
     light: Callable[[Array, Array], Array] | None = None
     """Of x and y as parts of the width and height: factor on the light."""
+    blur_px: Callable[[float], float] | None = None
+    """Of a stamp: standard deviation of a Gaussian on the light."""
+    corner_blur_px: float = 0.0
+    """Standard deviation of a Gaussian in the corners, growing with the square of the distance from the middle."""
     focus_dioptres: Callable[[Array], Array] | None = None
     """Of a frame's time: the focus distance that is logged."""
 
 
 NOTHING = Hidden()
+LEAST_BLUR_PX, STEPS = 0.05, 8
 
 
 def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array, first_row_s: float) -> Array:
@@ -56,6 +62,26 @@ def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array, first_r
     for hide in (hidden.row_delay_s, hidden.row_delay_at and partial(hidden.row_delay_at, first_row_s)):
         late = late if hide is None else late + hide(fraction)
     return late
+
+
+def defocused(profile: CameraProfile, hidden: Hidden, light: Any, stamp_s: float) -> Any:
+    """Light (h, w, 3) out of focus at some times, or towards the corners."""
+    sizes = [float(f.at_time(stamp_s)[0]) for f in profile.extensions.field if f.kind == "blur"]
+    sizes += [] if hidden.blur_px is None else [float(hidden.blur_px(stamp_s))]
+    if (sigma := float(np.hypot.reduce([0.0, *sizes]))) > LEAST_BLUR_PX:
+        light = cv2.GaussianBlur(light, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    if not hidden.corner_blur_px:
+        return light
+    height, width = light.shape[:2]
+    x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    part = 0.5 * (x**2 * width**2 + y**2 * height**2) / (0.5 * (width**2 + height**2))
+    levels = [light, *(cv2.GaussianBlur(light, (0, 0), hidden.corner_blur_px * k / STEPS) for k in range(1, STEPS + 1))]
+    place = np.clip(STEPS * part, 0, STEPS)
+    below = np.minimum(place.astype(int), STEPS - 1)
+    above = (place - below)[..., None].astype(np.float32)
+    whole = np.stack(levels)
+    rows, columns = np.indices((height, width))
+    return (1 - above) * whole[below, rows, columns] + above * whole[below + 1, rows, columns]
 
 
 def shaded(hidden: Hidden, light: Any) -> Any:

@@ -22,7 +22,7 @@ from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
-from virest.simulation.hidden import NOTHING, Hidden, gyro_reading, shaded
+from virest.simulation.hidden import NOTHING, Hidden, defocused, gyro_reading, shaded
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
@@ -239,6 +239,7 @@ def render_picture(session: Session, slot: int, phone: PhonePictures | None = No
         session.first_row_start_s(capture),
         session.true_exposure_s(capture),
     )
+    light = defocused(session.true, session.hidden, light, _stamp_s(capture, session.settings.fps))
     light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=True))
     rng = np.random.default_rng([session.settings.seed, 3, capture])
     levels = noisy_levels(_grey(session, light), session.settings.noise_levels, rng)

@@ -242,7 +242,9 @@ def _finding(
     else:
         along = np.linspace(form.knots[0][0], form.knots[0][-1], SAMPLES)
         curve = cardinal_weights(form.knots[0], along) @ values
-        shape = curve_shape(curve[:, int(np.argmax(np.ptp(curve, axis=0)))], form.over_time)
+        shape = curve_shape(
+            curve[:, int(np.argmax(np.ptp(curve, axis=0)))], "time" if form.over_time else form.covariates[0]
+        )
     sentence, reasons, following = _said(form, shape, size)
     beside = f"; {' and '.join(rivals)} would explain it as well" if rivals else ""
     return TableFinding(

@@ -197,8 +197,6 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     if (sudden := sudden_change(seen)) is not None and not any(", a step" in name for name in in_model):
         form = best_instant(seen, capture, sudden.at_s, sudden.scale, evidence.period_s)
         yield _Asked(form, sudden=sudden)
-        # or one that comes back: of a few frames, whose signs are too few for a test by flips
-        yield from (_Asked(form, sudden=sudden) for form in forms if form.local and form.kind == "scale")
     smooth = [form for form in forms if not form.local]
     if (selection := search.best(tangent, smooth)) is not None:
         form = smooth[selection.best.place]
@@ -211,6 +209,9 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     tangent = np.concatenate([tangent, *(search.effect(form) for form in plain.values())], axis=-1)
     if (selection := search.best(tangent, forms)) is not None:
         yield _Asked(forms[selection.best.place], selection)
+    elif sudden is not None:
+        # one that comes back: of a few frames, whose signs are too few for a test by flips
+        yield from (_Asked(form, sudden=sudden) for form in forms if form.local and form.kind == "scale")
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,7 +355,7 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
         fitted = evidence.fit(model, model.terms, evidence.table(model, JUDGE_POINTS))
         state = replace(state, model=replace(model, profile=fitted.profile, scene=fitted.scene))
         if (form := _idle_form(evidence, state, fitted)) is not None:
-            log.debug("stood in for a pair: %s", form.name)
+            log.debug("stood in for another form: %s", form.name)
             kept = tuple(known for known in state.forms if known is not form)
             state = replace(state, model=_without_form(state.model, form), forms=kept)
             continue
@@ -366,11 +367,8 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
 
 
 def _idle_form(evidence: Evidence, state: _Description, fitted: TrackFit) -> FieldForm | None:
-    """A form that a pair of covariates leaves nothing to say to, if any."""
-    *others, newest = state.forms
-    if not newest.is_pair:
-        return None
-    less = ((form, _without_form(state.model, form)) for form in others)
+    """A form that the newest leaves nothing to say to, if any."""
+    less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
     return next((form for form, model in less if not _useful(evidence, model, state.model, fitted)), None)
 
 

@@ -201,7 +201,7 @@ def shape_of(field: Field) -> str:
         return "a step"
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     values = field.at(along)
-    return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates == ("time",))
+    return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates[0])
 
 
 def _shape_of_pair(field: Field) -> str:
@@ -213,7 +213,7 @@ def _shape_of_pair(field: Field) -> str:
     if sizes[0] ** 2 < ALIKE * float((sizes**2).sum()):
         return "not a product of two curves"
     curves = zip((along[:, 0], over[0]), field.covariates, strict=True)
-    each = (f"{curve_shape(c, n == 'time')} of the {SENSORS.get(n, n)}" for c, n in curves)
+    each = (f"{curve_shape(c, n)} of the {SENSORS.get(n, n)}" for c, n in curves)
     return " times ".join(each)
 
 
@@ -222,16 +222,16 @@ def is_sudden(field: Field) -> bool:
     return field.covariates == ("time",) and field.knots[0][-1] - field.knots[0][0] < 2 * STEP_EDGE_S
 
 
-def curve_shape(curve: Array, over_time: bool = False) -> str:
+def curve_shape(curve: Array, covariate: str = "") -> str:
     """What a curve (SAMPLES,) at even steps of its covariate does."""
-    u = np.linspace(-1, 1, SAMPLES)
+    u, over_time = np.linspace(-1, 1, SAMPLES), covariate == "time"
     if not float(np.var(curve)):
         return "nothing"
     if _unexplained(curve, [u]) < 1 - ALIKE:
         return "a straight line"
     if not over_time and _is_step(curve):
         return "a step"
-    if not over_time and _is_sawtooth(curve, u):
+    if covariate == "row" and _is_sawtooth(curve, u):
         return "even blocks with a jump between them"
     if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
         rises, falls = (float(np.clip(way * np.diff(curve), 0, None).sum()) for way in (1, -1))
