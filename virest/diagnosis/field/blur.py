@@ -8,22 +8,26 @@ the radius the pictures' cells err together and whole quarters are left out; ove
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
-from virest.diagnosis.field.screening import Design, Scored, score_forms
+from virest.diagnosis.field.screening import Design, Scored, score_forms, t_ratio
 from virest.diagnosis.field.words import SAMPLES, curve_shape
 from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
 from virest.diagnosis.local_blur import LENS_SIGMA_PX, BlurObservations, predicted_blur
 from virest.diagnosis.local_blur_model import fitted_width
 from virest.inference.robust import CAUCHY
 from virest.motion.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -33,7 +37,9 @@ RADIUS_KNOTS, FOCUS_KNOTS, TIME_STEP_S, LEAST_TIMES, MOST_TIMES = 4, 4, 0.2, 5, 
 MIN_SIZE_PX = 0.5
 """Standard deviation of the added Gaussian: coding alone widens edges from 0.70 to 0.85 px, by one of 0.48 px."""
 LEAST_EDGES, LEAST_CHANGE = 300, 0.05
-RIDGE = 1e-3
+RIDGE, MIN_GAIN = 1e-3, 0.02
+CAP, BOUND, LEAST_WIDTH_PX, _STEPS = 10.0, 3.0, 0.2, 12
+"""Deviations at which what is left is capped, and at which one edge counts no more; no edge is sharper than that."""
 FOLLOWED = ("time", "focus")
 """Along which `process` can follow a blur: one width a frame."""
 SENTENCES = {
@@ -64,56 +70,119 @@ class _Form:
     """(n,) what errs together, rising in the order that parts are cut in."""
     nuisance: Array
     """(n, m) beside what all forms allow for."""
-    log: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    logged: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Edges:
+    """Widths of edges, and what an even blur makes of them."""
+
+    width_px: Array
+    """(n,) as measured."""
+    even_px: Array
+    """(n,) by path, lens and an even defocus."""
+    common: Array
+    """(n, m) added variance per unit of what every form allows for."""
+    scale_px: float
+    """Robust standard deviation of what is left."""
+
+    def fitted(self, form: _Form, rows: Index | None = None, free: bool = True) -> tuple[Array, Array, Array]:
+        """Added variance (knots,), px², about its mean, its covariance, and what is left of all edges (n,), px.
+
+        Gauss-Newton with Cauchy weights, on some rows.  free: False keeps the form at nought.
+        """
+        rows = np.arange(len(self.width_px)) if rows is None else rows
+        own = form.weights - form.weights.mean(axis=0)
+        columns = np.concatenate([own if free else own[:, :0], self.common, form.nuisance], axis=1)
+        numbers: Array = np.zeros(columns.shape[1])
+        inverse: Array = np.eye(len(numbers))
+        pull: Array = np.zeros((len(rows), len(numbers)))
+        for _ in range(_STEPS):
+            width = self._widths(columns @ numbers)
+            left = self.width_px - width
+            weight = 1 / (1 + (left[rows] / (CAUCHY * self.scale_px)) ** 2) / self.scale_px**2
+            slope = columns[rows] * (0.5 / width[rows])[:, None]
+            normal = (slope * weight[:, None]).T @ slope
+            inverse = np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9)))
+            pull = slope * (weight * left[rows])[:, None]
+            numbers = numbers + inverse @ pull.sum(axis=0)
+        count = own.shape[1] if free else 0
+        sums = np.stack([np.bincount(form.block[rows], column) for column in pull.T], axis=-1)
+        covariance = (inverse @ (sums.T @ sums) @ inverse)[:count, :count]
+        return numbers[:count], covariance, self.width_px - self._widths(columns @ numbers)
+
+    def _widths(self, added: Array) -> Array:
+        return np.sqrt(np.maximum(self.even_px**2 + added, LEAST_WIDTH_PX**2))
+
+    def held_out(self, form: _Form, free: bool) -> float:
+        """Capped rms of widths in blocks that a fit to the others did not see, px."""
+        left = np.zeros(len(self.width_px))
+        for fold in (0, 1):
+            inside = np.flatnonzero(form.block % 2 == fold)
+            left[form.block % 2 != fold] = self.fitted(form, inside, free)[2][form.block % 2 != fold]
+        return float(np.sqrt(np.mean(np.minimum(np.abs(left), CAP * self.scale_px) ** 2)))
 
 
 def blur_field(
     seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory, capture: Capture
 ) -> tuple[FieldFinding, CameraProfile] | None:
     """The field of blur that edges ask for, and the profile with it; None where they ask for none."""
-    edges = seen.edges
-    if len(edges) < LEAST_EDGES or not seen.edges_determined or profile.intrinsics is None:
+    widths = seen.edges
+    if len(widths) < LEAST_EDGES or not seen.edges_determined or profile.intrinsics is None:
         return None
     motion_px = predicted_blur(seen, profile, trajectory).motion_px
-    widths = fitted_width(motion_px, profile.extensions.defocus_sigma_px, LENS_SIGMA_PX)
-    left = edges.width_px - widths
+    even_px = fitted_width(motion_px, profile.extensions.defocus_sigma_px, LENS_SIGMA_PX)
+    left = widths.width_px - even_px
     scale = max(1.4826 * float(np.median(np.abs(left - np.median(left)))), 1e-6)
-    left = left / scale
-    weight = 1 / (1 + ((left - np.median(left)) / CAUCHY) ** 2)
-    per_variance = 0.5 / widths / scale
-    common = np.stack(
-        [per_variance, per_variance * motion_px**2, per_variance / edges.step_levels, per_variance * edges.brightness],
-        -1,
-    )
+    common = np.stack([np.ones_like(left), motion_px**2, 1 / widths.step_levels, widths.brightness], axis=-1)
+    edges = _Edges(widths.width_px, even_px, common, scale)
     forms = list(_forms(seen, profile, capture))
-    found: list[tuple[Scored, _Form]] = []
-    for form in forms:
-        order = np.argsort(form.block, kind="stable")
-        tangent = np.concatenate([common, form.nuisance * per_variance[:, None]], axis=1)
-        design = Design(form.covariate, (form.weights * per_variance[:, None])[order, None], form.covariate == "time")
-        found += [
-            (scored, form)
-            for scored in score_forms(
-                left[order, None], weight[order], tangent[order, None], [design], form.block[order], asked=len(forms)
-            )
-            if scored.significant
-        ]
+    found = [(scored, form) for form in forms if (scored := _asked(edges, form, len(forms))) is not None]
     if not found:
         return None
     scored, form = max(found, key=lambda pair: float(pair[0].gain.sum()))
-    variance, covariance = _fitted(form, left, weight, common, per_variance)
-    lowest = float(variance.min())
-    added = variance - lowest
-    size = float(np.sqrt(added.max()))
-    if size < MIN_SIZE_PX:
+    variance, covariance, _ = edges.fitted(form)
+    sigma = np.sqrt(variance - variance.min())
+    held = HeldOutGain(BLUR, edges.held_out(form, free=False), edges.held_out(form, free=True), None)
+    if sigma.max() < MIN_SIZE_PX or held.after > (1 - MIN_GAIN) * held.before:
         return None
-    sigma = np.sqrt(np.maximum(added, 0.0))
-    std = np.sqrt(np.diag(covariance)) / (2 * np.maximum(sigma, MIN_SIZE_PX))
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / (2 * np.maximum(sigma, MIN_SIZE_PX))
     stamp = capture.stamp_0_ns if form.covariate == "time" else None
     rows = [tuple((float(value),) for value in column) for column in (sigma, std)]
-    field = Field("blur", (form.covariate,), (tuple(form.knots.tolist()),), rows[0], rows[1], stamp, form.log)
+    field = Field("blur", (form.covariate,), (tuple(form.knots.tolist()),), rows[0], rows[1], stamp, form.logged)
     rivals = tuple(f"blur over {other.covariate}" for one, other in found if _alike(scored, one) and other is not form)
-    return _said(field, form, scored, rivals, left * scale, weight), _with(profile, field, lowest)
+    return _said(field, held, scored.p_value, rivals), _with(profile, field, float(variance.min()))
+
+
+def _asked(edges: _Edges, form: _Form, forms: int) -> Scored | None:
+    """How strongly edges ask for a form; None where chance or other blocks do not bear it out."""
+    order = np.argsort(form.block, kind="stable")
+    slope = 0.5 / edges.even_px / edges.scale_px
+    left = (edges.width_px - edges.even_px) / edges.scale_px
+    left = left - np.median(left)
+    weight = 1 / (1 + (left / CAUCHY) ** 2)
+    tangent = np.concatenate([edges.common, form.nuisance], axis=1) * slope[:, None]
+    over_time = form.covariate != "radius"
+    design = Design(form.covariate, (form.weights * slope[:, None])[order, None], over_time)
+    (scored, *_) = score_forms(
+        left[order, None], weight[order], tangent[order, None], [design], form.block[order], asked=forms
+    ) or (None,)
+    if scored is None:
+        return None
+    if over_time:
+        scored = replace(scored, p_value=min(1.0, 2 * scored.p_value, 2 * forms * _outstanding(left, form.block)))
+    log.debug("blur over %s: p %.2g, t %.1f", form.covariate, scored.p_value, t_ratio(scored.gain))
+    return scored if scored.significant else None
+
+
+def _outstanding(left: Array, block: Index) -> float:
+    """Probability of any frame standing out so far by chance: a few frames have too few signs for a test by flips."""
+    bounded = np.clip(left, -BOUND, BOUND)
+    count = np.maximum(np.bincount(block), 1)
+    mean = np.bincount(block, bounded - np.median(bounded)) / np.sqrt(count)
+    spread = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), float(bounded.std()))
+    most = float(np.abs(mean - np.median(mean)).max()) / max(spread, 1e-9)
+    return min(1.0, 2 * len(count) * float(stats.t.sf(most, len(count) - 1)))
 
 
 def _alike(best: Scored, other: Scored) -> bool:
@@ -147,19 +216,6 @@ def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> 
         yield _Form("focus", knots, weights, frame, own, (tuple(times.tolist()), tuple(values.tolist())))
 
 
-def _fitted(form: _Form, left: Array, weight: Array, common: Array, per_variance: Array) -> tuple[Array, Array]:
-    """Added variance (knots,), px², about its mean, and its covariance with blocks as what errs together."""
-    own = form.weights - form.weights.mean(axis=0)
-    columns = np.concatenate([own * per_variance[:, None], common, form.nuisance * per_variance[:, None]], axis=1)
-    normal = (columns * weight[:, None]).T @ columns
-    inverse = np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9)))
-    numbers = inverse @ (columns.T @ (weight * left))
-    pull = columns * (weight * (left - columns @ numbers))[:, None]
-    sums = np.stack([np.bincount(form.block, column) for column in pull.T], axis=-1)
-    count = own.shape[1]
-    return numbers[:count], (inverse @ (sums.T @ sums) @ inverse)[:count, :count]
-
-
 def _with(profile: CameraProfile, field: Field, lowest: float) -> CameraProfile:
     """The profile with a field that can be followed; the even defocus is that of the sharpest frames then."""
     if field.covariates[0] not in FOLLOWED:
@@ -171,24 +227,15 @@ def _with(profile: CameraProfile, field: Field, lowest: float) -> CameraProfile:
     )
 
 
-def _said(
-    field: Field, form: _Form, scored: Scored, rivals: tuple[str, ...], left_px: Array, weight: Array
-) -> FieldFinding:
-    """In words; held out: weighted rms of edges' widths."""
-    name = form.covariate
+def _said(field: Field, held: HeldOutGain, p_value: float, rivals: tuple[str, ...]) -> FieldFinding:
+    """In words."""
+    (name,), values = field.covariates, np.array(field.values)[:, 0]
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
-    shape = curve_shape(field.at(along)[:, 0], "time" if name == "time" else name)
-    place = int(np.argmax(np.array(field.values)[:, 0]))
-    size, std = field.values[place][0], field.std[place][0]
-    centred = left_px - np.median(left_px)
-    whole = float((weight * centred**2).sum() / weight.sum())
-    unit = float(np.median(np.abs(centred))) * 1.4826
-    after = float(np.sqrt(max(whole - unit**2 * float(scored.gain.sum()) / float(weight.sum()), 0.0)))
-    before = float(np.sqrt(whole))
-    said = (
-        f"{SENTENCES[name].format(size=f'{size:.2g}', shape=shape)} (edges {before:.3g} px → {after:.3g} px, held out)"
-    )
+    shape = curve_shape(field.at(along)[:, 0], name)
+    place = int(np.argmax(values))
+    size = float(values[place])
+    rms = f"edges {held.before:.3g} px → {held.after:.3g} px, held out"
     return FieldFinding(
-        (name,), "blur", shape, said, size, "px", std, HeldOutGain(BLUR, before, after, None), scored.p_value, rivals,
-        None, REASONS[name], NEXT[name], (field,),
+        (name,), "blur", shape, f"{SENTENCES[name].format(size=f'{size:.2g}', shape=shape)} ({rms})", size, "px",
+        field.std[place][0], held, p_value, rivals, None, REASONS[name], NEXT[name], (field,),
     )  # fmt: skip
