@@ -103,7 +103,7 @@ class _Edges:
             weight = 1 / (1 + (left[rows] / (CAUCHY * self.scale_px)) ** 2) / self.scale_px**2
             slope = columns[rows] * (0.5 / width[rows])[:, None]
             normal = (slope * weight[:, None]).T @ slope
-            inverse = np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9)))
+            inverse = np.asarray(np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9))), float)
             pull = slope * (weight * left[rows])[:, None]
             numbers = numbers + inverse @ pull.sum(axis=0)
         count = own.shape[1] if free else 0
