@@ -346,6 +346,7 @@ def test_a_focal_length_that_comes_back_at_once_is_no_step() -> None:
     assert gained(field) > 0.8
 
 
+@pytest.mark.scenario
 def test_a_gyroscope_that_sticks_near_rest_is_no_scale() -> None:
     """A dead zone of 0.02 rad/s: the ladder's scale only stands in for it."""
     stuck = Strange(gyro=lambda t, reading, _: np.sign(reading) * np.maximum(np.abs(reading) - 0.02, 0))
@@ -356,6 +357,7 @@ def test_a_gyroscope_that_sticks_near_rest_is_no_scale() -> None:
     assert gained(field) > 0.8
 
 
+@pytest.mark.scenario
 def test_a_dent_in_a_window_takes_a_finer_map() -> None:
     """A bump a sixth of the picture wide."""
 
@@ -387,7 +389,7 @@ def test_distortion_that_follows_the_focus_holds_for_the_phone() -> None:
     """A scale over the radius times the focus; time would say it as well here, and is named."""
 
     def shifted(arm_px, time_s):
-        return 3.0 * ((focus_dioptres(time_s) - 0.5) / 2 * ((arm_px / 320) ** 2).sum(axis=1))[:, None] * arm_px / 320
+        return 5.0 * ((focus_dioptres(time_s) - 0.5) / 2 * ((arm_px / 320) ** 2).sum(axis=1))[:, None] * arm_px / 320
 
     phone = StrangePhone(replace(HAND, seed=95, points=40), Strange(shifted_px=shifted, focus_dioptres=focus_dioptres))
     _, (field,) = judged(phone, phone.profile)
@@ -397,6 +399,7 @@ def test_distortion_that_follows_the_focus_holds_for_the_phone() -> None:
     assert not field.fields[0].belongs_to_one_capture
 
 
+@pytest.mark.scenario
 def test_a_gyroscope_whose_scale_drifts_is_a_rate_over_rate_and_time() -> None:
     """A constant scale leaves half of it."""
     drifting = Strange(gyro=lambda t, reading, _: reading * (1 + 0.03 * np.clip(t / 2, 0, 1))[:, None])

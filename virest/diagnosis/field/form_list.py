@@ -103,10 +103,22 @@ def _product(
     each moves its own axis.
     """
     changing = null_space(mean) if known & steady else np.eye(mean.shape[1])
+    more = 2 * mean.shape[1] - 1
+    refine: Recipe | None = None
+    if fields[0].covariates[1] == TIME and more <= MOST_KNOTS:
+        finer = tuple(_with_times(field, more) for field in fields)
+        refine = lambda _profile, now: _product(finer, first, np.ones((1, more)), steady, now)  # noqa: E731
     axes = np.eye(len(fields))
     bases = [np.kron(np.kron(along, changing), axes[:, k : k + 1]) for k, along in enumerate(first)]
-    return FieldForm(
-        fields, np.asarray(block_diag(*bases)), build=lambda _profile, now: _product(fields, first, mean, steady, now)
+    again: Recipe = lambda _profile, now: _product(fields, first, mean, steady, now)  # noqa: E731
+    return FieldForm(fields, np.asarray(block_diag(*bases)), build=again, refine=refine)
+
+
+def _with_times(field: Field, count: int) -> Field:
+    """The same over this many instants, nought everywhere."""
+    first, times = field.knots
+    return _zero(
+        field.kind, field.covariates, [np.array(first), np.linspace(times[0], times[-1], count)], field.stamp_0_ns
     )
 
 
@@ -186,7 +198,7 @@ def _drift_form(
         held = [row for name, row in line.items() if name in known]
         free = null_space(np.stack(held)) if held else free
     more = np.linspace(knots[0], knots[-1], 2 * count - 1)
-    refine = again(more) if len(more) <= MOST_KNOTS else None
+    refine = again(more) if len(more) <= (MOST_RATE_KNOTS if kind == "rate" else MOST_KNOTS) else None
     return FieldForm((field,), free, local=local, build=again(knots), refine=refine)
 
 

@@ -73,6 +73,11 @@ class FieldForm:
         """Whether it is one value a frame, known only where it was fitted."""
         return bool(set(self.covariates) & {TIME, "focus"})
 
+    def is_dense(self, step_s: float) -> bool:
+        """Whether knots over time lie closer than this: what frames say of others between them is little."""
+        knots = self.fields[0].knots[-1]
+        return TIME in self.covariates and self.step_s is None and (knots[-1] - knots[0]) / (len(knots) - 1) < step_s
+
     @property
     def is_pair(self) -> bool:
         """Whether it is what two covariates do together beyond what each does."""

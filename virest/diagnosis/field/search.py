@@ -369,7 +369,7 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
 def _idle_form(evidence: Evidence, state: _Description, fitted: TrackFit) -> FieldForm | None:
     """A form that the newest leaves nothing to say to, if any."""
     less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
-    return next((form for form, model in less if not _useful(evidence, model, state.model, fitted)), None)
+    return next((form for form, model in less if not _useful(evidence, model, state, fitted)), None)
 
 
 def _stand_ins(
@@ -383,7 +383,7 @@ def _stand_ins(
         doubts = {entry.name: _doubt(evidence, found, fitted, entry) for entry in fitting}
         weakest = [(max(fitting, key=lambda entry: doubts[entry.name]),)]
     for leaving in (*depth, *weakest, *combinations(fitting, 2)):
-        if not _useful(evidence, state.without(found, leaving).model, state.model, fitted):
+        if not _useful(evidence, state.without(found, leaving).model, state, fitted):
             return leaving
     return ()
 
@@ -393,9 +393,11 @@ def _doubt(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry:
     return p_of(fitted, entry.effect, fitted.profile, found.nominal.profile, evidence.typical_px)
 
 
-def _useful(evidence: Evidence, less: Model, more: Model, fitted: TrackFit) -> bool:
-    """Whether held-out blocks are better off with a cause."""
-    before, after = (_held_out(evidence, m, fitted) for m in (less, more))
+def _useful(evidence: Evidence, less: Model, more: _Description, fitted: TrackFit) -> bool:
+    """Whether held-out blocks, or points where knots lie as close as blocks, are better off with a cause or a form."""
+    step_s = 2 * PAIRS_IN_BLOCK * evidence.period_s
+    by_point = any(form.is_dense(step_s) for form in more.forms)
+    before, after = (_held_out(evidence, m, fitted, by_point) for m in (less, more.model))
     gain = before.block_loss - after.block_loss
     part = float(gain.mean() / before.block_loss.mean())
     return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)

@@ -196,7 +196,8 @@ def shape_of(field: Field) -> str:
     if field.covariates == ("x", "y"):
         return _shape_over_picture(field)
     if len(field.covariates) > 1:
-        return _shape_of_pair(field)
+        first, second = (np.linspace(k[0], k[-1], SAMPLES) for k in field.knots)
+        return shape_of_pair(field.at(first[:, None], second[None, :]), field.covariates)
     if is_sudden(field):
         return "a step"
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
@@ -204,15 +205,16 @@ def shape_of(field: Field) -> str:
     return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates[0])
 
 
-def _shape_of_pair(field: Field) -> str:
-    """What the product of two curves that is nearest to a field over two covariates does along each of them."""
-    first, second = (np.linspace(k[0], k[-1], SAMPLES) for k in field.knots)
-    values = field.at(first[:, None], second[None, :])
+def shape_of_pair(values: Array, names: tuple[str, ...]) -> str:
+    """What values (SAMPLES, SAMPLES, components) at even steps of two covariates do along each of them.
+
+    That is said of the product of two curves that is nearest to them.
+    """
     part = values[..., int(np.argmax(np.ptp(values, axis=(0, 1))))]
     along, sizes, over = np.linalg.svd(part, full_matrices=False)
     if sizes[0] ** 2 < ALIKE * float((sizes**2).sum()):
-        return "not a product of two curves"
-    curves = zip((along[:, 0], over[0]), field.covariates, strict=True)
+        return f"no product of curves of the {' and the '.join(SENSORS.get(n, n) for n in names)}"
+    curves = zip((along[:, 0], over[0]), names, strict=True)
     each = (f"{curve_shape(c, n)} of the {SENSORS.get(n, n)}" for c, n in curves)
     return " times ".join(each)
 
