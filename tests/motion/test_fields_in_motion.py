@@ -18,7 +18,7 @@ from virest.motion.integration import integrate_gyro, missing_rate_rad_s
 from virest.motion.optics import moving_lens
 from virest.simulation.exposure import make_view
 from virest.simulation.hand_motion import random_hand_motion
-from virest.simulation.hidden import NOTHING, focal_scale, gyro_reading, late_rows_s
+from virest.simulation.hidden import NOTHING, Hidden, defocused, focal_scale, gyro_reading, late_rows_s
 
 CAMERA = CameraProfile(
     160, 120, intrinsics=Intrinsics(160, 120, 130.0, 130.0, 80.0, 58.0), shutter=Shutter(0.02, "top_to_bottom"),
@@ -108,3 +108,19 @@ def test_rows_that_start_late_in_some_frames_do_so_in_a_frame_and_in_the_simulat
     motion = row_motion(integrate_gyro(log(), profile), profile, stamp_s, 0.008)
     assert motion.row_time_s(points, 0.5) - even_s == pytest.approx(late_s, abs=2e-5)
     assert late_rows_s(profile, NOTHING, fraction, stamp_s) == pytest.approx(late_s, abs=1e-9)
+
+
+def test_a_simulated_frame_is_out_of_focus_when_its_field_says_so() -> None:
+    """A point spreads by the field's deviation at the frame's stamp; in corners alone where that is hidden."""
+    blur = Field("blur", ("time",), ((0.0, 1.0),), ((0.0,), (3.0,)), (), 0)
+    light = np.zeros((121, 161, 3), np.float32)
+    light[[60, 20], [80, 20]] = 1.0
+    profile = CAMERA.with_fields([blur])
+    assert defocused(profile, NOTHING, light, 0.0) == pytest.approx(light)
+    seen = defocused(profile, NOTHING, light, 0.6)[..., 0]
+    rows = np.arange(121) - 60
+    part = seen[:, 60:101]
+    assert np.sqrt((part.sum(axis=1) * rows**2).sum() / part.sum()) == pytest.approx(1.8, rel=0.03)
+    cornered = defocused(CAMERA, Hidden(corner_blur_px=3.0), light, 0.0)[..., 0]
+    assert cornered[60, 80] > 0.9
+    assert cornered[20, 20] < 0.2

@@ -124,10 +124,13 @@ class Session:
         """Exposure that the sensor made."""
         return self.logged_exposure_s(capture) * self.true.shutter.exposure_scale
 
+    def stamp_s(self, capture: int) -> float:
+        """Stamp of a capture from stamp_0, camera clock."""
+        return _stamp_s(capture, self.settings.fps) if self.capture_s is None else float(self.capture_s[capture])
+
     def first_row_start_s(self, capture: int) -> float:
         """Start of the first row's exposure, IMU clock from stamp_0."""
-        stamps = self.capture_s
-        stamp_s = _stamp_s(capture, self.settings.fps) if stamps is None else float(stamps[capture])
+        stamp_s = self.stamp_s(capture)
         late_s = 0.0 if self.hidden.clock_s is None else self.hidden.clock_s(stamp_s)
         return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture)) + late_s
 
@@ -239,7 +242,7 @@ def render_picture(session: Session, slot: int, phone: PhonePictures | None = No
         session.first_row_start_s(capture),
         session.true_exposure_s(capture),
     )
-    light = defocused(session.true, session.hidden, light, _stamp_s(capture, session.settings.fps))
+    light = defocused(session.true, session.hidden, light, session.stamp_s(capture))
     light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=True))
     rng = np.random.default_rng([session.settings.seed, 3, capture])
     levels = noisy_levels(_grey(session, light), session.settings.noise_levels, rng)

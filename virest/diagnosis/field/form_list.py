@@ -49,8 +49,10 @@ def possible_forms(
     """
     knots, fine = (_times(span_s, step_s, most) for step_s, most in TIME_STEPS)
     stamp = capture.stamp_0_ns
-    drifts = [_drift_form(kind, knots, stamp, known) for kind in ("scale", "rate", "delay")]
-    drifts += [_drift_form(kind, fine, stamp, known, local=True) for kind in ("scale", "delay")]
+    stamps, fine_stamps = (np.asarray(profile.camera_time_s(times)) for times in (knots, fine))
+    drifts = [_drift_form(kind, knots, stamp, known) for kind in ("scale", "rate")]
+    drifts += [_drift_form("delay", stamps, stamp, known), _drift_form("scale", fine, stamp, known, local=True)]
+    drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
     forms = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), *drifts]
     forms += step_forms(capture, coarse_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
@@ -76,7 +78,7 @@ def forms_of_pairs(
     forms = []
     if profile.shutter.readout_time_s > 0:
         rows = np.linspace(0, 1, PAIR_ROW_KNOTS)
-        late = _zero("delay", ("row", TIME), [rows, times], stamp)
+        late = _zero("delay", ("row", TIME), [rows, np.asarray(profile.camera_time_s(times))], stamp)
         forms.append(_product((late,), [np.eye(len(rows))[:, 1:]], mean, READOUTS, known))
     radii = np.linspace(0, 0.5 * np.hypot(profile.width, profile.height), PAIR_RADIUS_KNOTS)
     outwards = [np.eye(len(radii))[:, 1:]]
