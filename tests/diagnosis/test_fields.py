@@ -355,6 +355,8 @@ def test_a_gyroscope_that_sticks_near_rest_is_no_scale() -> None:
     assert not verdict.accepted
     assert (field.kind, field.covariates) == ("rate", ("rate",))
     assert gained(field) > 0.8
+    assert field.size == pytest.approx(0.02, abs=0.015)
+    assert "it sticks there" in field.sentence
 
 
 @pytest.mark.scenario

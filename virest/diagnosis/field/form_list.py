@@ -27,6 +27,8 @@ MOST_KNOTS, MOST_PLACE_KNOTS, MOST_RATE_KNOTS = 41, 10, 25
 PAIR_ROW_KNOTS, PAIR_RADIUS_KNOTS = 3, 3
 LEAST_TIMES, TIME_STEPS = 4, ((0.4, 12), (0.1, MOST_KNOTS))
 """Seconds between knots over time and the most knots; three frames, for a focus hunts to and fro in half a second."""
+OFTEN = 0.97
+"""Fine knots over a rate reach as far as this part of the readings: beyond, few rows tell a value."""
 NEAR_REST = 3.0
 """Fine knots over a rate lie by sinh: a twentieth of the reach apart at rest, where a hand is most of the time."""
 FRAMES_PER_STEP, MOST_STEPS = 2, 100
@@ -124,10 +126,10 @@ def _with_times(field: Field, count: int) -> Field:
     )
 
 
-def _reaches(imu: ImuSamples, profile: CameraProfile) -> list[float]:
-    """Largest rate (three axes) that was read, less bias and over scale."""
+def _reaches(imu: ImuSamples, profile: CameraProfile, part: float = 1.0) -> list[float]:
+    """Rate (three axes) that this part of the readings stays below, less bias and over scale."""
     reading = (imu.gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
-    return [max(float(most), LEAST_REACH_RAD_S) for most in np.abs(reading).max(axis=0)]
+    return [max(float(most), LEAST_REACH_RAD_S) for most in np.quantile(np.abs(reading), part, axis=0)]
 
 
 def _times(span_s: tuple[float, float], step_s: float, most: int) -> Array:
@@ -258,16 +260,20 @@ def _fine_rate_form(
 
     steps = np.sinh(NEAR_REST * np.linspace(-1.0, 1.0, count)) / np.sinh(NEAR_REST)
     more = 2 * count - 1
-    made = _over_rates(imu, profile, steps, conditions)
+    made = _over_rates(imu, profile, steps, conditions, OFTEN)
     return replace(made, build=again(count), refine=again(more) if more <= MOST_RATE_KNOTS else None)
 
 
 def _over_rates(
-    imu: ImuSamples, profile: CameraProfile, steps: Array, conditions: Callable[[tuple[float, ...], Array], Array]
-) -> FieldForm:
-    """Each axis over its own reading; steps: knots as parts of the reach, conditions: rows on the values there."""
+    imu: ImuSamples, profile: CameraProfile, steps: Array, conditions: Callable[[tuple[float, ...], Array], Array],
+    part: float = 1.0,
+) -> FieldForm:  # fmt: skip
+    """Each axis over its own reading; steps: knots as parts of how far a part of the readings reaches.
+
+    conditions: rows on the values there.
+    """
     fields, bases = [], []
-    for axis, (name, reach) in enumerate(zip(RATES, _reaches(imu, profile), strict=True)):
+    for axis, (name, reach) in enumerate(zip(RATES, _reaches(imu, profile, part), strict=True)):
         reading = (imu.gyro_rad_s[:, axis] - profile.gyro_bias_rad_s[axis]) / profile.gyro_scale[axis]
         field = _zero("rate", (name,), [steps * reach])
         own = np.zeros((3, 1))

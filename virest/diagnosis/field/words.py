@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.field import FORCES, Field
+from virest.camera.field import FORCES, RATES, Field
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
@@ -31,6 +31,7 @@ SHAPE_PART = 0.9
 """The same for a displacement over the picture."""
 OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
 SAMPLES = 101
+STUCK_PART = 0.5
 INERTIAL = "inertial_rows"
 
 
@@ -72,8 +73,8 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "film a still board while focusing to and fro: a breathing lens comes back, a warm one does not",
     ),
     ("rate", ("rate",)): Pattern(
-        "the gyroscope's error depends on its rate, {shape}: up to {size} are missing at high rates",
-        "a sensor that saturates softly, or a filter in the phone that bounds fast turns",
+        "the gyroscope's error depends on its rate, {shape}: up to {size} are missing {rates}",
+        "a sensor that saturates softly or sticks near rest, or a filter in the phone that bounds fast or small turns",
         "turn the phone on a table at several speeds and compare the log with the angle turned",
     ),
     ("rate", ("acceleration",)): Pattern(
@@ -121,7 +122,12 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     factor, unit = UNIT_SCALES[form.kind]
     said = f"{size * factor:.3g} {unit}"
     sentence = pattern.sentence.format(
-        size=said, shape=shape, where=_where(fields[0]), lateness=_lateness(fields[0]), lens=lens_words(shape)
+        size=said,
+        shape=shape,
+        where=_where(fields[0]),
+        lateness=_lateness(fields[0]),
+        lens=lens_words(shape),
+        rates=_at_rates(fields[0]),
     )
     rms = f" (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out)"
     beside = f"; in this capture {' and '.join(entry.rivals)} would explain it as well" if entry.rivals else ""
@@ -347,6 +353,16 @@ def _where(field: Field) -> str:
     return (
         "in the middle" if 1 / 3 <= place <= 2 / 3 else "in the first third" if place < 1 / 3 else "in the last third"
     )
+
+
+def _at_rates(field: Field) -> str:
+    """Where along a rate an error begins: at a quarter of the reach one that grows with rates is next to nothing."""
+    if field.covariates[0] not in RATES or len(field.covariates) > 1:
+        return ""
+    along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+    size = np.linalg.norm(field.at(along), axis=1)
+    early = float(size[np.abs(along) < 0.25 * along[-1]].max())
+    return "already near rest: it sticks there" if early > STUCK_PART * float(size.max()) else "at high rates"
 
 
 def _lateness(field: Field) -> str:
