@@ -74,6 +74,14 @@ def test_a_field_runs_through_its_values_and_holds_its_ends() -> None:
     assert LATE.at(np.array([-3.0, 5.0]))[:, 0] == pytest.approx([0.0, 0.001])
 
 
+def test_a_blur_runs_straight_between_its_knots() -> None:
+    """A spline through a short blur would swing, and blur frames that are sharp."""
+    blur = Field("blur", ("time",), ((0.0, 1.2, 1.5, 2.3),), ((0.0,), (0.2,), (2.0,), (0.0,)))
+    assert blur.at_time(np.array([0.6, 1.35, 1.9]))[:, 0] == pytest.approx([0.1, 1.1, 1.0])
+    with pytest.raises(SettingsError, match="0 or more"):
+        blur.with_values(-np.array(blur.values))
+
+
 def test_over_the_picture_the_second_covariate_runs_fastest() -> None:
     """Values stand where they are written, and are exact for a product of both."""
     field = bent()

@@ -1,7 +1,8 @@
 """Fields: smooth corrections of the model along recorded covariates, for effects that have no name of their own.
 
 A field is given by its values at knots; between them runs the interpolating cubic spline (of lower degree below four
-knots), and beyond the first and last knot the end values hold.  Two covariates make a tensor product.  Six kinds:
+knots; straight lines for a blur, which must not swing below 0), and beyond the first and last knot the end values hold.
+Two covariates make a tensor product.  Six kinds:
 
 - ``delay`` (s): a row starts this much later than an even readout has it, or a frame than its stamp (camera clock); of
   row and time, the time is that of the frame's first row.
@@ -74,6 +75,8 @@ class Field:
         if len(self.knots) != len(self.covariates) or any(len(k) < 2 or np.any(np.diff(k) <= 0) for k in self.knots):
             raise SettingsError(f"field {self.kind}: needs two or more rising knots for each covariate")
         for name, rows in (("values", self.values), ("std", self.std or self.values)):
+            if self.kind == "blur" and any(value < 0 for row in rows for value in row):
+                raise SettingsError(f"field blur: {name} are 0 or more")
             if len(rows) != np.prod([len(k) for k in self.knots]) or any(len(row) != parts for row in rows):
                 raise SettingsError(f"field {self.kind}: {name} must have {parts} numbers for each knot")
 
@@ -91,7 +94,7 @@ class Field:
         """Values (..., components) where the covariates are (...) each."""
         table = np.array(self.values)
         if len(self.knots) == 1:
-            return cardinal_weights(self.knots[0], covariates[0]) @ table
+            return cardinal_weights(self.knots[0], covariates[0], 1 if self.kind == "blur" else 3) @ table
         both = np.broadcast_arrays(*covariates)
         first, second = (cardinal_weights(k, c) for k, c in zip(self.knots, both, strict=True))
         across = (first @ table.reshape(len(self.knots[0]), -1)).reshape(*first.shape[:-1], len(self.knots[1]), -1)
@@ -157,12 +160,12 @@ class Field:
         return replace(self, log=(tuple(t - seconds for t in self.log[0]), self.log[1]))
 
 
-def cardinal_weights(knots: tuple[float, ...], covariate: Any) -> Array:
+def cardinal_weights(knots: tuple[float, ...], covariate: Any, degree: int = 3) -> Array:
     """What each knot's value counts (..., knots) in the interpolating spline where a covariate is (...)."""
     held = np.clip(np.asarray(covariate, float), knots[0], knots[-1])
-    return np.asarray(_cardinal(knots)(held))
+    return np.asarray(_cardinal(knots, degree)(held))
 
 
 @lru_cache(maxsize=256)
-def _cardinal(knots: tuple[float, ...]) -> BSpline:
-    return make_interp_spline(knots, np.eye(len(knots)), k=min(3, len(knots) - 1))
+def _cardinal(knots: tuple[float, ...], degree: int) -> BSpline:
+    return make_interp_spline(knots, np.eye(len(knots)), k=min(degree, len(knots) - 1))

@@ -199,7 +199,7 @@ def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> 
     sector = ((np.arctan2(arm[:, 1], arm[:, 0]) / (2 * np.pi) + 0.5) * CELLS_ROUND).astype(np.intp) % CELLS_ROUND
     ring = np.minimum((radius / knots[-1] * CELLS_OUT).astype(np.intp), CELLS_OUT - 1)
     none = np.zeros((len(edges), 0))
-    yield _Form("radius", knots, cardinal_weights(tuple(knots), radius), sector * CELLS_OUT + ring, none)
+    yield _Form("radius", knots, cardinal_weights(tuple(knots), radius, 1), sector * CELLS_OUT + ring, none)
     frame = np.unique(edges.frame, return_inverse=True)[1]
     size = np.array([profile.width, profile.height])
     cell = (np.clip(edges.points_px / size, 0, 0.999) * CELLS).astype(np.intp) @ np.array([CELLS, 1])
@@ -207,13 +207,13 @@ def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> 
     first, last = float(edges.stamp_s.min()), float(edges.stamp_s.max())
     count = int(np.clip(round((last - first) / TIME_STEP_S) + 1, LEAST_TIMES, MOST_TIMES))
     knots = np.linspace(first, last, count)
-    yield _Form("time", knots, cardinal_weights(tuple(knots), edges.stamp_s), frame, own)
+    yield _Form("time", knots, cardinal_weights(tuple(knots), edges.stamp_s, 1), frame, own)
     log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
     values = np.array([value for _, value in log], float)
     if len(log) > 0.5 * len(capture.frames) and np.ptp(values) > LEAST_CHANGE:
         times = np.array([time_s for time_s, _ in log])
         knots = np.linspace(values.min(), values.max(), FOCUS_KNOTS)
-        weights = cardinal_weights(tuple(knots), np.interp(edges.stamp_s, times, values))
+        weights = cardinal_weights(tuple(knots), np.interp(edges.stamp_s, times, values), 1)
         yield _Form("focus", knots, weights, frame, own, (tuple(times.tolist()), tuple(values.tolist())))
 
 
