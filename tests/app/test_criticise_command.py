@@ -74,6 +74,20 @@ def test_the_text_says_it_in_a_sentence(
     assert "likely: a lens element off centre" in said
 
 
+def test_what_two_covariates_do_together_is_described_after_what_each_does() -> None:
+    """Distortion that follows the focus, beside a focal length that does: the pair comes last."""
+    table = residuals(3)
+    u, v = (table["x"] - 320) / 320, (table["y"] - 240) / 320
+    focus = np.random.default_rng(4).uniform(0, 2, 40)[table["frame"].astype(int)]
+    grown = 0.6 * focus * (u * u + v * v - 0.3) + 0.3 * focus
+    found = criticise({**table, "focus": focus, "dx": table["dx"] + grown * u, "dy": table["dy"] + grown * v})
+    assert found.findings[0].covariates == ("focus",)
+    assert found.findings[-1].covariates == ("radius", "focus")
+    assert found.findings[-1].shape.endswith("times a straight line of the focus")
+    assert found.left_px == pytest.approx(0.15, rel=0.05)
+    assert not criticise({**table, "focus": focus}).findings
+
+
 def test_a_lens_drawn_at_random_is_nothing() -> None:
     """Eight tables of noise, none of which is described: at most 1e-3 each may be by chance."""
     assert not any(criticise(residuals(seed)).findings for seed in range(10, 18))

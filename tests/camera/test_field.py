@@ -17,6 +17,33 @@ from virest.errors import SettingsError
 
 ROWS = (0.0, 0.2, 0.45, 0.8, 1.0)
 LATE = Field("delay", ("row",), (ROWS,), tuple((0.006 * r * (1 - r) + 0.001 * r,) for r in ROWS))
+TIMES = (0.0, 0.5, 1.0)
+PAIRS = (
+    Field(
+        "delay",
+        ("row", "time"),
+        ((0.0, 0.5, 1.0), TIMES),
+        tuple((1e-3 * r * t,) for r in (0, 1, 2) for t in (0, 1, 3)),
+        (),
+        77,
+    ),
+    Field(
+        "scale",
+        ("radius", "time"),
+        ((0.0, 200.0, 400.0), TIMES),
+        tuple((0.01 * r * t,) for r in (0, 1, 3) for t in (0, 1, 2)),
+        (),
+        77,
+    ),
+    Field(
+        "rate",
+        ("rate_x", "time"),
+        ((-2.0, 2.0), TIMES),
+        tuple((0.02 * r * t, 0.0, 0.0) for r in (-1, 1) for t in (0, 1, 2)),
+        (),
+        77,
+    ),
+)
 LENS = Intrinsics(640, 480, 510.0, 505.0, 322.0, 236.0, "radtan", (-0.05, 0.01, 0.001, -0.002, 0.0))
 
 
@@ -33,7 +60,7 @@ def every_kind() -> list[Field]:
     rate = Field("rate", ("accel_y",), ((-20.0, 20.0),), ((-0.1, 0.02, 0.03), (0.1, -0.02, -0.03)))
     drift = Field("delay", ("time",), ((0.0, 1.0, 2.0),), ((0.0,), (0.002,), (-0.001,)), (), 77)
     light = Field("gain", ("x", "y"), ((0.0, 639.0), (0.0, 479.0)), ((0.0,), (0.1,), (-0.05,), (0.0,)))
-    return [LATE, bent(), zoom, rate, drift, light]
+    return [LATE, bent(), zoom, rate, drift, light, *PAIRS]
 
 
 def camera() -> CameraProfile:
@@ -46,6 +73,14 @@ def test_a_field_runs_through_its_values_and_holds_its_ends() -> None:
     along = np.linspace(0, 1, 37)
     assert LATE.at(along)[:, 0] == pytest.approx(0.006 * along * (1 - along) + 0.001 * along, abs=1e-12)
     assert LATE.at(np.array([-3.0, 5.0]))[:, 0] == pytest.approx([0.0, 0.001])
+
+
+def test_a_blur_runs_straight_between_its_knots() -> None:
+    """A spline through a short blur would swing, and blur frames that are sharp."""
+    blur = Field("blur", ("time",), ((0.0, 1.2, 1.5, 2.3),), ((0.0,), (0.2,), (2.0,), (0.0,)))
+    assert blur.at_time(np.array([0.6, 1.35, 1.9]))[:, 0] == pytest.approx([0.1, 1.1, 1.0])
+    with pytest.raises(SettingsError, match="0 or more"):
+        blur.with_values(-np.array(blur.values))
 
 
 def test_over_the_picture_the_second_covariate_runs_fastest() -> None:
@@ -77,7 +112,7 @@ def test_a_profile_with_fields_is_read_as_it_was_written() -> None:
         ({"covariates": ["focus"]}, "covariates are"),
         ({"knots": [[0.0, 0.5, 0.5, 0.8, 1.0]]}, "rising knots"),
         ({"values": [[0.0]]}, "1 numbers for each knot"),
-        ({"version": 2}, "version"),
+        ({"version": 3}, "version"),
     ],
 )
 def test_a_field_that_cannot_be_is_refused_with_its_place(change: dict[str, object], said: str) -> None:
@@ -120,3 +155,12 @@ def test_times_can_be_counted_from_later() -> None:
     """The same instants keep their values."""
     field = every_kind()[2]
     assert field.later(0.3).at_time(0.4) == pytest.approx(field.at_time(0.7))
+    late, drawn, _ = PAIRS
+    assert late.later(0.3).at(0.7, 0.4) == pytest.approx(late.at(0.7, 0.7))
+    assert drawn.later(0.3).at_time(0.4, 150.0) == pytest.approx(drawn.at_time(0.7, 150.0))
+
+
+def test_entries_over_pairs_of_covariates_say_their_version() -> None:
+    """A program that knows no pairs refuses the file instead of reading it wrongly."""
+    content = yaml.safe_load(format_profile(camera().with_fields([LATE, *PAIRS])))
+    assert [entry["version"] for entry in content["extensions"]["field"]] == [1, 2, 2, 2]

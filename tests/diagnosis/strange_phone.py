@@ -30,6 +30,10 @@ class Strange:
     gyro: Callable[[Array, Array, Array], Array] | None = None
     """Of time, reading and force: what is logged."""
     focus_dioptres: Callable[[Array], Array] | None = None
+    late_in_frame_s: Callable[[Array, Array], Array] | None = None
+    """Of the fraction of the readout and of the stamp: how much later a row of that frame starts."""
+    shifted_px: Callable[[Array, Array], Array] | None = None
+    """Of the place from the principal point, px, and of time: how far from there a point is seen."""
 
 
 class StrangePhone(Recording):
@@ -50,10 +54,10 @@ class StrangePhone(Recording):
     def seen_s(self, points_px: Array, frame: NDArray[np.intp]) -> Array:
         """Rows that start late are seen late."""
         even_s = super().seen_s(points_px, frame)
-        if self.strange.late_s is None:
-            return even_s
         fraction = points_px[:, 1] / self.setup.height
-        return even_s + self.strange.late_s(fraction)
+        if self.strange.late_in_frame_s is not None:
+            even_s = even_s + self.strange.late_in_frame_s(fraction, self.stamp_s[frame])
+        return even_s if self.strange.late_s is None else even_s + self.strange.late_s(fraction)
 
     def _project(self, way: Array, start: Array, inverse: Array, time_s: Array) -> Array:
         setup, (p1, p2) = self.setup, self.strange.tangential
@@ -62,7 +66,9 @@ class StrangePhone(Recording):
         r2 = x * x + y * y
         x, y = x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         longer = 0.0 if self.strange.longer is None else self.strange.longer(time_s)
-        return np.stack([x, y], axis=-1) * setup.focal_px * (1 + np.atleast_1d(longer)[:, None]) + setup.centre_px
+        arm_px = np.stack([x, y], axis=-1) * setup.focal_px * (1 + np.atleast_1d(longer)[:, None])
+        shift = 0.0 if self.strange.shifted_px is None else self.strange.shifted_px(arm_px, time_s)
+        return arm_px + shift + setup.centre_px
 
     @property
     def capture(self) -> Capture:

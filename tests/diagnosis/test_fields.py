@@ -326,6 +326,93 @@ def test_a_clock_that_wanders_is_a_delay_over_time() -> None:
     assert np.std(off - line) < 5e-4
 
 
+def test_a_focus_that_hunts_is_a_scale_over_a_few_frames() -> None:
+    """To and fro 1.4 times a second: knots 0.4 s apart see nothing of it, finer ones say it."""
+    phone = StrangePhone(replace(HAND, seed=90), Strange(longer=lambda t: 0.005 * np.sin(2 * np.pi * 1.4 * t)))
+    _, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates) == ("scale", ("time",))
+    assert field.size == pytest.approx(0.01, rel=0.1)
+    assert gained(field) > 0.8
+
+
+def test_a_focal_length_that_comes_back_at_once_is_no_step() -> None:
+    """A pulse of a fifth of a second lies in too few frames for a test by signs, and is found by their size."""
+    phone = StrangePhone(
+        replace(HAND, seed=91, points=40), Strange(longer=lambda t: 0.012 * np.exp(-(((t - 1.1) / 0.12) ** 2)))
+    )
+    _, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates) == ("scale", ("time",))
+    assert field.shape != "a step"
+    assert field.size == pytest.approx(0.012, rel=0.2)
+    assert gained(field) > 0.8
+
+
+@pytest.mark.scenario
+def test_a_gyroscope_that_sticks_near_rest_is_no_scale() -> None:
+    """A dead zone of 0.02 rad/s: the ladder's scale only stands in for it."""
+    stuck = Strange(gyro=lambda t, reading, _: np.sign(reading) * np.maximum(np.abs(reading) - 0.02, 0))
+    phone = StrangePhone(replace(HAND, seed=92, points=40), stuck)
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates) == ("rate", ("rate",))
+    assert gained(field) > 0.8
+    assert field.size == pytest.approx(0.02, abs=0.015)
+    assert "it sticks there" in field.sentence
+
+
+@pytest.mark.scenario
+def test_a_dent_in_a_window_takes_a_finer_map() -> None:
+    """A bump a sixth of the picture wide."""
+
+    def shifted(arm_px, _time):
+        off = (arm_px - (130, -60)) / 100
+        return 2.5 * off * np.exp(-0.5 * (off**2).sum(axis=1))[:, None]
+
+    phone = StrangePhone(replace(HAND, seed=93, points=50), Strange(shifted_px=shifted))
+    _, (field,) = judged(phone, phone.profile)
+    assert field.kind == "displacement"
+    assert len(field.fields[0].knots[0]) > 4
+    assert gained(field) > 0.8
+
+
+def test_a_readout_that_changes_is_a_delay_over_row_and_time() -> None:
+    """Neither covariate alone says it, and nothing stays in the model that only stood in."""
+    phone = StrangePhone(
+        replace(HAND, seed=94), Strange(late_in_frame_s=lambda row, stamp_s: 0.0025 * row * (stamp_s > 1))
+    )
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates) == ("delay", ("row", "time"))
+    assert field.shape.startswith("a straight line of the row times")
+    assert gained(field) > 0.8
+    assert field.fields[0].belongs_to_one_capture
+
+
+def test_distortion_that_follows_the_focus_holds_for_the_phone() -> None:
+    """A scale over the radius times the focus; time would say it as well here, and is named."""
+
+    def shifted(arm_px, time_s):
+        return 5.0 * ((focus_dioptres(time_s) - 0.5) / 2 * ((arm_px / 320) ** 2).sum(axis=1))[:, None] * arm_px / 320
+
+    phone = StrangePhone(replace(HAND, seed=95, points=40), Strange(shifted_px=shifted, focus_dioptres=focus_dioptres))
+    _, (field,) = judged(phone, phone.profile)
+    assert field.covariates == ("radius", "focus")
+    assert field.confounded == ("scale over radius, time",)
+    assert gained(field) > 0.8
+    assert not field.fields[0].belongs_to_one_capture
+
+
+@pytest.mark.scenario
+def test_a_gyroscope_whose_scale_drifts_is_a_rate_over_rate_and_time() -> None:
+    """A constant scale leaves half of it."""
+    drifting = Strange(gyro=lambda t, reading, _: reading * (1 + 0.03 * np.clip(t / 2, 0, 1))[:, None])
+    phone = StrangePhone(replace(HAND, seed=96), drifting)
+    verdict, (field,) = judged(phone, phone.profile, rungs=1)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates) == ("rate", ("rate", "time"))
+    assert gained(field) > 0.8
+
+
 class WanderingPhone(StrangePhone):
     """A phone whose frames come later than their stamps, by a function of the stamp."""
 

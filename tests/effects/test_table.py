@@ -28,6 +28,7 @@ LOGGED = Field("scale", ("focus",), ((0.0, 1.0),), ((0.0,), (0.02,)), log=((0.0,
 DRIVEN = Field("rate", ("time",), ((0.0, 0.3),), ((0.01, -0.02, 0.0), (0.0, 0.03, 0.02)))
 FOUND = Field("scale", ("time",), ((0.0, 0.3),), ((0.01,), (-0.02,)))
 LATE = Field("delay", ("time",), ((0.0, 0.3),), ((0.001,), (-0.002,)))
+SOFT = Field("blur", ("time",), ((0.0, 0.3),), ((0.0,), (1.5,)))
 SHADED = Field("gain", ("x", "y"), ((0.0, 400.0), (0.0, 600.0)), ((0.0,), (0.1,), (0.2,), (0.1,)))
 
 
@@ -95,7 +96,7 @@ def changed_profiles() -> dict[str, CameraProfile]:
     found = {name: replace(profile, **{name: change(profile)}) for name, change in OTHER.items()}
     for name, value in OTHER_EXTENSION.items():
         found[f"extensions.{name}"] = replace(profile, extensions=replace(profile.extensions, **{name: value}))
-    for more in (FOUND, LATE, SHADED):
+    for more in (FOUND, LATE, SHADED, SOFT):
         field = replace(profile.extensions, field=(LOGGED, DRIVEN, more))
         found[f"extensions.field of {more.kind}"] = replace(profile, extensions=field)
     for effect in EFFECTS.values():
@@ -133,7 +134,8 @@ def test_a_changed_value_changes_predictions_as_a_fresh_integration_does(name: s
 
 def test_every_kind_of_field_has_been_thought_of() -> None:
     """The lens holds displacements; a new kind must be changed here too."""
-    assert {LOGGED.kind, DRIVEN.kind, FOUND.kind, LATE.kind, SHADED.kind} == KINDS.keys() - {"displacement"}
+    known = {field.kind for field in (LOGGED, DRIVEN, FOUND, LATE, SHADED, SOFT)}
+    assert known == KINDS.keys() - {"displacement"}
 
 
 def test_what_nobody_has_thought_of_is_integrated_anew(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,20 +12,29 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
+from virest.image_formation.row_clock import RowClock
+from virest.image_formation.row_motion import row_motion
 from virest.motion.integration import integrate_gyro, missing_rate_rad_s
 from virest.motion.optics import moving_lens
 from virest.simulation.exposure import make_view
 from virest.simulation.hand_motion import random_hand_motion
-from virest.simulation.hidden import NOTHING, focal_scale, gyro_reading, late_rows_s
+from virest.simulation.hidden import NOTHING, Hidden, defocused, focal_scale, gyro_reading, late_rows_s
 
 CAMERA = CameraProfile(
     160, 120, intrinsics=Intrinsics(160, 120, 130.0, 130.0, 80.0, 58.0), shutter=Shutter(0.02, "top_to_bottom"),
     time_offset_s=0.0, gyro_bias_rad_s=(0.01, -0.02, 0.03), gyro_scale=(1.02, 0.99, 1.01),
 )  # fmt: skip
+OUTWARDS = Field(
+    "scale",
+    ("radius", "time"),
+    ((0.0, 50.0, 100.0), (0.0, 1.0)),
+    tuple((0.02 * r * t,) for r in (0, 1, 4) for t in (0, 1)),
+)
 ZOOM = Field("scale", ("time",), ((0.0, 0.5, 1.5),), ((0.0,), (0.01,), (0.03,)))
 FIELDS = (
     Field("rate", ("rate_x",), ((-2.0, 0.0, 2.0),), ((-0.2, 0.0, 0.0), (0.0,) * 3, (0.15, 0.0, 0.0))),
     Field("rate", ("accel_z",), ((-20.0, 20.0),), ((-0.1, 0.05, 0.0), (0.1, -0.05, 0.0))),
+    Field("rate", ("rate_y", "time"), ((-1.0, 1.0), (0.0, 1.0)), tuple((0.0, y, 0.0) for y in (0, -0.03, 0, 0.03))),
     Field("rate", ("time",), ((0.0, 0.5, 1.0),), ((0.0,) * 3, (0.0, 0.04, -0.03), (0.0,) * 3)),
 )  # fmt: skip
 
@@ -59,14 +68,15 @@ def test_the_simulated_gyroscope_reads_what_the_fields_take_back() -> None:
     assert true + added == pytest.approx(imu.gyro_rad_s, abs=1e-6)
 
 
-def test_a_scale_field_lengthens_the_focal_length_in_lens_and_simulator_alike() -> None:
+@pytest.mark.parametrize("fields", [(ZOOM,), (ZOOM, OUTWARDS)])
+def test_a_scale_field_lengthens_the_focal_length_in_lens_and_simulator_alike(fields: tuple[Field, ...]) -> None:
     """Rays and projection are inverse at any time, and the simulator looks along the same rays."""
-    imu, profile = log(), CAMERA.with_fields([ZOOM])
+    imu, profile = log(), CAMERA.with_fields(fields)
     lens = moving_lens(integrate_gyro(imu, profile), profile)
     points = np.array([[10.0, 20.0], [150.0, 111.0]])
     time_s = np.array([0.3, 0.9])
-    assert lens.project(lens.rays(points, time_s), time_s) == pytest.approx(points)
-    assert focal_scale(profile, NOTHING, 0.5) == pytest.approx(1.01)
+    assert lens.project(lens.rays(points, time_s), time_s) == pytest.approx(points, abs=1e-4)
+    assert focal_scale(profile, NOTHING, 0.5, 0.0) == pytest.approx(1.01)
     motion = random_hand_motion(
         np.random.default_rng(1), rate_rms_rad_s=0.5, duration_s=1.0, sway_rms_m=0.0, margin_s=1
     )
@@ -82,4 +92,35 @@ def test_rows_start_late_in_the_simulator_too() -> None:
     fraction = np.arange(120) / 120
     rows = np.stack([np.zeros(120), np.arange(120.0)], axis=-1)
     seen_s = 0.02 * (profile.shutter.readout_fraction(rows, 160, 120) - fraction)
-    assert late_rows_s(profile, NOTHING, fraction) == pytest.approx(seen_s)
+    assert late_rows_s(profile, NOTHING, fraction, 0.0) == pytest.approx(seen_s)
+
+
+def test_rows_that_start_late_in_some_frames_do_so_in_a_frame_and_in_the_simulator() -> None:
+    """One delay by row and time: the clock of all points, that of one frame, and the simulator's."""
+    rows = Field("delay", ("row",), ((0.0, 1.0),), ((0.0,), (0.002,)))
+    later = tuple((0.003 * r * r * t,) for r in (0.0, 0.5, 1.0) for t in (0.0, 1.0))
+    profile = CAMERA.with_fields([rows, Field("delay", ("row", "time"), ((0.0, 0.5, 1.0), (0.0, 1.0)), later)])
+    points = np.stack([np.zeros(120), np.arange(120.0)], axis=-1)
+    fraction, stamp_s = np.arange(120) / 120, 0.6
+    even_s = RowClock(CAMERA).seen_s(points, stamp_s, 0.008)
+    late_s = RowClock(profile).seen_s(points, stamp_s, 0.008) - even_s
+    assert late_s == pytest.approx(0.002 * fraction + 0.0018 * np.minimum(1.1 * fraction, 1) ** 2, abs=1e-9)
+    motion = row_motion(integrate_gyro(log(), profile), profile, stamp_s, 0.008)
+    assert motion.row_time_s(points, 0.5) - even_s == pytest.approx(late_s, abs=2e-5)
+    assert late_rows_s(profile, NOTHING, fraction, stamp_s) == pytest.approx(late_s, abs=1e-9)
+
+
+def test_a_simulated_frame_is_out_of_focus_when_its_field_says_so() -> None:
+    """A point spreads by the field's deviation at the frame's stamp; in corners alone where that is hidden."""
+    blur = Field("blur", ("time",), ((0.0, 1.0),), ((0.0,), (3.0,)), (), 0)
+    light = np.zeros((121, 161, 3), np.float32)
+    light[[60, 20], [80, 20]] = 1.0
+    profile = CAMERA.with_fields([blur])
+    assert defocused(profile, NOTHING, light, 0.0) == pytest.approx(light)
+    seen = defocused(profile, NOTHING, light, 0.6)[..., 0]
+    rows = np.arange(121) - 60
+    part = seen[:, 60:101]
+    assert np.sqrt((part.sum(axis=1) * rows**2).sum() / part.sum()) == pytest.approx(1.8, rel=0.03)
+    cornered = defocused(CAMERA, Hidden(corner_blur_px=3.0), light, 0.0)[..., 0]
+    assert cornered[60, 80] > 0.9
+    assert cornered[20, 20] < 0.2

@@ -145,10 +145,12 @@ def _field(field: TableFinding) -> Json:
 
 def describe(path: Path, found: Criticism) -> str:
     """The findings for people."""
-    asked = ", ".join(dict.fromkeys(name for form in found.forms for name in form.split(" over ")[1].split(", ")))
+    over = [form.split(" over ")[1].split(", ") for form in found.forms]
+    asked = ", ".join(dict.fromkeys(name for names in over for name in names if name != "radius"))
+    pairs = " and pairs of these" if any(len(names) > 1 and names != ["x", "y"] for names in over) else ""
     lines = [
         f"{path.name}: {found.rows} residuals ({found.used} used), {found.rms_px:.3g} px rms per coordinate",
-        f"asked along {asked}",
+        f"asked along {asked}{pairs}",
     ]
     for field in found.findings:
         lines.append(f"field: {field.sentence}; largest value ± {field.std:.2g} {field.unit}")

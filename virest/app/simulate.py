@@ -151,7 +151,7 @@ def _of_new_capture(profile: CameraProfile) -> CameraProfile:
         )
     at_rest = ((0.0, 1.0), (FOCUS_DIOPTRES, FOCUS_DIOPTRES))
     kept = [
-        replace(field, log=at_rest) if field.covariates == ("focus",) else field
+        replace(field, log=at_rest) if "focus" in field.covariates else field
         for field in profile.fields
         if field not in others
     ]

@@ -1,17 +1,21 @@
 """Fields: smooth corrections of the model along recorded covariates, for effects that have no name of their own.
 
 A field is given by its values at knots; between them runs the interpolating cubic spline (of lower degree below four
-knots), and beyond the first and last knot the end values hold.  Two covariates make a tensor product.  Five kinds:
+knots; straight lines for a blur, which must not swing below 0), and beyond the first and last knot the end values hold.
+Two covariates make a tensor product.  Six kinds:
 
-- ``delay`` (s): a row starts this much later than an even readout has it, or a frame than its stamp (camera clock).
+- ``delay`` (s): a row starts this much later than an even readout has it, or a frame than its stamp (camera clock); of
+  row and time, the time is that of the frame's first row.
 - ``displacement`` (px): a point is seen this far from where the lens puts it.
-- ``scale`` (1): the focal length is longer by this part.
+- ``scale`` (1): the focal length is longer by this part; over the radius, for points that are seen there.
 - ``gain`` (1): at this place more light, by this part, reaches the sensor.
+- ``blur`` (px): the standard deviation of a Gaussian on the light, beside an even defocus.
 - ``rate`` (rad/s, IMU axes): the true rate is larger than the gyroscope's, less bias and over scale.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -26,16 +30,17 @@ Array = NDArray[np.float64]
 AXES = ("x", "y", "z")
 RATES, FORCES = tuple(f"rate_{a}" for a in AXES), tuple(f"accel_{a}" for a in AXES)
 KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
-    "delay": ("s", 1, (("row",), ("time",))),
+    "delay": ("s", 1, (("row",), ("time",), ("row", "time"))),
     "displacement": ("px", 2, (("x", "y"),)),
-    "scale": ("1", 1, (("time",), ("focus",), ("focal",))),
+    "scale": ("1", 1, (("time",), ("focus",), ("focal",), ("radius", "time"), ("radius", "focus"))),
     "gain": ("1", 1, (("x", "y"),)),
-    "rate": ("rad/s", 3, (("time",), *((name,) for name in (*RATES, *FORCES)))),
+    "blur": ("px", 1, (("time",), ("focus",), ("radius",))),
+    "rate": ("rad/s", 3, (("time",), *((name,) for name in (*RATES, *FORCES)), *((name, "time") for name in RATES))),
 }
 """Unit, number of components and possible covariates of each kind."""
-UNITS = {"row": "1", "x": "px", "y": "px", "time": "s", "focus": "1/m", "focal": "1"}
-"""Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``focal``: logged
-focal length over its median."""
+UNITS = {"row": "1", "radius": "px", "x": "px", "y": "px", "time": "s", "focus": "1/m", "focal": "1"}
+"""Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``radius``: from
+the principal point; ``focal``: logged focal length over its median."""
 TIMED_BY_IMU = ("scale", "rate")
 """Kinds whose times are the inertial log's; the others' are the camera's."""
 _FIXED_POINT_STEPS = 5
@@ -70,6 +75,8 @@ class Field:
         if len(self.knots) != len(self.covariates) or any(len(k) < 2 or np.any(np.diff(k) <= 0) for k in self.knots):
             raise SettingsError(f"field {self.kind}: needs two or more rising knots for each covariate")
         for name, rows in (("values", self.values), ("std", self.std or self.values)):
+            if self.kind == "blur" and any(value < 0 for row in rows for value in row):
+                raise SettingsError(f"field blur: {name} are 0 or more")
             if len(rows) != np.prod([len(k) for k in self.knots]) or any(len(row) != parts for row in rows):
                 raise SettingsError(f"field {self.kind}: {name} must have {parts} numbers for each knot")
 
@@ -87,15 +94,19 @@ class Field:
         """Values (..., components) where the covariates are (...) each."""
         table = np.array(self.values)
         if len(self.knots) == 1:
-            return cardinal_weights(self.knots[0], covariates[0]) @ table
-        first, second = (cardinal_weights(k, c) for k, c in zip(self.knots, covariates, strict=True))
+            return cardinal_weights(self.knots[0], covariates[0], 1 if self.kind == "blur" else 3) @ table
+        both = np.broadcast_arrays(*covariates)
+        first, second = (cardinal_weights(k, c) for k, c in zip(self.knots, both, strict=True))
         across = (first @ table.reshape(len(self.knots[0]), -1)).reshape(*first.shape[:-1], len(self.knots[1]), -1)
         return np.asarray((second[..., None] * across).sum(axis=-2))
 
-    def at_time(self, time_s: Any) -> Array:
-        """Values (..., components) of a field over time, or over what is logged, at times (...) of its own clock."""
+    def at_time(self, time_s: Any, *first: Any) -> Array:
+        """Values (..., components) of a field over time, or over what is logged, at times (...) of its own clock.
+
+        first: the first of two covariates.
+        """
         time_s = np.asarray(time_s, float)
-        return self.at(time_s if self.log is None else np.interp(time_s, *self.log))
+        return self.at(*first, time_s if self.log is None else np.interp(time_s, *self.log))
 
     def undisplaced(self, points_px: Array) -> Array:
         """Where points seen at pixels (..., 2) would be without a displacement: q + u(q) = p."""
@@ -111,9 +122,21 @@ class Field:
         return replace(self, knots=(x, y))
 
     @property
+    def is_pair(self) -> bool:
+        """Whether it is over two covariates that are not a place in the picture: version 2 of the file's entries."""
+        return len(self.covariates) > 1 and self.covariates != ("x", "y")
+
+    @property
     def is_single(self) -> bool:
         """Whether a profile holds one such field at most."""
         return self.kind == "displacement" or (self.kind, self.covariates) == ("delay", ("row",))
+
+    def with_times(self, clock: Callable[[float], float]) -> Field:
+        """The field with its knots over time on another clock."""
+        knots = (
+            tuple(map(clock, k)) if name == "time" else k for name, k in zip(self.covariates, self.knots, strict=True)
+        )
+        return replace(self, knots=tuple(knots))
 
     def with_values(self, values: Array, std: Array | None = None) -> Field:
         """The field with other values (knots, components)."""
@@ -132,19 +155,17 @@ class Field:
 
     def later(self, seconds: float) -> Field:
         """The field with its times counted from a later origin."""
-        if self.covariates == ("time",):
-            return replace(self, knots=(tuple(k - seconds for k in self.knots[0]),))
         if self.log is None:
-            return self
+            return self.with_times(lambda time_s: time_s - seconds)
         return replace(self, log=(tuple(t - seconds for t in self.log[0]), self.log[1]))
 
 
-def cardinal_weights(knots: tuple[float, ...], covariate: Any) -> Array:
+def cardinal_weights(knots: tuple[float, ...], covariate: Any, degree: int = 3) -> Array:
     """What each knot's value counts (..., knots) in the interpolating spline where a covariate is (...)."""
     held = np.clip(np.asarray(covariate, float), knots[0], knots[-1])
-    return np.asarray(_cardinal(knots)(held))
+    return np.asarray(_cardinal(knots, degree)(held))
 
 
 @lru_cache(maxsize=256)
-def _cardinal(knots: tuple[float, ...]) -> BSpline:
-    return make_interp_spline(knots, np.eye(len(knots)), k=min(3, len(knots) - 1))
+def _cardinal(knots: tuple[float, ...], degree: int) -> BSpline:
+    return make_interp_spline(knots, np.eye(len(knots)), k=min(degree, len(knots) - 1))

@@ -70,6 +70,10 @@ class Intrinsics:
         """The camera of the same focal lengths and principal point without distortion."""
         return replace(self, model="none", coefficients=(), displaced=None)
 
+    def radius_px(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance (...) of pixels (..., 2) from the principal point."""
+        return np.hypot(points_px[..., 0] - self.cx_px, points_px[..., 1] - self.cy_px)
+
     def scaled_focal(self, scale: float) -> Intrinsics:
         """The same lens with both focal lengths multiplied by ``scale``."""
         return replace(self, fx_px=self.fx_px * scale, fy_px=self.fy_px * scale)

@@ -120,6 +120,8 @@ class CameraProfile:
             raise SettingsError(
                 "extensions.field: one delay over the row and one displacement at most", hint="add their values up"
             )
+        if any((f.kind, f.covariates) == ("blur", ("radius",)) for f in fields):
+            raise SettingsError("extensions.field: blur over the radius is not followed", hint="leave the entry out")
         uneven, displaced = (next(iter(held[kind]), None) for kind in ("delay", "displacement"))
         lens = self.intrinsics
         if lens is None and displaced is not None:
@@ -147,12 +149,17 @@ class CameraProfile:
     def camera_time_s(self, imu_time_s: Any) -> Any:
         """Camera clock of an IMU time: the inverse of :meth:`imu_time_s`."""
         found = even_s = (imu_time_s - (self.time_offset_s or 0.0)) / (1.0 + self.clock_skew)
-        for _ in range(3 if any(f.kind == "delay" for f in self.extensions.field) else 0):
+        for _ in range(3 if self._wanders else 0):
             found = even_s - self._late_s(found) / (1.0 + self.clock_skew)
         return found
 
+    @property
+    def _wanders(self) -> list[ModelField]:
+        """Delays over time alone: of whole frames."""
+        return [f for f in self.extensions.field if (f.kind, f.covariates) == ("delay", ("time",))]
+
     def _late_s(self, camera_time_s: Any) -> Any:
-        late = [f.at_time(camera_time_s)[..., 0] for f in self.extensions.field if f.kind == "delay"]
+        late = [f.at_time(camera_time_s)[..., 0] for f in self._wanders]
         return sum(late) if late else 0.0
 
     def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:

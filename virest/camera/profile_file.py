@@ -265,7 +265,11 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
 
 
 def _field_block(entry: ModelField) -> dict[str, Any]:
-    block: dict[str, Any] = {"version": 1, "kind": entry.kind, "covariates": list(entry.covariates)}
+    block: dict[str, Any] = {
+        "version": 2 if entry.is_pair else 1,
+        "kind": entry.kind,
+        "covariates": list(entry.covariates),
+    }
     for name in ("knots", "values", "std"):
         if rows := getattr(entry, name):
             block[name] = [list(row) for row in rows]

@@ -165,8 +165,8 @@ class _Defocus(_Strict):
 class FieldBlock(_Strict):
     """A field of an unknown effect."""
 
-    version: Literal[1] = 1
-    kind: Literal["delay", "displacement", "scale", "rate", "gain"]
+    version: Literal[1, 2] = 1
+    kind: Literal["delay", "displacement", "scale", "rate", "gain", "blur"]
     covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
     knots: Annotated[list[Annotated[list[Number], Field(max_length=200)]], Field(min_length=1, max_length=2)]
     values: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)]

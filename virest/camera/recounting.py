@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -66,7 +65,7 @@ def on_camera_clock(profile: CameraProfile) -> CameraProfile:
         imu_untrusted_s=tuple((camera_s(begin), camera_s(end)) for begin, end in profile.imu_untrusted_s),
     )
     kept = [f for f in profile.fields if (f.kind, f.covariates) != ("delay", ("time",))]
-    timed = [_retimed(f, camera_s) if f.kind in TIMED_BY_IMU else f for f in kept]
+    timed = [f.with_times(camera_s) if f.kind in TIMED_BY_IMU else f for f in kept]
     return changed.with_fields([_of_longer(field, 1 + drift * offset_s) for field in timed])
 
 
@@ -75,10 +74,3 @@ def _of_longer(field: Field, scale: float) -> Field:
     if field.kind != "scale" or scale == 1.0:
         return field
     return field.with_values(np.array(field.values) / scale, np.array(field.std) / scale if field.std else None)
-
-
-def _retimed(field: Field, clock: Callable[[float], float]) -> Field:
-    """A field over time with its knots on another clock."""
-    if field.covariates != ("time",):
-        return field
-    return replace(field, knots=(tuple(clock(t) for t in field.knots[0]),))

@@ -80,7 +80,7 @@ def for_capture(profile: CameraProfile, capture: Capture) -> CameraProfile:
     for field in profile.fields:
         if field.stamp_0_ns not in (None, capture.stamp_0_ns):
             log.info("%s: a field of %s over %s belongs to another capture", capture.name, field.kind, field.covariates)
-        elif field.covariates != ("focus",):
+        elif "focus" not in field.covariates:
             fields.append(field)
         elif focus:
             times, values = zip(*focus, strict=True)

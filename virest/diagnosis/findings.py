@@ -90,7 +90,7 @@ class FieldFinding:
 
     covariates: tuple[str, ...]
     kind: str
-    """``delay``, ``displacement``, ``scale`` or ``rate`` (see :mod:`virest.camera.field`), or ``inertial_rows``."""
+    """As of :mod:`virest.camera.field`, or ``inertial_rows``."""
     shape: str
     sentence: str
     """What it does, for people."""

@@ -22,6 +22,7 @@ from virest.diagnosis.ambiguities import (
     one_exposure,
 )
 from virest.diagnosis.edge_overshoot import judge_sharpening
+from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
 from virest.diagnosis.field.brightness import (
     instead_of_flicker,
@@ -267,6 +268,10 @@ class DiagnosisSession:
             if (found := instead or light_field(patches, extended)) is not None:
                 extended, fields = with_light_field(extended, found), [*fields, found.finding]
                 light = replace(light, profile=with_light_field(light.profile, found))
+        if self.blur.edges is not None:
+            trajectory = integrate_gyro(self.capture.imu, extended)
+            if (soft := blur_field(self.blur.edges, extended, trajectory, self.capture)) is not None:
+                fields, extended = [*fields, soft[0]], soft[1]
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]

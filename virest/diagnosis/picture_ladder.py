@@ -81,6 +81,8 @@ class PictureVerdict:
     """What blur says of the curve, by cause, named or not."""
     photometric_rms: float | None = None
     blur_rms_px: float | None = None
+    edges: local_blur.BlurObservations | None = None
+    """Of blur: what was measured."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -376,6 +378,7 @@ def climb_blur(
     if len(observations) < local_blur.MIN_EDGES:
         verdict.notes.append("too little texture to measure local blur")
         return verdict, False
+    verdict.edges = observations
     effects: tuple[Any, ...] = (local_blur_fit.ExposureTime(), local_blur_fit.Defocus())
     fitted, plain = each(local_blur_fit.fit, [(observations, profile, trajectory, some) for some in (effects, ())])
     log.debug("blur: %s ± %s", fitted.values, fitted.std)

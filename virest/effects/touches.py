@@ -41,7 +41,7 @@ OF_EXTENSIONS = {
     **dict.fromkeys(("flicker_amplitude", "flicker_frequency_hz", "flicker_phase_rad"), NOTHING),
 }
 """Extensions that do not touch everything."""
-OF_FIELDS = {"rate": RATES, "scale": LENS, "delay": NOTHING, "gain": NOTHING}
+OF_FIELDS = {"rate": RATES, "scale": LENS, "delay": NOTHING, "gain": NOTHING, "blur": NOTHING}
 """Fields in ``extensions.field``, by kind; the shutter and the lens hold the others."""
 
 

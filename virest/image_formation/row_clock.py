@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 
 Array = NDArray[np.float64]
 ROW_START, ROW_MIDDLE, ROW_END = 0.0, 0.5, 1.0
 """Shares of an exposure."""
+ROWS = np.linspace(0.0, 1.0, 41)
+"""Fractions at which one frame's delays are told: as many knots as a field over rows may have."""
 
 
 def row_time_s(
@@ -28,6 +31,30 @@ def row_time_s(
     first_row_s: start of the first row's exposure.  exposure_s: true, not logged.
     """
     return first_row_s + readout_fraction * readout_time_s + exposure_share * exposure_s
+
+
+def of_frame(profile: CameraProfile, stamp_s: float, logged_exposure_s: float) -> CameraProfile:
+    """The profile with the readout and the defocus of one frame, where these differ from frame to frame."""
+    blurs = [field for field in profile.extensions.field if field.kind == "blur"]
+    if blurs:
+        even = profile.extensions.defocus_sigma_px
+        sigma_px = float(np.hypot.reduce([even, *(float(field.at_time(stamp_s)[0]) for field in blurs)]))
+        profile = replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=sigma_px))
+        profile = profile.with_fields([field for field in profile.fields if field not in blurs])
+    changing, shutter = _changing_rows(profile), profile.shutter
+    if not changing:
+        return profile
+    begin_s = shutter.first_row_start_s(stamp_s, logged_exposure_s)
+    late = np.zeros((len(ROWS), 1)) if shutter.uneven is None else shutter.uneven.at(ROWS)
+    fraction = ROWS + late[:, 0] / (shutter.readout_time_s or 1.0)
+    late = late + sum(field.at(fraction, begin_s) for field in changing)
+    rows = Field("delay", ("row",), (tuple(ROWS.tolist()),), tuple(map(tuple, late.tolist())))
+    others = [field for field in profile.fields if field not in changing and field != shutter.uneven]
+    return profile.with_fields([*others, rows])
+
+
+def _changing_rows(profile: CameraProfile) -> list[Field]:
+    return [f for f in profile.extensions.field if (f.kind, f.covariates) == ("delay", ("row", "time"))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +75,10 @@ class RowClock:
     ) -> Any:
         """IMU time at which rows that start at a fraction of the readout are exposed to a share of their exposure."""
         shutter = self.profile.shutter
-        first_row_s = self.profile.imu_time_s(shutter.first_row_start_s(stamp_s, logged_exposure_s))
+        begin_s = shutter.first_row_start_s(stamp_s, logged_exposure_s)
+        first_row_s = self.profile.imu_time_s(begin_s)
+        for field in _changing_rows(self.profile):
+            first_row_s = first_row_s + field.at(readout_fraction, begin_s)[..., 0]
         exposure_s = shutter.true_exposure_s(logged_exposure_s)
         return row_time_s(first_row_s, shutter.readout_time_s, readout_fraction, exposure_s, exposure_share)
 

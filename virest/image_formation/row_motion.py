@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
-from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock, row_time_s
+from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock, of_frame, row_time_s
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.relief_surface import Relief
 from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
@@ -215,7 +215,8 @@ def row_motion(
     if lens is None and profile.intrinsics is not None:
         lens = moving_lens(trajectory, profile)
     span_s = start_s, float(RowClock(profile).end_s(stamp_s, logged_exposure_s or 0.0))
-    return _tabulated(trajectory, span_s, start_s, exposure_s, reference_s, profile, lens, translation)
+    own = of_frame(profile, stamp_s, logged_exposure_s or 0.0)
+    return _tabulated(trajectory, span_s, start_s, exposure_s, reference_s, own, lens, translation)
 
 
 def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, lens: MovingLens) -> RowMotion:
@@ -232,7 +233,10 @@ def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, l
 
 def with_row_clock_of(motion: RowMotion, other: RowMotion) -> RowMotion:
     """The same motion about the same reference time, its rows read and exposed when another frame's are."""
-    return replace(motion, start_s=other.start_s, exposure_s=other.exposure_s, readout_time_s=other.readout_time_s)
+    return replace(
+        motion, start_s=other.start_s, exposure_s=other.exposure_s, readout_time_s=other.readout_time_s,
+        profile=other.profile,
+    )  # fmt: skip
 
 
 def _tabulated(

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict, with_profile
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
-from virest.inference.term import Term
+from virest.inference.term import Term, slopes_of
 from virest.inference.travel_direction import find_directions, without_directions
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
@@ -152,16 +153,14 @@ class Problem:
         return Linearisation(scene, prediction, np.concatenate(slopes, axis=-1), prediction.second_px, scene)
 
     def _term_slopes(self, state: State, at: Prediction) -> Array:
-        """(n, 2, k) change of the predicted points per unit of each term's values, by difference quotients."""
-        columns = []
-        for term in self.terms:
-            for k, quotient in enumerate(term.quotient):
-                step = np.zeros(len(term))
-                step[k] = quotient
-                moved = with_profile(state.known, self.imu, term.change(state.known.profile, step))
-                ahead = predict(moved, self.table, state.scene, like=at)
-                columns.append((ahead.second_px - at.second_px) / quotient)
-        return np.stack(columns, axis=-1) if columns else np.zeros((len(self.table), 2, 0))
+        """(n, 2, k) change of the predicted points per unit of each term's values."""
+
+        def moved_by(profile: CameraProfile) -> Array:
+            moved = with_profile(state.known, self.imu, profile)
+            return predict(moved, self.table, state.scene, like=at).second_px - at.second_px
+
+        found = [slopes_of(term, state.known.profile, self.table, moved_by) for term in self.terms]
+        return np.concatenate(found, axis=-1) if found else np.zeros((len(self.table), 2, 0))
 
     def weighed(self, state: State, look: Linearisation) -> System:
         """Whiten a look's rows by noise and spread of depths, weigh them, and sum the normal equations up."""

@@ -41,7 +41,7 @@ def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
     known = {"time": imu.time_s}
     known |= {name: rate[:, k] for k, name in enumerate(RATES)}
     known |= {name: np.nan_to_num(imu.accel_m_s2[:, k]) for k, name in enumerate(FORCES)}
-    return np.asarray(sum(field.at(known[field.covariates[0]]) for field in fields))
+    return np.asarray(sum(field.at(*(known[name] for name in field.covariates)) for field in fields))
 
 
 def _camera_rate(measured: MeasuredRate, profile: CameraProfile) -> Array:

@@ -24,6 +24,8 @@ SHIFT_STEP_S = 5e-4
 """Grid of the stabiliser's path: at 50 rad/s² a straight line over it is off by 1.6e-6 rad."""
 SETTLED = 16.0
 """After this many time constants 1 / (2π cutoff) the high-pass has forgotten its start but for 1e-7 of it."""
+RADIUS_STEPS = 5
+"""A scale over the radius changes by a few per cent over it: each step of its inversion shrinks the error so."""
 _SMALL = 1e-4
 
 
@@ -52,7 +54,7 @@ class MovingLens:
     def rays_at_rest(self, points_px: Array, time_s: Any) -> Array:
         """Rays (..., 3) as if the stabiliser were at rest."""
         if self.focal_drift_per_s or self.zoom:
-            points_px = self._about_centre(points_px, 1.0 / self._focal_scale(time_s))
+            points_px = self._about_centre(points_px, 1.0 / self._focal_scale(time_s, points_px))
         return self.lens.rays(points_px)
 
     def from_rest(self, rays: Array, time_s: Any) -> Array:
@@ -69,7 +71,10 @@ class MovingLens:
             rays = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         points_px = self.lens.project(rays)
         if self.focal_drift_per_s or self.zoom:
-            points_px = self._about_centre(points_px, self._focal_scale(time_s))
+            seen_px = points_px
+            for _ in range(RADIUS_STEPS if self._over_radius else 1):
+                seen_px = self._about_centre(points_px, self._focal_scale(time_s, seen_px))
+            points_px = seen_px
         return points_px
 
     def shift_at(self, time_s: Any) -> Array:
@@ -87,9 +92,17 @@ class MovingLens:
         cut = slice(first, last)
         return replace(self, shift_time_s=self.shift_time_s[cut], shift=self.shift[cut], path=None, swing=None)
 
-    def _focal_scale(self, time_s: Any) -> Array:
-        drifted = 1.0 + self.focal_drift_per_s * np.asarray(time_s, float)[..., None]
-        return np.asarray(drifted + sum(field.at_time(time_s) for field in self.zoom))
+    @property
+    def _over_radius(self) -> bool:
+        return any("radius" in field.covariates for field in self.zoom)
+
+    def _focal_scale(self, time_s: Any, seen_px: Array) -> Array:
+        """Factor (..., 1) on the focal length at times (...), for points seen at pixels (..., 2)."""
+        total = 1.0 + self.focal_drift_per_s * np.asarray(time_s, float)[..., None]
+        first = (self.lens.radius_px(seen_px),) if self._over_radius else ()
+        for field in self.zoom:
+            total = total + field.at_time(time_s, *(first if "radius" in field.covariates else ()))
+        return np.asarray(total)
 
     def _about_centre(self, points_px: Array, scale: Array) -> Array:
         centre = np.array([self.lens.cx_px, self.lens.cy_px])

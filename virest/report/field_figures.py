@@ -17,10 +17,17 @@ from virest.report.figures import as_file, canvas, literal
 
 Array = NDArray[np.float64]
 SAMPLES, ARROWS, BINS, MIN_IN_BIN = 200, 13, 20, 8
-UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.0, "%"), "rate": (1.0, "rad/s")}
+UNIT_SCALES = {
+    "delay": (1e3, "ms"),
+    "displacement": (1.0, "px"),
+    "scale": (100.0, "%"),
+    "rate": (1.0, "rad/s"),
+    "blur": (1.0, "px"),
+}
 NAMES = {
     "row": "fraction of the readout",
     "time": "time",
+    "radius": "distance from the principal point",
     "focus": "focus distance",
     "focal": "logged focal length",
     "x": "x",
@@ -28,6 +35,7 @@ NAMES = {
 }
 RESIDUALS_OVER = {
     "row": "row",
+    "radius": "radius",
     "time": "time",
     "rate": "rate",
     "x": "radius",
@@ -53,6 +61,8 @@ def field_figure(
         _draw_map(figure, left, finding.fields[0])
     elif finding.covariates == ("x", "y"):
         _draw_arrows(figure, left, finding.fields[0])
+    elif len(finding.covariates) > 1:
+        _draw_pair(figure, left, max(finding.fields, key=lambda field: float(np.abs(field.values).max())))
     else:
         _draw_values(left, finding.fields)
     _draw_residuals(right, RESIDUALS_OVER[finding.covariates[0]], {"before": before, "after": after})
@@ -77,13 +87,35 @@ def _draw_values(axes: Any, fields: tuple[Field, ...]) -> None:
             knots = np.array(field.knots[0])
             axes.plot(knots, factor * np.array(field.values)[:, part], "o", ms=3, color=line.get_color())
         axes.set_ylabel(f"{field.kind}, {unit}")
-        name = field.covariates[0]
-        unit_along = UNITS.get(name, "rad/s" if name.startswith("rate") else "m/s²")
-        axes.set_xlabel(NAMES.get(name, name) + (f", {unit_along}" if unit_along != "1" else ""))
+        axes.set_xlabel(_named(field.covariates[0]))
     axes.axhline(0, color="0.7", lw=0.8, zorder=0)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="best", fontsize=8)
     axes.set_title("value ± standard deviation", fontsize=10)
+
+
+def _draw_pair(figure: Any, axes: Any, field: Field) -> None:
+    """The largest component over two covariates, the second along x."""
+    factor, unit = UNIT_SCALES[field.kind]
+    fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
+    values = factor * field.at(*np.meshgrid(*fine, indexing="ij"))
+    values = values[..., int(np.argmax(np.abs(values).max(axis=(0, 1))))]
+    most = float(np.abs(values).max())
+    shown = axes.pcolormesh(
+        fine[1], fine[0], values, cmap="RdBu_r", vmin=-most, vmax=most, shading="auto", rasterized=True
+    )
+    figure.colorbar(shown, ax=axes, label=f"{field.kind}, {unit}", shrink=0.8)
+    axes.set_ylabel(_named(field.covariates[0]))
+    axes.set_xlabel(_named(field.covariates[1]))
+    if field.std:
+        typical = factor * float(np.sqrt(np.mean(np.square(field.std))))
+        axes.set_title(f"map; standard deviation {typical:.2g} {unit}", fontsize=10)
+
+
+def _named(covariate: str) -> str:
+    """A covariate with its unit."""
+    unit = UNITS.get(covariate, "rad/s" if covariate.startswith("rate") else "m/s²")
+    return NAMES.get(covariate, covariate) + (f", {unit}" if unit != "1" else "")
 
 
 def _draw_arrows(figure: Any, axes: Any, field: Field) -> None:

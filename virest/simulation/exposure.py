@@ -19,7 +19,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.errors import SettingsError
 from virest.simulation.hand_motion import HandMotion
-from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale, late_rows_s
+from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale, late_rows_s, seen_radius_px
 from virest.simulation.scenes import Scene
 
 Array = NDArray[np.float64]
@@ -54,7 +54,9 @@ class View:
         """x/z and y/z of the rays of a part of the picture at one time; they broadcast against each other."""
         x, y = _part(self.x, rows, columns), _part(self.y, rows, columns)
         if self.x_rate is not None and self.y_rate is not None:
-            shrinking = np.float32(1 - 1 / focal_scale(self.profile, self.hidden, time_s))
+            y_px, x_px = np.ogrid[: self.profile.height, : self.profile.width]
+            radius_px = seen_radius_px(self.profile, x_px[:, columns], y_px[rows])
+            shrinking = np.float32(1 - 1 / focal_scale(self.profile, self.hidden, time_s, radius_px))
             x = x + shrinking * _part(self.x_rate, rows, columns)
             y = y + shrinking * _part(self.y_rate, rows, columns)
         if len(self.filter_s):
@@ -100,7 +102,11 @@ def expose(scene: Scene, motion: HandMotion, view: View, first_row_start_s: floa
     by_column = shutter.readout_direction in ("left_to_right", "right_to_left")
     width, height = view.profile.width, view.profile.height
     fraction = start_fractions(shutter.readout_direction, width, height)
-    start_s = first_row_start_s + shutter.readout_time_s * fraction + late_rows_s(view.profile, view.hidden, fraction)
+    start_s = (
+        first_row_start_s
+        + shutter.readout_time_s * fraction
+        + late_rows_s(view.profile, view.hidden, fraction, first_row_start_s)
+    )
     instants_s = _instants(scene, motion, view, start_s, exposure_s)
     weights = hat_weights(instants_s, start_s, exposure_s) * flicker(view.profile, instants_s)[:, None]
     homographies = _homographies(scene, motion, instants_s)

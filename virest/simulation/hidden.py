@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,27 +26,62 @@ class Hidden:
 
     row_delay_s: Callable[[Array], Array] | None = None
     """Of the fraction of the readout (rows,): how much later than evenly each row starts."""
+    row_delay_at: Callable[[float, Array], Array] | None = None
+    """The same of the time of a frame's first row, and of the fraction."""
     clock_s: Callable[[float], float] | None = None
     """Of a stamp: how much later than the clocks say the frame is taken."""
     focal_scale: Callable[[Array], Array] | None = None
     """Of time: factor on the focal length."""
+    radial_scale: Callable[[Array, Array], Array] | None = None
+    """Of time and of the seen distance from the principal point, px: another."""
     gyro: Callable[[Array, Array, Array], Array] | None = None
     """Of time (n,), reading (n, 3) and specific force (n, 3): what is logged instead of the reading."""
     light: Callable[[Array, Array], Array] | None = None
     """Of x and y as parts of the width and height: factor on the light."""
+    blur_px: Callable[[float], float] | None = None
+    """Of a stamp: standard deviation of a Gaussian on the light."""
+    corner_blur_px: float = 0.0
+    """Standard deviation of a Gaussian in the corners, growing with the square of the distance from the middle."""
     focus_dioptres: Callable[[Array], Array] | None = None
     """Of a frame's time: the focus distance that is logged."""
 
 
 NOTHING = Hidden()
+LEAST_BLUR_PX, STEPS = 0.05, 8
 
 
-def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array) -> Array:
-    """How much later than evenly rows start (rows,), by their fraction of the readout."""
+def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array, first_row_s: float) -> Array:
+    """How much later than evenly rows start (rows,), by their fraction of the readout; first_row_s: IMU clock."""
     late = np.zeros(len(fraction))
     if profile.shutter.uneven is not None:
         late = late + profile.shutter.uneven.at(fraction)[:, 0]
-    return late if hidden.row_delay_s is None else late + hidden.row_delay_s(fraction)
+    begun = fraction + late / (profile.shutter.readout_time_s or 1.0)
+    for field in profile.extensions.field:
+        if field.kind == "delay" and field.covariates == ("row", "time"):
+            late = late + field.at(begun, profile.camera_time_s(first_row_s))[:, 0]
+    for hide in (hidden.row_delay_s, hidden.row_delay_at and partial(hidden.row_delay_at, first_row_s)):
+        late = late if hide is None else late + hide(fraction)
+    return late
+
+
+def defocused(profile: CameraProfile, hidden: Hidden, light: Any, stamp_s: float) -> Any:
+    """Light (h, w, 3) out of focus at some times, or towards the corners."""
+    sizes = [float(f.at_time(stamp_s)[0]) for f in profile.extensions.field if f.kind == "blur"]
+    sizes += [] if hidden.blur_px is None else [float(hidden.blur_px(stamp_s))]
+    if (sigma := float(np.hypot.reduce([0.0, *sizes]))) > LEAST_BLUR_PX:
+        light = cv2.GaussianBlur(light, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    if not hidden.corner_blur_px:
+        return light
+    height, width = light.shape[:2]
+    x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    part = 0.5 * (x**2 * width**2 + y**2 * height**2) / (0.5 * (width**2 + height**2))
+    levels = [light, *(cv2.GaussianBlur(light, (0, 0), hidden.corner_blur_px * k / STEPS) for k in range(1, STEPS + 1))]
+    place = np.clip(STEPS * part, 0, STEPS)
+    below = np.minimum(place.astype(int), STEPS - 1)
+    above = (place - below)[..., None].astype(np.float32)
+    whole = np.stack(levels)
+    rows, columns = np.indices((height, width))
+    return (1 - above) * whole[below, rows, columns] + above * whole[below + 1, rows, columns]
 
 
 def shaded(hidden: Hidden, light: Any) -> Any:
@@ -56,23 +93,34 @@ def shaded(hidden: Hidden, light: Any) -> Any:
     return light * hidden.light(x, y)[..., None].astype(np.float32)
 
 
-def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any) -> Any:
-    """Factor on the profile's focal length at times (...)."""
+def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any, radius_px: Any) -> Any:
+    """Factor on the profile's focal length at times (...), for points seen this far (...) from the principal point."""
     time_s = np.asarray(time_s, float)
     scale = 1 + profile.extensions.focal_drift_per_s * time_s
     for field in profile.extensions.field:
         if field.kind == "scale":
             # what the camera logs runs on its clock
             own_s = time_s if field.log is None else profile.camera_time_s(time_s)
-            scale = scale + field.at_time(own_s)[..., 0]
-    return scale if hidden.focal_scale is None else scale * hidden.focal_scale(time_s)
+            first = (radius_px,) if "radius" in field.covariates else ()
+            scale = scale + field.at_time(own_s, *first)[..., 0]
+    if hidden.focal_scale is not None:
+        scale = scale * hidden.focal_scale(time_s)
+    return scale if hidden.radial_scale is None else scale * hidden.radial_scale(time_s, radius_px)
+
+
+def seen_radius_px(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:
+    """Distance (...) of pixels from the principal point."""
+    lens = profile.intrinsics
+    assert lens is not None
+    return np.hypot(x_px - lens.cx_px, y_px - lens.cy_px)
 
 
 def focal_changes(profile: CameraProfile, hidden: Hidden) -> bool:
     """Whether the focal length is another at another time."""
     extensions = profile.extensions
     own = any(field.kind == "scale" for field in extensions.field)
-    return bool(extensions.focal_drift_per_s or own or hidden.focal_scale is not None)
+    asked = hidden.focal_scale is not None or hidden.radial_scale is not None
+    return bool(extensions.focal_drift_per_s or own or asked)
 
 
 def missing_rate_rad_s(profile: CameraProfile, time_s: Array, reading: Array, force_m_s2: Array | None) -> Array:
@@ -84,7 +132,7 @@ def missing_rate_rad_s(profile: CameraProfile, time_s: Array, reading: Array, fo
             continue
         known = {"time": time_s, **dict(zip(RATES, reading.T, strict=True))}
         known |= {} if force_m_s2 is None else dict(zip(FORCES, np.nan_to_num(force_m_s2).T, strict=True))
-        total = total + field.at(known[name])
+        total = total + field.at(*(known[name] for name in field.covariates))
     return total
 
 

@@ -23,7 +23,7 @@ from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
-from virest.simulation.hidden import NOTHING, Hidden, gyro_reading, shaded
+from virest.simulation.hidden import NOTHING, Hidden, defocused, gyro_reading, shaded
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
@@ -47,6 +47,8 @@ FASTEST_HAND_RAD_S = 100.0
 NEAREST_M, FARTHEST_M = 0.001, 1e6
 FOCAL_OF_LONG_SIDE = (0.05, 100.0)
 """What the renderer takes; beyond, arrays outgrow the memory or numbers lose their digits."""
+WHOLE_FRAMES = ("delay", ("time",))
+"""Fields that make all rows of a frame late."""
 _IMU_LEAD_S = 0.6
 _SCENE_MARGIN = 1.12
 
@@ -123,10 +125,13 @@ class Session:
         """Exposure that the sensor made."""
         return self.logged_exposure_s(capture) * self.true.shutter.exposure_scale
 
+    def stamp_s(self, capture: int) -> float:
+        """Stamp of a capture from stamp_0, camera clock."""
+        return _stamp_s(capture, self.settings.fps) if self.capture_s is None else float(self.capture_s[capture])
+
     def first_row_start_s(self, capture: int) -> float:
         """Start of the first row's exposure, IMU clock from stamp_0."""
-        stamps = self.capture_s
-        stamp_s = _stamp_s(capture, self.settings.fps) if stamps is None else float(stamps[capture])
+        stamp_s = self.stamp_s(capture)
         late_s = 0.0 if self.hidden.clock_s is None else self.hidden.clock_s(stamp_s)
         return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture)) + late_s
 
@@ -238,6 +243,7 @@ def render_picture(session: Session, slot: int, phone: PhonePictures | None = No
         session.first_row_start_s(capture),
         session.true_exposure_s(capture),
     )
+    light = defocused(session.true, session.hidden, light, session.stamp_s(capture))
     light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=True))
     rng = np.random.default_rng([session.settings.seed, 3, capture])
     levels = noisy_levels(_grey(session, light), session.settings.noise_levels, rng)
@@ -350,7 +356,9 @@ def _stamp_s(index: int, fps: float) -> float:
 
 def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: float) -> float:
     start_cam = stamp_s - STAMP_PLACE[true.shutter.timestamp] * true_exposure_s
-    late_s = sum(float(f.at_time(start_cam)[0]) for f in true.extensions.field if f.kind == "delay")
+    late_s = sum(
+        float(f.at_time(start_cam)[0]) for f in true.extensions.field if (f.kind, f.covariates) == WHOLE_FRAMES
+    )
     return start_cam * (1 + true.clock_skew) + (true.time_offset_s or 0.0) + late_s
 
 

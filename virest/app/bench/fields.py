@@ -163,6 +163,52 @@ def _shading(rng: np.random.Generator, size: float) -> Strangeness:
     return Strangeness(Hidden(light=light), expected=(_either(("gain", "x, y")),), lasting=False)
 
 
+def _hunting(rng: np.random.Generator, size: float) -> Strangeness:
+    """A focus that hunts to and fro, without a log."""
+    part, hz, phase = 0.003 * size * rng.uniform(0.8, 1.25), rng.uniform(1.0, 1.8), rng.uniform(0, 2 * np.pi)
+    hidden = Hidden(focal_scale=lambda t: 1 + part * np.sin(2 * np.pi * hz * np.asarray(t) + phase))
+    return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
+
+
+def _sticking(rng: np.random.Generator, size: float) -> Strangeness:
+    """Rates below a threshold read as nought, and others are too small by it."""
+    threshold = 0.008 * size * rng.uniform(0.8, 1.25)
+
+    def stuck(_time: Array, reading: Array, _force: Array) -> Array:
+        return np.asarray(np.sign(reading) * np.maximum(np.abs(reading) - threshold, 0.0))
+
+    return Strangeness(Hidden(gyro=stuck), expected=(_either(("rate", "rate")),))
+
+
+def _changing_readout(rng: np.random.Generator, size: float) -> Strangeness:
+    """A readout that lasts longer from some time on."""
+    longer_s, at_s = _sign(rng) * 1.2e-3 * size * rng.uniform(0.8, 1.25), rng.uniform(0.9, 2.0)
+    hidden = Hidden(row_delay_at=lambda t, fraction: longer_s * fraction / (1 + np.exp(-(t - at_s) / 0.1)))
+    return Strangeness(hidden, expected=(_either(("delay", "row, time")),), lasting=False)
+
+
+def _changing_distortion(rng: np.random.Generator, size: float) -> Strangeness:
+    """Distortion that settles as the lens warms up."""
+    part, settling_s = _sign(rng) * 0.008 * size * rng.uniform(0.8, 1.25), rng.uniform(0.4, 0.9)
+
+    def scale(time_s: Array, radius_px: Array) -> Array:
+        return 1 + part * (np.asarray(radius_px) / 400) ** 2 * (1 - np.exp(-np.maximum(time_s, 0) / settling_s))
+
+    return Strangeness(Hidden(radial_scale=scale), expected=(_either(("scale", "radius, time")),), lasting=False)
+
+
+def _soft_corners(rng: np.random.Generator, size: float) -> Strangeness:
+    hidden = Hidden(corner_blur_px=float(1.2 * size * rng.uniform(0.8, 1.25)))
+    return Strangeness(hidden, expected=(_either(("blur", "radius")),), lasting=False)
+
+
+def _soft_moments(rng: np.random.Generator, size: float) -> Strangeness:
+    """A focus that is lost for half a second."""
+    sigma_px, at_s, lasting_s = 1.0 * size * rng.uniform(0.8, 1.25), rng.uniform(0.8, 2.2), rng.uniform(0.2, 0.3)
+    hidden = Hidden(blur_px=lambda t: float(sigma_px * np.exp(-(((t - at_s) / lasting_s) ** 2))))
+    return Strangeness(hidden, expected=(_either(("blur", "time")),), lasting=False)
+
+
 def _two(rng: np.random.Generator, size: float) -> Strangeness:
     uneven, lens = _uneven(rng, size), _tangential(rng, size)
     return replace(uneven, tangential=lens.tangential, expected=(*uneven.expected, *lens.expected))
@@ -198,6 +244,12 @@ EFFECTS: dict[str, Draw] = {
     "lens_switch": _lens_switch,
     "wandering": _wandering,
     "shading": _shading,
+    "hunting": _hunting,
+    "sticking": _sticking,
+    "changing_readout": _changing_readout,
+    "changing_distortion": _changing_distortion,
+    "soft_corners": _soft_corners,
+    "soft_moments": _soft_moments,
     "two": _two,
     "one_named": _one_named,
 }

@@ -16,7 +16,7 @@ from scipy.linalg import null_space
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.diagnosis.field.screening import MAX_P, MIN_T, score_forms, t_ratio
+from virest.diagnosis.field.screening import MAX_P, MIN_T, Design, score_forms, t_ratio
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
 
@@ -88,9 +88,8 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile) -
     scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
     weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2) / scale**2
     tangent = _tangent(seen, profile, at) / seen.noise[:, None]
-    (scored, *_) = score_forms(
-        left[order, None], weight[order], tangent[order, None], [("gain", design[order, None], False)], block[order]
-    ) or (None,)
+    asked = [Design("gain", design[order, None], over_time=False)]
+    (scored, *_) = score_forms(left[order, None], weight[order], tangent[order, None], asked, block[order]) or (None,)
     if scored is None or scored.parts_gain is None or scored.p_value > MAX_P:
         return None
     size = float(np.sqrt(max(scored.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))

@@ -14,7 +14,8 @@ from virest.diagnosis.candidates import varies
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.image_formation.point_model import Prediction, TrackTable, predict, with_profile
 from virest.inference import profile_terms as terms_of
-from virest.inference.track_fit import Term, TrackFit
+from virest.inference.term import Term, slopes_of
+from virest.inference.track_fit import TrackFit
 from virest.motion.scene_motion import DirectedMotion
 
 Array = NDArray[np.float64]
@@ -70,13 +71,8 @@ class PointResiduals:
 
     def effect(self, terms: Sequence[Term]) -> Array:
         """Whitened change (n, 2, k) of the predicted points per free number of terms."""
-        columns = [self._moved(term, number) for term in terms for number in range(len(term))]
-        return self.whitening.of(np.stack(columns, axis=-1))
-
-    def _moved(self, term: Term, number: int) -> Array:
-        step = np.zeros(len(term))
-        step[number] = term.quotient[number]
-        return self.moved_by(term.change(self.fit.profile, step)) / term.quotient[number]
+        slopes = [slopes_of(term, self.fit.profile, self.table, self.moved_by) for term in terms]
+        return self.whitening.of(np.concatenate(slopes, axis=-1))
 
     def moved_by(self, profile: CameraProfile) -> Array:
         """By how much another profile moves the points (n, 2), px."""

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.field import Field, cardinal_weights
-from virest.diagnosis.field.screening import MAX_P, score_forms, select
-from virest.diagnosis.field.words import PATTERNS, SAMPLES, curve_shape, lens_words, shape_of
+from virest.diagnosis.field.screening import MAX_P, Design, score_forms, select
+from virest.diagnosis.field.words import PATTERNS, SAMPLES, curve_shape, lens_words, shape_of, shape_of_pair
 from virest.errors import CaptureError
 
 Array = NDArray[np.float64]
@@ -23,7 +25,8 @@ NEEDED = ("x", "y", "dx", "dy")
 VELOCITY = ("vx", "vy")
 ORDER = ("frame", "time")
 MOST_ROWS, LEAST_ROWS = 20_000, 100
-KNOTS, PLACE_KNOTS = 6, 4
+KNOTS, PLACE_KNOTS, PAIR_KNOTS, MOST_PAIRS = 6, 4, 4, 10
+SAME_PART = 1e-6
 BLOCKS, LEAST_BLOCKS = 40, 8
 MAX_FINDINGS = 6
 MOST_PX = 1e6
@@ -109,6 +112,8 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
     left = left - np.median(left, axis=0)
     block = _blocks(columns, len(left))
     forms = _forms(columns)
+    pairs = _pairs(columns)
+    asked = len(forms) + len(pairs)
     tangent = np.broadcast_to(np.eye(2), (len(left), 2, 2)).copy()
     rms_px = _scale(left)
     found: list[tuple[_Form, float, tuple[str, ...], float, float]] = []
@@ -116,12 +121,18 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
     for _ in range(MAX_FINDINGS):
         scale = _scale(current)
         weight = 1 / (1 + (current**2).sum(axis=-1) / (CAUCHY * scale) ** 2)
-        open_forms = [form for form in forms if form.name not in {known[0].name for known in found}]
-        designs = [(form.name, form.design / scale, form.over_time) for form in open_forms]
-        selection = select(score_forms(current / scale, weight, tangent, designs, block), float(weight.sum()))
-        if selection is None or selection.size * scale < MIN_SIZE_PX:
+        taken = {known[0].name for known in found}
+        for group, beside in ((forms, []), (pairs, [form.design for form in forms])):
+            open_forms = [form for form in group if form.name not in taken]
+            designs = [Design(form.name, form.design / scale, form.over_time) for form in open_forms]
+            everything = np.concatenate([tangent, *beside], axis=-1)
+            scored = score_forms(current / scale, weight, everything, designs, block, asked=asked)
+            selection = select(scored, float(weight.sum()))
+            if selection is not None and selection.size * scale >= MIN_SIZE_PX:
+                break
+        else:
             break
-        form = next(form for form in open_forms if form.name == selection.best.name)
+        form = open_forms[selection.best.place]
         tangent = np.concatenate([tangent, form.design], axis=-1)
         after = float(np.sqrt(max(scale**2 - (selection.size * scale) ** 2, 0.0)))
         found.append((form, selection.best.p_value, selection.rivals, scale, after))
@@ -134,7 +145,7 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
         part = slice(place, place + form.design.shape[2])
         place = part.stop
         findings.append(_finding(form, numbers[part], covariance[part, part], p_value, rivals, before, after, left_px))
-    return Criticism(rows, len(left), rms_px, left_px, tuple(findings), tuple(form.name for form in forms))
+    return Criticism(rows, len(left), rms_px, left_px, tuple(findings), tuple(form.name for form in (*forms, *pairs)))
 
 
 def _cleaned(columns: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
@@ -176,20 +187,69 @@ def _forms(columns: Mapping[str, Array]) -> list[_Form]:
     forms = [_over_picture(x, y)] if np.ptp(x) > 0 and np.ptp(y) > 0 else []
     names = [name for name in columns if name not in (*NEEDED, *VELOCITY)]
     for name in names:
-        values = columns[name]
-        knots = np.unique(np.linspace(values.min(), values.max(), KNOTS))
-        if len(knots) < KNOTS:
+        if (curve := _curve(columns[name], KNOTS)) is None:
             continue
-        weights = cardinal_weights(tuple(knots.tolist()), values)
-        shared = tuple(float(k) for k in knots)
-        shift = np.einsum("nk,ij->nikj", weights, np.eye(2)).reshape(len(x), 2, -1)
-        forms.append(_Form("shift", (name,), (shared,), shift, 2))
+        knots, weights = (curve[0],), curve[1]
+        forms.append(_shift((name,), knots, weights))
         if name != "row":
-            forms.append(_Form("scale", (name,), (shared,), arm[:, :, None] * weights[:, None, :], 1))
-        if name == "row" and all(v in columns for v in VELOCITY):
-            speed = np.stack([columns[v] for v in VELOCITY], axis=-1)
-            forms.append(_Form("delay", (name,), (shared,), speed[:, :, None] * weights[:, None, :], 1))
+            forms.append(_along("scale", (name,), knots, weights, arm))
+        elif all(v in columns for v in VELOCITY):
+            forms.append(_along("delay", (name,), knots, weights, np.stack([columns[v] for v in VELOCITY], axis=-1)))
     return forms
+
+
+def _pairs(columns: Mapping[str, Array]) -> list[_Form]:
+    """What two covariates do together; the distance from the middle goes with each other one as a scale.
+
+    Of two that are the same all over a frame nothing is asked: what a frame's points share is a function of both.
+    """
+    x, y = columns["x"], columns["y"]
+    arm = np.stack([a - 0.5 * (a.min() + a.max()) for a in (x, y)], axis=-1)
+    recorded = {name: values for name, values in columns.items() if name not in (*NEEDED, *VELOCITY)}
+    curves = {name: curve for name in recorded if (curve := _curve(recorded[name], PAIR_KNOTS)) is not None}
+    forms = []
+    key = next((columns[name] for name in ORDER if name in columns), np.arange(len(x)))
+    frame = np.unique(key, return_inverse=True)[1]
+    within = {name for name in curves if _varies_within(recorded[name], frame)}
+    for one, two in [pair for pair in combinations(curves, 2) if within & set(pair)][:MOST_PAIRS]:
+        knots, weights = _product(curves[one], curves[two])
+        forms.append(_shift((one, two), knots, weights))
+        if "row" in (one, two) and all(v in columns for v in VELOCITY):
+            speed = np.stack([columns[v] for v in VELOCITY], axis=-1)
+            forms.append(_along("delay", (one, two), knots, weights, speed))
+    if (outwards := _curve(np.linalg.norm(arm, axis=-1), PAIR_KNOTS)) is not None:
+        for name in [name for name in curves if name != "row"][:MOST_PAIRS]:
+            forms.append(_along("scale", ("radius", name), *_product(outwards, curves[name]), arm))
+    return forms
+
+
+def _varies_within(values: Array, group: Index) -> bool:
+    """Whether a column is not the same all over each group of rows."""
+    mean = np.bincount(group, values) / np.maximum(np.bincount(group), 1)
+    return bool(np.ptp(values - mean[group]) > SAME_PART * np.ptp(values))
+
+
+def _curve(values: Array, count: int) -> tuple[tuple[float, ...], Array] | None:
+    """Knots over a column and what each counts (n, knots); None where it hardly varies."""
+    knots = tuple(np.unique(np.linspace(values.min(), values.max(), count)).tolist())
+    return None if len(knots) < count else (knots, cardinal_weights(knots, values))
+
+
+def _product(
+    one: tuple[tuple[float, ...], Array], two: tuple[tuple[float, ...], Array]
+) -> tuple[tuple[tuple[float, ...], ...], Array]:
+    return (one[0], two[0]), np.asarray(one[1][:, :, None] * two[1][:, None, :]).reshape(len(one[1]), -1)
+
+
+def _shift(names: tuple[str, ...], knots: tuple[tuple[float, ...], ...], weights: Array) -> _Form:
+    return _Form("shift", names, knots, np.einsum("nk,ij->nikj", weights, np.eye(2)).reshape(len(weights), 2, -1), 2)
+
+
+def _along(
+    kind: str, names: tuple[str, ...], knots: tuple[tuple[float, ...], ...], weights: Array, way: Array
+) -> _Form:
+    """Shifts along ways (n, 2), by one number a knot."""
+    return _Form(kind, names, knots, way[:, :, None] * weights[:, None, :], 1)
 
 
 def _over_picture(x: Array, y: Array) -> _Form:
@@ -230,7 +290,12 @@ def _finding(
     after: float, noise: float,
 ) -> TableFinding:  # fmt: skip
     values = numbers.reshape(-1, form.parts)
-    centre = np.eye(len(values)) - 1 / len(values) if form.kind != "displacement" else np.eye(len(values))
+    centre = np.eye(len(values))
+    if form.kind != "displacement":
+        # of two covariates what they do beyond the sum of what each does
+        centre = reduce(
+            lambda one, two: np.asarray(np.kron(one, two)), [np.eye(len(k)) - 1 / len(k) for k in form.knots]
+        )
     values = centre @ values
     turn = np.kron(centre, np.eye(form.parts))
     std = np.sqrt(np.maximum(np.diag(turn @ covariance @ turn.T), 0.0)).reshape(-1, form.parts)
@@ -239,10 +304,16 @@ def _finding(
     size, unit = float(length[row]), {"scale": "1", "delay": "s"}.get(form.kind, "px")
     if form.kind == "displacement":
         shape = shape_of(Field("displacement", ("x", "y"), form.knots, tuple(map(tuple, values.tolist()))))
+    elif len(form.knots) > 1:
+        one, two = (cardinal_weights(k, np.linspace(k[0], k[-1], SAMPLES)) for k in form.knots)
+        table = values.reshape(len(form.knots[0]), len(form.knots[1]), -1)
+        shape = shape_of_pair(np.einsum("ai,bj,ijc->abc", one, two, table), form.covariates)
     else:
         along = np.linspace(form.knots[0][0], form.knots[0][-1], SAMPLES)
         curve = cardinal_weights(form.knots[0], along) @ values
-        shape = curve_shape(curve[:, int(np.argmax(np.ptp(curve, axis=0)))], form.over_time)
+        shape = curve_shape(
+            curve[:, int(np.argmax(np.ptp(curve, axis=0)))], "time" if form.over_time else form.covariates[0]
+        )
     sentence, reasons, following = _said(form, shape, size)
     beside = f"; {' and '.join(rivals)} would explain it as well" if rivals else ""
     return TableFinding(
@@ -254,7 +325,13 @@ def _finding(
 
 def _said(form: _Form, shape: str, size: float) -> tuple[str, str, str]:
     """Sentence, likely reasons and the next measurement."""
-    name = form.covariates[0]
+    name = " and the ".join(form.covariates)
+    if len(form.knots) > 1 and form.kind != "displacement":
+        unit = {"scale": f"{100 * size:.3g} % of the focal length", "delay": f"{1e3 * size:.3g} ms"}
+        said = f"{form.kind}s of up to {unit.get(form.kind, f'{size:.3g} px')} that the {name} make together: {shape}"
+        known = PATTERNS.get((form.kind, form.covariates), PATTERNS["scale", ("radius", "time")])
+        reasons = known.reasons if form.kind != "shift" else "something that acts through both at once"
+        return said, reasons, f"record again with the {name} moving independently of each other"
     match form.kind:
         case "displacement":
             pattern = PATTERNS["displacement", ("x", "y")]

@@ -12,7 +12,7 @@ doi:10.1111/j.1467-9868.2010.00740.x).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -32,6 +32,9 @@ MAX_P = 1e-3
 MIN_T, MIN_LOCAL_T = 3.0, 2.0
 """Least ratio of the held-out gain to its standard error; of a form over time, whose gain may lie in a few blocks: one
 in seven of 30 blocks makes no more than 2.2, however large it is there."""
+HALVES_VARIANCE = 12.0
+"""Of the gain of either half of the points by a fit of k numbers to the other, per number, where there is nothing to
+gain: 2 (e'Xv)·2 and v'X'Xv, v and e'X of unit variance, have 4 k + 2 k each time; their mean is −2 k."""
 RIVAL_T = 2.0
 """Forms whose gains differ by less than this many standard errors cannot be told apart."""
 ALIKE_PART = 0.9
@@ -41,9 +44,24 @@ MIN_STABLE = 0.7
 
 
 @dataclass(frozen=True, slots=True)
+class Design:
+    """What a form does to the residuals."""
+
+    name: str
+    effect: Array
+    """(n, d, k) per free number, in standard deviations."""
+    over_time: bool
+    """Whether it runs over time, so that no part of the capture tells of another."""
+    local: bool = False
+    """Whether its knots lie as close as blocks, so that no block tells of another either: other points of them do."""
+
+
+@dataclass(frozen=True, slots=True)
 class Scored:
     """One form's scores."""
 
+    place: int
+    """Of its design among those given."""
     name: str
     numbers: int
     p_value: float
@@ -52,10 +70,14 @@ class Scored:
     """(blocks,) squared whitened residual taken away in blocks that were not fitted."""
     parts_gain: Array | None
     """(blocks,) the same, with whole parts of the capture left out; None where that cannot be asked."""
+    local: bool = False
+    """Whether the gain is that of other points of the blocks that were fitted."""
 
     @property
     def significant(self) -> bool:
         """Whether chance is ruled out and the gain holds wherever it was asked for."""
+        if self.local:
+            return self.p_value < MAX_P and float(self.gain.sum()) > MIN_T * np.sqrt(HALVES_VARIANCE * self.numbers)
         if self.parts_gain is None:
             return self.p_value < MAX_P and t_ratio(self.gain) > MIN_LOCAL_T
         return self.p_value < MAX_P and all(t_ratio(gain) > MIN_T for gain in (self.gain, self.parts_gain))
@@ -76,28 +98,31 @@ class Selection:
 class _Block:
     """Sums of one form over blocks."""
 
+    place: int
     name: str
     pull: Array
-    """(blocks, k) X'e."""
+    """(blocks, k) X'e; of moments of time for both halves of their points in turn."""
     curvature: Array
     """(blocks, k, k) X'X."""
     over_time: bool
+    local: bool
 
 
 def score_forms(
     left: Array,
     weight: Array,
     tangent: Array,
-    designs: Sequence[tuple[str, Array, bool]],
+    designs: Sequence[Design],
     block: Index,
     moment: Index | None = None,
     seed: int = 0,
+    asked: int | None = None,
 ) -> list[Scored]:
     """Score forms, best gain first.
 
-    left: (n, d) residuals in standard deviations; weight (n,); tangent (n, d, m); designs: name, effect (n, d, k) per
-    free number, and whether the form runs over time; block (n,) number of the block of time, rising; moment (n,)
-    the same of shorter stretches within blocks, by which forms over time are tested: a few blocks hold each knot.
+    left: (n, d) residuals in standard deviations; weight (n,); tangent (n, d, m); block (n,) number of
+    the block of time, rising; moment (n,) the same of shorter stretches within blocks, by which forms over time are
+    tested: a few blocks hold each knot.  asked: how many forms are asked for in all; None: these.
     """
     root = np.repeat(np.sqrt(weight), left.shape[1])[:, None]
     frame = _orthonormal(tangent.reshape(len(root), -1) * root)
@@ -106,14 +131,12 @@ def score_forms(
     moments, fine = np.unique(block if moment is None else moment, return_inverse=True)
     coarse = np.zeros(len(moments), np.intp)
     coarse[fine] = np.unique(block, return_inverse=True)[1]
-    of_row = np.repeat(fine, left.shape[1])
-    summed = (
-        _summed(name, design.reshape(len(root), -1) * root, frame, error, of_row, over)
-        for name, design, over in designs
-    )
+    half = np.arange(len(left)) % 2
+    of_row = np.repeat(2 * fine + half, left.shape[1])
+    summed = (_summed(k, form, root, frame, error, of_row, 2 * len(moments)) for k, form in enumerate(designs))
     blocks = [entry for entry in summed if entry is not None]
     signs = np.random.default_rng(seed).choice((-1.0, 1.0), (FLIPS, len(moments)))
-    scored = [_scored(entry, coarse, signs, len(blocks)) for entry in blocks]
+    scored = [_scored(entry, coarse, signs, asked or len(blocks)) for entry in blocks]
     return sorted(scored, key=lambda s: -float(s.gain.sum()))
 
 
@@ -151,8 +174,11 @@ def _orthonormal(columns: Array) -> Array:
     return np.asarray(u[:, singular > 1e-6 * singular[0]])
 
 
-def _summed(name: str, design: Array, frame: Array, error: Array, of_row: Index, over_time: bool) -> _Block | None:
-    """Sums over blocks, in the directions of the form that are its own; None where it has none."""
+def _summed(
+    place: int, form: Design, root: Array, frame: Array, error: Array, of_row: Index, count: int
+) -> _Block | None:
+    """Sums over groups of rows, in the directions of the form that are its own; None where it has none."""
+    design = form.effect.reshape(len(root), -1) * root
     own = design - frame @ (frame.T @ design)
     full, kept = design.T @ design, own.T @ own
     # directions by the part of them that the tangent space does not hold
@@ -164,28 +190,33 @@ def _summed(name: str, design: Array, frame: Array, error: Array, of_row: Index,
     if not basis.shape[1]:
         return None
     own = own @ basis
-    count = int(of_row.max()) + 1
     pull: Array = np.stack([np.bincount(of_row, column * error, count) for column in own.T], axis=-1).astype(float)
     order = np.argsort(of_row, kind="stable")
     edges = np.searchsorted(of_row[order], np.arange(count + 1))
     curvature: Array = np.stack([own[order[a:b]].T @ own[order[a:b]] for a, b in pairwise(edges)])
-    return _Block(name, pull, curvature, over_time)
+    return _Block(place, form.name, pull, curvature, form.over_time, form.local)
 
 
 def _scored(entry: _Block, coarse: Index, signs: Array, forms: int) -> Scored:
-    whole = _Block(entry.name, _added(entry.pull, coarse), _added(entry.curvature, coarse), entry.over_time)
-    entry = entry if entry.over_time else whole
-    count, numbers = entry.pull.shape
-    total, inverse = entry.pull.sum(axis=0), _solver(entry.curvature.sum(axis=0))
-    flipped = signs[:, :count] @ entry.pull
+    halves = np.arange(len(entry.pull))
+    moments = _grouped(entry, halves // 2)
+    whole = _grouped(moments, coarse)
+    tested = moments if entry.over_time else whole
+    count, numbers = tested.pull.shape
+    total, inverse = tested.pull.sum(axis=0), _solver(tested.curvature.sum(axis=0))
+    flipped = signs[:, :count] @ tested.pull
     drawn = np.einsum("fk,kl,fl->f", flipped, inverse, flipped)
     seen = float(total @ inverse @ total)
     scale = max(float(drawn.var() / max(drawn.mean(), 1e-300)), 1e-300)
     p_value = float(stats.gamma.sf(seen, max(float(drawn.mean()) / scale, 1e-3), scale=scale))
     block = np.arange(len(whole.pull))
-    gain = _held_out(whole, block % FOLDS)
+    gain = _added(_held_out(entry, halves % 2), coarse[halves // 2]) if entry.local else _held_out(whole, block % FOLDS)
     parts = None if entry.over_time else _held_out(whole, block * PARTS // len(block))
-    return Scored(entry.name, numbers, min(p_value * forms, 1.0), gain, parts)
+    return Scored(entry.place, entry.name, numbers, min(p_value * forms, 1.0), gain, parts, entry.local)
+
+
+def _grouped(entry: _Block, group: Index) -> _Block:
+    return replace(entry, pull=_added(entry.pull, group), curvature=_added(entry.curvature, group))
 
 
 def _added(sums: Array, group: Index) -> Array:

@@ -7,7 +7,7 @@ in; it stays if blocks of time that the fit did not see gain.  Then causes that 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -16,19 +16,15 @@ from numpy.typing import NDArray
 
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
-from virest.diagnosis.field.forms import (
-    FRAMES_PER_STEP,
-    OVER,
-    FieldForm,
-    possible_forms,
-)
+from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
+from virest.diagnosis.field.forms import OVER, FieldForm
 from virest.diagnosis.field.records import FittedField
-from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, Scored, Selection, score_forms, select, t_ratio
+from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, Design, Scored, Selection, score_forms, select, t_ratio
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
     FINAL_POINTS,
-    MAX_P,
+    LARGE_GAIN,
     MIN_GAIN,
     Accepted,
     GeometricVerdict,
@@ -47,6 +43,8 @@ PAIRS_IN_BLOCK = 3
 MIN_SIZE_PX = 0.025
 """Structure below 0.02 px may be tracking's own bias; a smaller one only enters in place of a named cause."""
 MIN_BLOCKS = 8
+DEPTH = "scene_depth"
+"""A camera's path before a near plane says much that a gyroscope's errors do."""
 LASTING_PART = 0.5
 """Least part of the loss about a sudden change that goes by what the frames before and after say of it."""
 
@@ -55,10 +53,19 @@ LASTING_PART = 0.5
 class HeldOut:
     """A model on blocks of time that it was not fitted to."""
 
-    block_loss: Array
-    """(blocks,) mean loss of a point."""
+    losses: Array
+    """(n,) of the points."""
+    block: Index | None
+    """(n,) number of the block of time that errs together; None: the points were judged one by one."""
     rms: float
     """In units of the typical noise."""
+
+    @property
+    def block_loss(self) -> Array:
+        """(blocks,) mean loss of a point, or (n,) the points' own."""
+        if self.block is None:
+            return self.losses
+        return np.bincount(self.block, self.losses) / np.maximum(np.bincount(self.block), 1)
 
 
 def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -> GeometricVerdict:
@@ -68,16 +75,11 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     state, fitted = _Description(replace(found.model, terms=terms), tuple(found.accepted), ()), found.fit
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
-        forms = _asked_for(evidence, capture, state.model, fitted)
-        tried = ((asked, _entered(evidence, state.model, asked, fitted)) for asked in forms)
-        chosen, entered = next((pair for pair in tried if pair[1] is not None), (None, None))
-        if chosen is None or entered is None:
+        asked = _asked_for(evidence, capture, state.model, fitted)
+        steps = (_step(evidence, found, state, one, fitted) for one in asked)
+        if (step := next((step for step in steps if step is not None), None)) is None:
             break
-        more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
-        after = _without_stand_ins(evidence, found, more)
-        small = chosen.selection is not None and chosen.selection.size * evidence.typical_px < MIN_SIZE_PX
-        if small and len(after.accepted) == len(state.accepted):
-            break
+        chosen, entered, after = step
         before = entered.before
         if len(after.accepted) < len(state.accepted):
             before = _held_out(evidence, _without_form(after.model, after.forms[-1]), fitted)
@@ -87,6 +89,7 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         typical = evidence.typical_px
         stability = chosen.selection.stability if chosen.selection else None
         before_px, after_px = before.rms * typical, entered.after.rms * typical
+        fields = [entry for entry in fields if entry.form.name in {form.name for form in after.forms}]
         fields.append(FittedField(entered.form, chosen.rivals, chosen.p_value, stability, before_px, after_px, fitted))
         log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
     if not fields:
@@ -116,22 +119,39 @@ class _Description:
     def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _Description:
         """The same without some causes, their values back where the profile had them.
 
-        A displacement begins anew: it stays clear of the principal point that the lens has then.
+        Forms that keep clear of these, as a displacement of the principal point, begin anew.
         """
         model = self.model
         for entry in leaving:
+            if entry.name == DEPTH:
+                model = replace(model, scene=found.nominal.scene)
+                continue
             assert entry.effect is not None
             assert entry.effect.term is not None
             name = entry.effect.term.name
             back = -entry.effect.total_change(found.nominal.profile, model.profile)
             terms: Sequence[Term] = [term for term in model.terms if term.name != name]
             model = replace(model, profile=entry.effect.term.change(model.profile, back), terms=tuple(terms))
-        forms = tuple(form.about(model.profile) for form in self.forms)
+        names = frozenset(term.name for term in model.terms)
+        forms = tuple(form.about(model.profile, names) for form in self.forms)
         for old, new in zip(self.forms, forms, strict=True):
             if old is not new:
                 less = _without_form(model, old)
                 model = replace(less, terms=(*less.terms, new.term))
         return _Description(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
+
+
+def _step(
+    evidence: Evidence, found: GeometricVerdict, state: _Description, asked: _Asked, fitted: TrackFit
+) -> tuple[_Asked, _Entered, _Description] | None:
+    """A form that was asked for, in the model, and all that stays beside it; None where it gains nothing."""
+    entered = _entered(evidence, state.model, asked, fitted)
+    if entered is None:
+        return None
+    more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
+    after = _without_stand_ins(evidence, found, more)
+    small = asked.selection is not None and asked.selection.size * evidence.typical_px < MIN_SIZE_PX
+    return None if small and len(after.accepted) == len(state.accepted) else (asked, entered, after)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,75 +173,102 @@ class _Asked:
         return self.selection.rivals if self.selection else ()
 
 
-def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> list[_Asked]:
-    """The forms that the residuals of a model ask for, the one between two frames first, and how sure that is."""
+def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> Iterator[_Asked]:
+    """The forms that the residuals of a model ask for, and how sure that is.
+
+    Pairs of covariates, and curves over a few frames, come last and beside all that the plain forms can do.
+    """
     table = evidence.table(model, SEARCH_POINTS)
     fitted = fit_model(evidence.imu, model, model.terms, table)
     in_model = {term.name for term in model.terms}
-    seconds = fitted.seconds
-    forms = possible_forms(capture, fitted.profile, (float(seconds.min()), float(seconds.max())), frozenset(in_model))
-    forms = [form for form in forms if form.family not in in_model]
-    seen = point_residuals(evidence.imu, fitted, table)
+    span_s = float(fitted.seconds.min()), float(fitted.seconds.max())
+    alone = possible_forms(capture, fitted.profile, span_s, frozenset(in_model))
+    pairs = forms_of_pairs(capture, fitted.profile, span_s, frozenset(in_model))
     block = table.pair // PAIRS_IN_BLOCK
     if len(np.unique(block)) < MIN_BLOCKS:
-        return []
+        return
+    seen = point_residuals(evidence.imu, fitted, table)
     tangent = seen.tangent()
     if model.terms:
         tangent = np.concatenate([tangent, seen.effect(model.terms)], axis=-1)
     blind_s = FRAMES_PER_STEP * evidence.period_s
-    scored = _scored(seen, tangent, forms, block, blind_s)
-    for entry in scored:
-        log.debug(
-            "%s: p %.2g, gain %.4g (t %.1f), parts t %s",
-            entry.name,
-            entry.p_value,
-            entry.gain.sum() / (seen.weight * (seen.left**2).sum(axis=-1)).sum(),
-            t_ratio(entry.gain),
-            None if entry.parts_gain is None else round(t_ratio(entry.parts_gain), 1),
-        )
-    selection = select(scored, float(seen.weight.sum()))
-    asked: list[_Asked] = []
+    search = _Search(seen, block, blind_s, len(alone) + len(pairs))
+    forms = [form for form in alone if form.family not in in_model]
     if (sudden := sudden_change(seen)) is not None and not any(", a step" in name for name in in_model):
         form = best_instant(seen, capture, sudden.at_s, sudden.scale, evidence.period_s)
-        asked.append(_Asked(form, sudden=sudden))
-    if selection is None:
-        return asked
-    form = next(form for form in forms if form.name == selection.best.name)
-    if form.step_s is not None:
-        scale = lasting_change(seen, tangent, _effect(seen, form, blind_s))
-        form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
-    return [*asked, _Asked(form, selection)]
+        yield _Asked(form, sudden=sudden)
+    smooth = [form for form in forms if not form.local]
+    if (selection := search.best(tangent, smooth)) is not None:
+        form = smooth[selection.best.place]
+        if form.step_s is not None:
+            scale = lasting_change(seen, tangent, search.effect(form))
+            form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
+        yield _Asked(form, selection)
+    forms = [form for form in (*forms, *pairs) if form.local or (form.is_pair and form.family not in in_model)]
+    plain = {form.family: form for form in reversed(alone) if not form.local and form.step_s is None}
+    tangent = np.concatenate([tangent, *(search.effect(form) for form in plain.values())], axis=-1)
+    if (selection := search.best(tangent, forms)) is not None:
+        yield _Asked(forms[selection.best.place], selection)
+    elif sudden is not None:
+        # one that comes back: of a few frames, whose signs are too few for a test by flips
+        yield from (_Asked(form, sudden=sudden) for form in forms if form.local and form.kind == "scale")
 
 
-def _scored(
-    seen: PointResiduals, tangent: Array, forms: Sequence[FieldForm], block: Index, blind_s: float
-) -> list[Scored]:
-    """Scores of forms, best gain first; of the forms of one field the best alone.
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Residuals, and how forms are asked for."""
 
-    blind_s: how near to a sudden change points are not asked.  Between two frames it moves them by many times their
-    noise, so that an instant that is a frame off would be ruled out by the points that tell it best.
-    """
-    sudden = [form for form in forms if form.step_s is not None]
-    best: dict[str, Scored] = {}
-    for group in ([form for form in forms if form.step_s is None], sudden):
-        designs = [(form.name, _effect(seen, form, blind_s), form.over_time) for form in group]
-        family = {form.name: form.family for form in group}
-        for entry in score_forms(seen.left, seen.weight, tangent, designs, block, seen.table.pair):
-            known = best.get(family[entry.name])
-            if known is None or entry.gain.sum() > known.gain.sum():
-                best[family[entry.name]] = entry
-    return sorted(best.values(), key=lambda entry: -float(entry.gain.sum()))
+    seen: PointResiduals
+    block: Index
+    blind_s: float
+    """How near to a sudden change points are not asked.  Between two frames it moves them by many times their noise, so
+    that an instant that is a frame off would be ruled out by the points that tell it best."""
+    asked: int
+    """How many forms are asked for in all."""
 
+    def best(self, tangent: Array, forms: Sequence[FieldForm]) -> Selection | None:
+        """The form that residuals ask for beside a tangent space (n, 2, m), if any."""
+        return select(self.scored(tangent, forms), float(self.seen.weight.sum()))
 
-def _effect(seen: PointResiduals, form: FieldForm, blind_s: float) -> Array:
-    effect = seen.effect((form.term,))
-    if form.step_s is not None and blind_s:
-        profile, table = seen.fit.profile, seen.table
-        lasting_s = profile.shutter.readout_time_s + table.second_exposure_s
-        begin_s, end_s = (np.asarray(profile.imu_time_s(t)) for t in (table.first_stamp_s, table.second_stamp_s))
-        near = (begin_s - blind_s < form.step_s) & (form.step_s < end_s + lasting_s + blind_s)
-        effect[near] = 0.0
-    return effect
+    def scored(self, tangent: Array, forms: Sequence[FieldForm]) -> list[Scored]:
+        """Scores of forms, best gain first; of the forms of one field the best alone."""
+        designs = [Design(form.name, self.effect(form), form.over_time, form.local) for form in forms]
+        best: dict[str, Scored] = {}
+
+        def worth(entry: Scored) -> tuple[bool, float]:
+            return entry.significant, float(entry.gain.sum())
+
+        seen = self.seen
+        for entry in score_forms(
+            seen.left, seen.weight, tangent, designs, self.block, seen.table.pair, asked=self.asked
+        ):
+            family = forms[entry.place].family
+            if family not in best or worth(entry) > worth(best[family]):
+                best[family] = entry
+        whole = seen.weight * (seen.left**2).sum(axis=-1)
+        for entry in best.values():
+            log.debug(
+                "%s, %d numbers: p %.2g, gain %.4g (t %.1f), parts t %s",
+                entry.name,
+                entry.numbers,
+                entry.p_value,
+                entry.gain.sum() / whole.sum(),
+                t_ratio(entry.gain),
+                None if entry.parts_gain is None else round(t_ratio(entry.parts_gain), 1),
+            )
+        return sorted(best.values(), key=lambda entry: -float(entry.gain.sum()))
+
+    def effect(self, form: FieldForm) -> Array:
+        """Whitened change (n, 2, k) of the points per number of a form."""
+        seen = self.seen
+        effect = seen.effect((form.term,))
+        if form.step_s is not None and self.blind_s:
+            profile, table = seen.fit.profile, seen.table
+            lasting_s = profile.shutter.readout_time_s + table.second_exposure_s
+            begin_s, end_s = (np.asarray(profile.imu_time_s(t)) for t in (table.first_stamp_s, table.second_stamp_s))
+            near = (begin_s - self.blind_s < form.step_s) & (form.step_s < end_s + lasting_s + self.blind_s)
+            effect[near] = 0.0
+        return effect
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,17 +283,17 @@ class _Entered:
 
 def _entered(evidence: Evidence, model: Model, asked: _Asked, fitted: TrackFit) -> _Entered | None:
     """The model with a form in it, with as many knots as pay; None where held-out blocks do not gain."""
-    form, wanted = asked.form, MIN_LOCAL_T if asked.form.over_time else MIN_T
+    form = asked.form
     extended = replace(model, terms=(*model.terms, form.term))
-    before, after = (_held_out(evidence, m, fitted) for m in (model, extended))
+    before, after = (_held_out(evidence, m, fitted, form.local) for m in (model, extended))
     gain = before.block_loss - after.block_loss
     log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
-    holds = t_ratio(gain) > wanted
-    if asked.sudden is not None:
+    holds = t_ratio(gain) > (MIN_LOCAL_T if form.over_time and not form.local else MIN_T)
+    if asked.sudden is not None and not form.local:
         # most of the gain lies in one block; that of the others tells the change, and it must hold there
         there = asked.sudden.pair // PAIRS_IN_BLOCK
         holds = bool(gain[there] > LASTING_PART * before.block_loss[there])
-    if gain.mean() < MIN_GAIN * before.block_loss.mean() or not holds:
+    if gain.mean() < MIN_GAIN * before.block_loss.mean() or after.rms > before.rms or not holds:
         return None
     return _refined(evidence, model, _Entered(extended, form, before, after), fitted)
 
@@ -255,17 +302,23 @@ def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackF
     """The same with twice the knots, as often as held-out points gain.
 
     A form over time is judged on other points of the frames that it was fitted to: fine knots lie as close as blocks.
+    Where twice the knots gain nothing over time or rows, four times as many may: of what goes to and fro between two.
     """
     by_point = entered.form.over_time
     last = _held_out(evidence, entered.model, fitted, by_point) if by_point else entered.after
-    while (finer := entered.form.finer) is not None:
+    names = frozenset(term.name for term in model.terms)
+    finer, failed = entered.form.finer(model.profile, names), False
+    while finer is not None:
         extended = replace(model, terms=(*model.terms, finer.term))
         after = _held_out(evidence, extended, fitted, by_point)
         gain = last.block_loss - after.block_loss
         log.debug("%d knots: %.4f to %.4f, t %.1f", len(finer.basis), last.rms, after.rms, t_ratio(gain))
-        if gain.mean() < MIN_GAIN * last.block_loss.mean() or t_ratio(gain) < MIN_T:
+        gains = gain.mean() > MIN_GAIN * last.block_loss.mean() and t_ratio(gain) > MIN_T
+        if gains:
+            entered, last = _Entered(extended, finer, entered.before, after), after
+        elif failed or finer.kind == "displacement":
             break
-        entered, last = _Entered(extended, finer, entered.before, after), after
+        finer, failed = finer.finer(model.profile, names), not gains
     return entered
 
 
@@ -289,12 +342,11 @@ def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool
     for number in (0, 1):
         part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number))
         left[fold != number] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[fold != number]
-    counts = np.maximum(np.bincount(block), 1)
-    return HeldOut(np.bincount(block, loss(left, 1.0)) / counts, capped_rms(left))
+    return HeldOut(np.asarray(loss(left, 1.0)), None if by_point else block, capped_rms(left))
 
 
 def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Description) -> _Description:
-    """Let go of causes that are no longer significant, or of no use on held-out blocks, now that a field is in.
+    """Let go of causes that are of no use on held-out blocks, now that a field is in.
 
     Two that only compensate for each other, such as a turn and a principal point, are of use until both are gone.
     """
@@ -302,6 +354,11 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
         model = state.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, JUDGE_POINTS))
         state = replace(state, model=replace(model, profile=fitted.profile, scene=fitted.scene))
+        if (form := _idle_form(evidence, state, fitted)) is not None:
+            log.debug("stood in for another form: %s", form.name)
+            kept = tuple(known for known in state.forms if known is not form)
+            state = replace(state, model=_without_form(state.model, form), forms=kept)
+            continue
         leaving = _stand_ins(evidence, found, state, fitted)
         if not leaving:
             return state
@@ -309,19 +366,24 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
         state = state.without(found, leaving)
 
 
+def _idle_form(evidence: Evidence, state: _Description, fitted: TrackFit) -> FieldForm | None:
+    """A form that the newest leaves nothing to say to, if any."""
+    less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
+    return next((form for form, model in less if not _useful(evidence, model, state, fitted)), None)
+
+
 def _stand_ins(
     evidence: Evidence, found: GeometricVerdict, state: _Description, fitted: TrackFit
 ) -> tuple[Accepted, ...]:
     """The cause, or the two, that a model can do without; nothing where it needs all."""
     fitting = [entry for entry in state.accepted if entry.effect is not None and entry.effect.term is not None]
-    if not fitting:
-        return ()
-    doubts = {entry.name: _doubt(evidence, found, fitted, entry) for entry in fitting}
-    weakest = max(fitting, key=lambda entry: doubts[entry.name])
-    if doubts[weakest.name] >= MAX_P:
-        return (weakest,)
-    for leaving in ((weakest,), *combinations(fitting, 2)):
-        if not _useful(evidence, state.without(found, leaving).model, state.model, fitted):
+    depth = [(entry,) for entry in state.accepted if entry.name == DEPTH]
+    weakest: list[tuple[Accepted, ...]] = []
+    if fitting:
+        doubts = {entry.name: _doubt(evidence, found, fitted, entry) for entry in fitting}
+        weakest = [(max(fitting, key=lambda entry: doubts[entry.name]),)]
+    for leaving in (*depth, *weakest, *combinations(fitting, 2)):
+        if not _useful(evidence, state.without(found, leaving).model, state, fitted):
             return leaving
     return ()
 
@@ -331,8 +393,11 @@ def _doubt(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry:
     return p_of(fitted, entry.effect, fitted.profile, found.nominal.profile, evidence.typical_px)
 
 
-def _useful(evidence: Evidence, less: Model, more: Model, fitted: TrackFit) -> bool:
-    """Whether held-out blocks are better off with a cause."""
-    before, after = (_held_out(evidence, m, fitted) for m in (less, more))
+def _useful(evidence: Evidence, less: Model, more: _Description, fitted: TrackFit) -> bool:
+    """Whether held-out blocks, or points where knots lie as close as blocks, are better off with a cause or a form."""
+    step_s = 2 * PAIRS_IN_BLOCK * evidence.period_s
+    by_point = any(form.is_dense(step_s) for form in more.forms)
+    before, after = (_held_out(evidence, m, fitted, by_point) for m in (less, more.model))
     gain = before.block_loss - after.block_loss
-    return bool(gain.mean() > MIN_GAIN * before.block_loss.mean() and t_ratio(gain) > MIN_T)
+    part = float(gain.mean() / before.block_loss.mean())
+    return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)

@@ -14,7 +14,8 @@ from scipy import stats
 
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals
-from virest.diagnosis.field.forms import FieldForm, step_forms
+from virest.diagnosis.field.form_list import step_forms
+from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
 
 Array = NDArray[np.float64]

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.field import FORCES, Field
+from virest.camera.field import FORCES, RATES, Field
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.field.forms import FORCE_REACH_M_S2, STEP_EDGE_S
+from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
 from virest.diagnosis.field.stretches import axis_names
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
@@ -31,6 +31,7 @@ SHAPE_PART = 0.9
 """The same for a displacement over the picture."""
 OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
 SAMPLES = 101
+STUCK_PART = 0.5
 INERTIAL = "inertial_rows"
 
 
@@ -72,14 +73,34 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "film a still board while focusing to and fro: a breathing lens comes back, a warm one does not",
     ),
     ("rate", ("rate",)): Pattern(
-        "the gyroscope's error depends on its rate, {shape}: up to {size} are missing at high rates",
-        "a sensor that saturates softly, or a filter in the phone that bounds fast turns",
+        "the gyroscope's error depends on its rate, {shape}: up to {size} are missing {rates}",
+        "a sensor that saturates softly or sticks near rest, or a filter in the phone that bounds fast or small turns",
         "turn the phone on a table at several speeds and compare the log with the angle turned",
     ),
     ("rate", ("acceleration",)): Pattern(
         "the gyroscope reads a rate in proportion to the acceleration, {size} per m/s²: it is sensitive to g",
         "a micromechanical gyroscope's mass moves under gravity and shocks",
         "log the phone at rest on each of its six sides: the rates differ by 2 g times the sensitivity",
+    ),
+    ("delay", ("row", "time")): Pattern(
+        "rows are {lateness} by up to {size} in some frames and not in others, {shape}: the readout changes as it runs",
+        "a sensor that changes its mode or clock while it films, or a picture that is cropped and scaled as it goes",
+        "film a lamp that flickers at a known rate: its bands grow closer where the readout takes longer",
+    ),
+    ("scale", ("radius", "time")): Pattern(
+        "the lens draws up to {size} longer outwards at some times and not at others, {shape}: its distortion changes",
+        "a lens that warms up or refocuses without logging it, or a phone that corrects distortion frame by frame",
+        "film a still board for a minute, once with the focus locked: a distortion that then stays is the focus's",
+    ),
+    ("scale", ("radius", "focus")): Pattern(
+        "the lens draws up to {size} longer outwards as it focuses, {shape}: its distortion changes with the focus",
+        "focusing moves lens elements, and distortion moves along",
+        "calibrate the lens with a board at several focus distances",
+    ),
+    ("rate", ("rate", "time")): Pattern(
+        "the gyroscope's scale changes over the capture, {shape}: up to {size} are missing at its highest rates",
+        "a sensor that warms up or changes its range, or a phone that corrects its scale while it logs",
+        "turn the phone on a table by a known angle, again and again from a cold start",
     ),
     ("rate", ("time",)): Pattern(
         "the gyroscope's bias changes by up to {size} over the capture",
@@ -101,7 +122,12 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     factor, unit = UNIT_SCALES[form.kind]
     said = f"{size * factor:.3g} {unit}"
     sentence = pattern.sentence.format(
-        size=said, shape=shape, where=_where(fields[0]), lateness=_lateness(fields[0]), lens=lens_words(shape)
+        size=said,
+        shape=shape,
+        where=_where(fields[0]),
+        lateness=_lateness(fields[0]),
+        lens=lens_words(shape),
+        rates=_at_rates(fields[0]),
     )
     rms = f" (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out)"
     beside = f"; in this capture {' and '.join(entry.rivals)} would explain it as well" if entry.rivals else ""
@@ -175,11 +201,28 @@ def shape_of(field: Field) -> str:
     """What the values do along one covariate, or over the picture."""
     if field.covariates == ("x", "y"):
         return _shape_over_picture(field)
+    if len(field.covariates) > 1:
+        first, second = (np.linspace(k[0], k[-1], SAMPLES) for k in field.knots)
+        return shape_of_pair(field.at(first[:, None], second[None, :]), field.covariates)
     if is_sudden(field):
         return "a step"
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     values = field.at(along)
-    return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates == ("time",))
+    return curve_shape(values[:, int(np.argmax(np.ptp(values, axis=0)))], field.covariates[0])
+
+
+def shape_of_pair(values: Array, names: tuple[str, ...]) -> str:
+    """What values (SAMPLES, SAMPLES, components) at even steps of two covariates do along each of them.
+
+    That is said of the product of two curves that is nearest to them.
+    """
+    part = values[..., int(np.argmax(np.ptp(values, axis=(0, 1))))]
+    along, sizes, over = np.linalg.svd(part, full_matrices=False)
+    if sizes[0] ** 2 < ALIKE * float((sizes**2).sum()):
+        return f"no product of curves of the {' and the '.join(SENSORS.get(n, n) for n in names)}"
+    curves = zip((along[:, 0], over[0]), names, strict=True)
+    each = (f"{curve_shape(c, n)} of the {SENSORS.get(n, n)}" for c, n in curves)
+    return " times ".join(each)
 
 
 def is_sudden(field: Field) -> bool:
@@ -187,16 +230,16 @@ def is_sudden(field: Field) -> bool:
     return field.covariates == ("time",) and field.knots[0][-1] - field.knots[0][0] < 2 * STEP_EDGE_S
 
 
-def curve_shape(curve: Array, over_time: bool = False) -> str:
+def curve_shape(curve: Array, covariate: str = "") -> str:
     """What a curve (SAMPLES,) at even steps of its covariate does."""
-    u = np.linspace(-1, 1, SAMPLES)
+    u, over_time = np.linspace(-1, 1, SAMPLES), covariate == "time"
     if not float(np.var(curve)):
         return "nothing"
     if _unexplained(curve, [u]) < 1 - ALIKE:
         return "a straight line"
     if not over_time and _is_step(curve):
         return "a step"
-    if not over_time and _is_sawtooth(curve, u):
+    if covariate == "row" and _is_sawtooth(curve, u):
         return "even blocks with a jump between them"
     if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
         rises, falls = (float(np.clip(way * np.diff(curve), 0, None).sum()) for way in (1, -1))
@@ -310,6 +353,16 @@ def _where(field: Field) -> str:
     return (
         "in the middle" if 1 / 3 <= place <= 2 / 3 else "in the first third" if place < 1 / 3 else "in the last third"
     )
+
+
+def _at_rates(field: Field) -> str:
+    """Where along a rate an error begins: at a quarter of the reach one that grows with rates is next to nothing."""
+    if field.covariates[0] not in RATES or len(field.covariates) > 1:
+        return ""
+    along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+    size = np.linalg.norm(field.at(along), axis=1)
+    early = float(size[np.abs(along) < 0.25 * along[-1]].max())
+    return "already near rest: it sticks there" if early > STUCK_PART * float(size.max()) else "at high rates"
 
 
 def _lateness(field: Field) -> str:

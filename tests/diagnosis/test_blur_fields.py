@@ -1,0 +1,106 @@
+"""Fields of blur, from widths of edges that were never measured: what is added comes back, and nothing else does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from virest.camera.field import Field
+from virest.camera.intrinsics import Intrinsics
+from virest.camera.profile import CameraProfile
+from virest.camera.shutter import Shutter
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Capture, CaptureMetadata, Frame
+from virest.diagnosis.field.blur import blur_field
+from virest.diagnosis.local_blur import LENS_SIGMA_PX, BlurObservations
+from virest.diagnosis.local_blur_edges import EdgeWidths
+from virest.diagnosis.local_blur_spectra import join_ratios
+from virest.errors import SettingsError
+from virest.image_formation.row_motion import row_motion
+from virest.motion.integration import integrate_gyro
+
+Array = NDArray[np.float64]
+CAMERA = CameraProfile(
+    640, 480, intrinsics=Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0), shutter=Shutter(0.02), time_offset_s=0.0
+)
+STILL = ImuSamples(np.arange(-0.5, 3.5, 0.01), np.zeros((400, 3)), np.zeros((400, 3)))
+FRAMES, EACH = 40, 40
+
+
+def focus_dioptres(time_s: Array) -> Array:
+    """There and back."""
+    return 0.5 + 2 * np.exp(-(((time_s - 1.3) / 0.4) ** 2))
+
+
+def seen(added_px: Array | float, seed: int = 5) -> tuple[BlurObservations, Capture]:
+    """Widths with a Gaussian of this size on top, and the log beside them."""
+    rng = np.random.default_rng(seed)
+    count = FRAMES * EACH
+    frame = np.repeat(np.arange(FRAMES), EACH)
+    turn = rng.uniform(0, 2 * np.pi, count)
+    width = np.sqrt(LENS_SIGMA_PX**2 + np.broadcast_to(added_px, count) ** 2) * np.exp(rng.normal(0, 0.12, count))
+    edges = EdgeWidths(
+        frame, STAMPS[frame], np.full(count, 0.004), PLACES, np.stack([np.cos(turn), np.sin(turn)], -1),
+        width, 0.05 * width, rng.uniform(20, 90, count), rng.uniform(0.2, 0.8, count), candidates=20 * count,
+    )  # fmt: skip
+    logged = tuple(Frame(k, 0, float(t), 0.004, focus_dioptres=float(focus_dioptres(t))) for k, t in enumerate(STAMPS))
+    nowhere = Path("nowhere")
+    capture = Capture("edges", nowhere, nowhere, 640, 480, logged, STILL, CaptureMetadata(), "REALTIME", 0)
+    return BlurObservations(edges, join_ratios([]), 20 * count, count), capture
+
+
+STAMPS = np.arange(FRAMES) / 15
+PLACES = np.random.default_rng(3).uniform(5, (635, 475), (FRAMES * EACH, 2))
+RADIUS = np.linalg.norm(PLACES - (320, 240), axis=-1)
+WHEN = np.repeat(STAMPS, EACH)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_of_one_width_have_no_field(seed: int) -> None:
+    """No false alarm: none from an even defocus, and none from what a lens and an encoder do to corners."""
+    for added in (0.0, 1.2, 0.5 * (RADIUS / 350) ** 2):
+        observations, capture = seen(added, seed)
+        assert blur_field(observations, CAMERA, integrate_gyro(STILL, CAMERA), capture) is None
+
+
+def test_corners_that_are_soft_are_a_field_over_the_radius_that_no_profile_takes() -> None:
+    """It is described; the forward model has one defocus for the whole picture."""
+    observations, capture = seen(1.5 * (RADIUS / 350) ** 2)
+    found = blur_field(observations, CAMERA, integrate_gyro(STILL, CAMERA), capture)
+    assert found is not None
+    finding, profile = found
+    assert (finding.kind, finding.covariates) == ("blur", ("radius",))
+    assert finding.size == pytest.approx(1.5 * (finding.fields[0].knots[0][-1] / 350) ** 2, rel=0.15)
+    assert finding.held_out.after < 0.8 * finding.held_out.before
+    assert "process does not follow it" in finding.sentence
+    assert profile == CAMERA
+    with pytest.raises(SettingsError, match="blur over the radius"):
+        CAMERA.with_fields(finding.fields)
+
+
+def test_a_focus_that_moves_is_a_field_that_each_frame_follows() -> None:
+    """A few soft frames are told, with the log of the focus as their rival or cause; kernels of a frame have it."""
+    soft = 2.0 * (focus_dioptres(WHEN) - 0.5) / 2
+    observations, capture = seen(soft)
+    trajectory = integrate_gyro(STILL, CAMERA)
+    for logged in (capture, replace(capture, frames=tuple(replace(f, focus_dioptres=None) for f in capture.frames))):
+        found = blur_field(observations, CAMERA, trajectory, logged)
+        assert found is not None
+        finding, profile = found
+        assert finding.size == pytest.approx(2.0, rel=0.2)
+        sharp, wide = (row_motion(trajectory, profile, t, 0.004).profile.extensions for t in (0.1, 1.33))
+        assert sharp.defocus_sigma_px < 0.5
+        assert wide.defocus_sigma_px == pytest.approx(2.0, rel=0.2)
+    assert finding.covariates == ("time",)
+
+
+def test_a_blur_comes_on_top_of_an_even_defocus() -> None:
+    """Variances add up."""
+    blur = Field("blur", ("time",), ((0.0, 1.0),), ((0.0,), (2.0,)), (), 0)
+    even = replace(CAMERA, extensions=replace(CAMERA.extensions, defocus_sigma_px=1.5))
+    motion = row_motion(integrate_gyro(STILL, CAMERA), even.with_fields([blur]), 1.0, 0.004)
+    assert motion.profile.extensions.defocus_sigma_px == pytest.approx(2.5)

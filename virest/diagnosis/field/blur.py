@@ -1,0 +1,242 @@
+"""Fields of blur: edges that are wider in some places or at some times than path, lens and an even defocus make them.
+
+Variances of blurs that follow each other add up, so what the widths of isolated edges leave over is regressed on an
+added variance along the distance from the principal point, time, and the logged focus distance, beside an even defocus,
+a longer path, and what contrast and brightness do to a measured width.  What lies in the scene is not the lens's: over
+the radius the pictures' cells err together and whole quarters are left out; over time each cell has its own width.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from virest.camera.field import Field, cardinal_weights
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture
+from virest.diagnosis.field.screening import Design, Scored, score_forms, t_ratio
+from virest.diagnosis.field.words import SAMPLES, curve_shape
+from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
+from virest.diagnosis.local_blur import LENS_SIGMA_PX, LENS_STD_PX, BlurObservations, predicted_blur
+from virest.diagnosis.local_blur_model import fitted_width
+from virest.inference.robust import CAUCHY
+from virest.motion.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+CELLS_ROUND, CELLS_OUT, CELLS = 12, 3, 5
+"""Cells that err together: sectors and rings about the middle; and squares each way, whose widths are compared."""
+RADIUS_KNOTS, FOCUS_KNOTS, TIME_STEP_S, LEAST_TIMES, MOST_TIMES = 4, 4, 0.2, 5, 24
+MIN_SIZE_PX = float(np.sqrt((LENS_SIGMA_PX + 3 * LENS_STD_PX) ** 2 - LENS_SIGMA_PX**2))
+"""Standard deviation (0.83 px) of the added Gaussian: edges are wider by three deviations of what coding makes of them.
+On 41 simulated captures without such a blur the largest was 0.50 px."""
+LEAST_EDGES, LEAST_CHANGE = 300, 0.05
+RIDGE, MIN_GAIN = 1e-3, 0.02
+CAP, BOUND, LEAST_WIDTH_PX, _STEPS = 10.0, 3.0, 0.2, 12
+"""Deviations at which what is left is capped, and at which one edge counts no more; no edge is sharper than that."""
+FOLLOWED = ("time", "focus")
+"""Along which `process` can follow a blur: one width a frame."""
+SENTENCES = {
+    "radius": "pictures are softer by up to {size} px away from the principal point, {shape} of the distance; process "
+    "does not follow it",
+    "time": "pictures are softer by up to {size} px at some times, {shape} of time: the focus moves",
+    "focus": "pictures are softer by up to {size} px at some logged focus distances, {shape}: the focus misses",
+}
+REASONS = {
+    "radius": "field curvature or a lens that is soft towards its edges, a lens element that is tilted, or dirt",
+    "time": "an autofocus that hunts, or things that come nearer than the focus",
+    "focus": "an autofocus that moves on its way to the distance, or a log that is late",
+}
+NEXT = {
+    "radius": "film a page of print that fills the frame, in focus in the middle, then in a corner",
+    "time": "film the same with the focus locked",
+    "focus": "film a page of print while the focus is moved by hand from stop to stop",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    covariate: str
+    knots: Array
+    weights: Array
+    """(n, knots) of each edge."""
+    block: Index
+    """(n,) what errs together, rising in the order that parts are cut in."""
+    nuisance: Array
+    """(n, m) beside what all forms allow for."""
+    logged: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Edges:
+    """Widths of edges, and what an even blur makes of them."""
+
+    width_px: Array
+    """(n,) as measured."""
+    even_px: Array
+    """(n,) by path, lens and an even defocus."""
+    common: Array
+    """(n, m) added variance per unit of what every form allows for."""
+    scale_px: float
+    """Robust standard deviation of what is left."""
+
+    def fitted(self, form: _Form, rows: Index | None = None, free: bool = True) -> tuple[Array, Array, Array]:
+        """Added variance (knots,), px², about its mean, its covariance, and what is left of all edges (n,), px.
+
+        Gauss-Newton with Cauchy weights, on some rows.  free: False keeps the form at nought.
+        """
+        rows = np.arange(len(self.width_px)) if rows is None else rows
+        own = form.weights - form.weights.mean(axis=0)
+        columns = np.concatenate([own if free else own[:, :0], self.common, form.nuisance], axis=1)
+        numbers: Array = np.zeros(columns.shape[1])
+        inverse: Array = np.eye(len(numbers))
+        pull: Array = np.zeros((len(rows), len(numbers)))
+        for _ in range(_STEPS):
+            width = self._widths(columns @ numbers)
+            left = self.width_px - width
+            weight = 1 / (1 + (left[rows] / (CAUCHY * self.scale_px)) ** 2) / self.scale_px**2
+            slope = columns[rows] * (0.5 / width[rows])[:, None]
+            normal = (slope * weight[:, None]).T @ slope
+            inverse = np.asarray(np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9))), float)
+            pull = slope * (weight * left[rows])[:, None]
+            numbers = numbers + inverse @ pull.sum(axis=0)
+        count = own.shape[1] if free else 0
+        sums = np.stack([np.bincount(form.block[rows], column) for column in pull.T], axis=-1)
+        covariance = (inverse @ (sums.T @ sums) @ inverse)[:count, :count]
+        return numbers[:count], covariance, self.width_px - self._widths(columns @ numbers)
+
+    def _widths(self, added: Array) -> Array:
+        return np.sqrt(np.maximum(self.even_px**2 + added, LEAST_WIDTH_PX**2))
+
+    def held_out(self, form: _Form, free: bool) -> float:
+        """Capped rms of widths in blocks that a fit to the others did not see, px."""
+        left = np.zeros(len(self.width_px))
+        for fold in (0, 1):
+            inside = np.flatnonzero(form.block % 2 == fold)
+            left[form.block % 2 != fold] = self.fitted(form, inside, free)[2][form.block % 2 != fold]
+        return float(np.sqrt(np.mean(np.minimum(np.abs(left), CAP * self.scale_px) ** 2)))
+
+
+def blur_field(
+    seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory, capture: Capture
+) -> tuple[FieldFinding, CameraProfile] | None:
+    """The field of blur that edges ask for, and the profile with it; None where they ask for none."""
+    widths = seen.edges
+    if len(widths) < LEAST_EDGES or not seen.edges_determined or profile.intrinsics is None:
+        return None
+    motion_px = predicted_blur(seen, profile, trajectory).motion_px
+    even_px = fitted_width(motion_px, profile.extensions.defocus_sigma_px, LENS_SIGMA_PX)
+    left = widths.width_px - even_px
+    scale = max(1.4826 * float(np.median(np.abs(left - np.median(left)))), 1e-6)
+    common = np.stack([np.ones_like(left), motion_px**2, 1 / widths.step_levels, widths.brightness], axis=-1)
+    edges = _Edges(widths.width_px, even_px, common, scale)
+    forms = list(_forms(seen, profile, capture))
+    found = [(scored, form) for form in forms if (scored := _asked(edges, form, len(forms))) is not None]
+    if not found:
+        return None
+    scored, form = max(found, key=lambda pair: float(pair[0].gain.sum()))
+    variance, covariance, _ = edges.fitted(form)
+    sigma = np.sqrt(variance - variance.min())
+    held = HeldOutGain(BLUR, edges.held_out(form, free=False), edges.held_out(form, free=True), None)
+    if sigma.max() < MIN_SIZE_PX or held.after > (1 - MIN_GAIN) * held.before:
+        return None
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / (2 * np.maximum(sigma, MIN_SIZE_PX))
+    stamp = capture.stamp_0_ns if form.covariate == "time" else None
+    rows = [tuple((float(value),) for value in column) for column in (sigma, std)]
+    field = Field("blur", (form.covariate,), (tuple(form.knots.tolist()),), rows[0], rows[1], stamp, form.logged)
+    rivals = tuple(f"blur over {other.covariate}" for one, other in found if _alike(scored, one) and other is not form)
+    return _said(field, held, scored.p_value, rivals), _with(profile, field, float(variance.min()))
+
+
+def _asked(edges: _Edges, form: _Form, forms: int) -> Scored | None:
+    """How strongly edges ask for a form; None where chance or other blocks do not bear it out."""
+    order = np.argsort(form.block, kind="stable")
+    slope = 0.5 / edges.even_px / edges.scale_px
+    left = (edges.width_px - edges.even_px) / edges.scale_px
+    left = left - np.median(left)
+    weight = 1 / (1 + (left / CAUCHY) ** 2)
+    tangent = np.concatenate([edges.common, form.nuisance], axis=1) * slope[:, None]
+    over_time = form.covariate != "radius"
+    design = Design(form.covariate, (form.weights * slope[:, None])[order, None], over_time)
+    (scored, *_) = score_forms(
+        left[order, None], weight[order], tangent[order, None], [design], form.block[order], asked=forms
+    ) or (None,)
+    if scored is None:
+        return None
+    if over_time:
+        scored = replace(scored, p_value=min(1.0, 2 * scored.p_value, 2 * forms * _outstanding(left, form.block)))
+    log.debug("blur over %s: p %.2g, t %.1f", form.covariate, scored.p_value, t_ratio(scored.gain))
+    return scored if scored.significant else None
+
+
+def _outstanding(left: Array, block: Index) -> float:
+    """Probability of any frame standing out so far by chance: a few frames have too few signs for a test by flips."""
+    bounded = np.clip(left, -BOUND, BOUND)
+    count = np.maximum(np.bincount(block), 1)
+    mean = np.bincount(block, bounded - np.median(bounded)) / np.sqrt(count)
+    spread = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), float(bounded.std()))
+    most = float(np.abs(mean - np.median(mean)).max()) / max(spread, 1e-9)
+    return min(1.0, 2 * len(count) * float(stats.t.sf(most, len(count) - 1)))
+
+
+def _alike(best: Scored, other: Scored) -> bool:
+    return float(other.gain.sum()) > 0.9 * float(best.gain.sum())
+
+
+def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> Iterator[_Form]:
+    edges, lens = seen.edges, profile.intrinsics
+    assert lens is not None
+    arm = edges.points_px - np.array([lens.cx_px, lens.cy_px])
+    radius = np.linalg.norm(arm, axis=-1)
+    knots = np.linspace(0, float(np.quantile(radius, 0.995)), RADIUS_KNOTS)
+    sector = ((np.arctan2(arm[:, 1], arm[:, 0]) / (2 * np.pi) + 0.5) * CELLS_ROUND).astype(np.intp) % CELLS_ROUND
+    ring = np.minimum((radius / knots[-1] * CELLS_OUT).astype(np.intp), CELLS_OUT - 1)
+    none = np.zeros((len(edges), 0))
+    yield _Form("radius", knots, cardinal_weights(tuple(knots), radius, 1), sector * CELLS_OUT + ring, none)
+    frame = np.unique(edges.frame, return_inverse=True)[1]
+    size = np.array([profile.width, profile.height])
+    cell = (np.clip(edges.points_px / size, 0, 0.999) * CELLS).astype(np.intp) @ np.array([CELLS, 1])
+    own = (cell[:, None] == np.unique(cell)[None, :]).astype(float)
+    first, last = float(edges.stamp_s.min()), float(edges.stamp_s.max())
+    count = int(np.clip(round((last - first) / TIME_STEP_S) + 1, LEAST_TIMES, MOST_TIMES))
+    knots = np.linspace(first, last, count)
+    yield _Form("time", knots, cardinal_weights(tuple(knots), edges.stamp_s, 1), frame, own)
+    log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
+    values = np.array([value for _, value in log], float)
+    if len(log) > 0.5 * len(capture.frames) and np.ptp(values) > LEAST_CHANGE:
+        times = np.array([time_s for time_s, _ in log])
+        knots = np.linspace(values.min(), values.max(), FOCUS_KNOTS)
+        weights = cardinal_weights(tuple(knots), np.interp(edges.stamp_s, times, values), 1)
+        yield _Form("focus", knots, weights, frame, own, (tuple(times.tolist()), tuple(values.tolist())))
+
+
+def _with(profile: CameraProfile, field: Field, lowest: float) -> CameraProfile:
+    """The profile with a field that can be followed; the even defocus is that of the sharpest frames then."""
+    if field.covariates[0] not in FOLLOWED:
+        return profile
+    even = float(np.sqrt(max(profile.extensions.defocus_sigma_px**2 + lowest, 0.0)))
+    even = even if profile.extensions.defocus_sigma_px else 0.0
+    return replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=even)).with_fields(
+        [*profile.fields, field]
+    )
+
+
+def _said(field: Field, held: HeldOutGain, p_value: float, rivals: tuple[str, ...]) -> FieldFinding:
+    """In words."""
+    (name,), values = field.covariates, np.array(field.values)[:, 0]
+    along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
+    shape = curve_shape(field.at(along)[:, 0], name)
+    place = int(np.argmax(values))
+    size = float(values[place])
+    rms = f"edges {held.before:.3g} px → {held.after:.3g} px, held out"
+    return FieldFinding(
+        (name,), "blur", shape, f"{SENTENCES[name].format(size=f'{size:.2g}', shape=shape)} ({rms})", size, "px",
+        field.std[place][0], held, p_value, rivals, None, REASONS[name], NEXT[name], (field,),
+    )  # fmt: skip

@@ -1,0 +1,290 @@
+"""Forms that are asked for: which covariates, which knots, and which values are left to the named causes.
+
+What a named cause says already is kept out by conditions on the values: a delay over rows is nought at the first and
+last row (offset and readout time), a displacement has neither value, scale nor turn at the principal point, and no
+cubic part (principal point, focal length, k1), a rate is nought and flat at rest (bias and scale).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, null_space
+
+from virest.camera.field import FORCES, KINDS, RATES, Field, cardinal_weights
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.capture.records import Capture
+from virest.diagnosis.field.forms import FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
+
+Array = NDArray[np.float64]
+ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
+FINE_ROW_KNOTS, FINE_PLACE_KNOTS, FINE_RATE_KNOTS = 21, 7, 13
+MOST_KNOTS, MOST_PLACE_KNOTS, MOST_RATE_KNOTS = 41, 10, 25
+PAIR_ROW_KNOTS, PAIR_RADIUS_KNOTS = 3, 3
+LEAST_TIMES, TIME_STEPS = 4, ((0.4, 12), (0.1, MOST_KNOTS))
+"""Seconds between knots over time and the most knots; three frames, for a focus hunts to and fro in half a second."""
+OFTEN = 0.97
+"""Fine knots over a rate reach as far as this part of the readings: beyond, few rows tell a value."""
+NEAR_REST = 3.0
+"""Fine knots over a rate lie by sinh: a twentieth of the reach apart at rest, where a hand is most of the time."""
+FRAMES_PER_STEP, MOST_STEPS = 2, 100
+"""How densely in time a sudden change is looked for."""
+LEAST_REACH_RAD_S = 0.1
+LEAST_FOCUS_CHANGE = 0.05
+"""In dioptres: less moves no lens by a pixel."""
+READOUTS = frozenset({"readout_time", f"delay{OVER}row"})
+LENSES = frozenset({"radial_distortion", f"displacement{OVER}x, y"})
+GYROS = frozenset({"gyro_scale", f"rate{OVER}rate"})
+"""Terms that say what of a pair does not change."""
+
+
+def possible_forms(
+    capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
+) -> list[FieldForm]:
+    """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock.
+
+    known: causes that are in the model and say what the forms need not.
+    """
+    knots, fine = (_times(span_s, step_s, most) for step_s, most in TIME_STEPS)
+    stamp = capture.stamp_0_ns
+    stamps, fine_stamps = (np.asarray(profile.camera_time_s(times)) for times in (knots, fine))
+    drifts = [_drift_form(kind, knots, stamp, known) for kind in ("scale", "rate")]
+    drifts += [_drift_form("delay", stamps, stamp, known), _drift_form("scale", fine, stamp, known, local=True)]
+    drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
+    forms = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), *drifts]
+    forms += step_forms(capture, coarse_steps_s(span_s, capture))
+    if profile.shutter.readout_time_s > 0:
+        forms += [_row_form(count) for count in (ROW_KNOTS, FINE_ROW_KNOTS)]
+    if (focus := _focus_form(capture)) is not None:
+        forms.append(focus)
+    forms += [_rate_form(capture.imu, profile), _fine_rate_form(capture.imu, profile, known)]
+    if capture.imu.has_accelerometer:
+        forms.append(_force_form())
+    return forms
+
+
+def forms_of_pairs(
+    capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
+) -> list[FieldForm]:
+    """What two covariates do together: tensor products of curves along each.
+
+    At the first row, at the principal point and at rest they are nought: what is there belongs to time or focus alone.
+    What does not change over time or focus is theirs, unless a cause or a field in the model (known) says it.
+    """
+    times = _rounded(_times(span_s, *TIME_STEPS[0]))
+    stamp, mean = capture.stamp_0_ns, np.ones((1, len(times)))
+    forms = []
+    if profile.shutter.readout_time_s > 0:
+        rows = np.linspace(0, 1, PAIR_ROW_KNOTS)
+        late = _zero("delay", ("row", TIME), [rows, np.asarray(profile.camera_time_s(times))], stamp)
+        forms.append(_product((late,), [np.eye(len(rows))[:, 1:]], mean, READOUTS, known))
+    radii = np.linspace(0, 0.5 * np.hypot(profile.width, profile.height), PAIR_RADIUS_KNOTS)
+    outwards = [np.eye(len(radii))[:, 1:]]
+    drawn = _zero("scale", ("radius", TIME), [radii, times], stamp)
+    forms.append(_product((drawn,), outwards, mean, LENSES, known))
+    if (focus := _focus_form(capture)) is not None:
+        ((dioptres,), log) = focus.fields[0].knots, focus.fields[0].log
+        assert log is not None
+        drawn = _zero("scale", ("radius", "focus"), [radii, np.array(dioptres)], None, log)
+        typical = cardinal_weights(dioptres, np.array(log[1])).mean(axis=0, keepdims=True)
+        forms.append(_product((drawn,), outwards, typical, LENSES, known))
+    reaches = [np.array([-reach, reach]) for reach in _reaches(capture.imu, profile)]
+    rates = tuple(_zero("rate", (name, TIME), [ends, times], stamp) for name, ends in zip(RATES, reaches, strict=True))
+    odd = [np.array([[-1.0], [1.0]]) / np.sqrt(2)] * 3
+    return [*forms, _product(rates, odd, mean, GYROS, known)]
+
+
+def _product(
+    fields: tuple[Field, ...], first: list[Array], mean: Array, steady: frozenset[str], known: frozenset[str]
+) -> FieldForm:
+    """first: what is free along the first covariate of each field; steady: terms that say what does not change.
+
+    Where one of those is known, the mean (1, knots) over the second covariate is nought.  Of three fields of a rate
+    each moves its own axis.
+    """
+    changing = null_space(mean) if known & steady else np.eye(mean.shape[1])
+    more = 2 * mean.shape[1] - 1
+    refine: Recipe | None = None
+    if fields[0].covariates[1] == TIME and more <= MOST_KNOTS:
+        finer = tuple(_with_times(field, more) for field in fields)
+        refine = lambda _profile, now: _product(finer, first, np.ones((1, more)), steady, now)  # noqa: E731
+    axes = np.eye(len(fields))
+    bases = [np.kron(np.kron(along, changing), axes[:, k : k + 1]) for k, along in enumerate(first)]
+    again: Recipe = lambda _profile, now: _product(fields, first, mean, steady, now)  # noqa: E731
+    return FieldForm(fields, np.asarray(block_diag(*bases)), build=again, refine=refine)
+
+
+def _with_times(field: Field, count: int) -> Field:
+    """The same over this many instants, nought everywhere."""
+    first, times = field.knots
+    return _zero(
+        field.kind, field.covariates, [np.array(first), np.linspace(times[0], times[-1], count)], field.stamp_0_ns
+    )
+
+
+def _reaches(imu: ImuSamples, profile: CameraProfile, part: float = 1.0) -> list[float]:
+    """Rate (three axes) that this part of the readings stays below, less bias and over scale."""
+    reading = (imu.gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    return [max(float(most), LEAST_REACH_RAD_S) for most in np.quantile(np.abs(reading), part, axis=0)]
+
+
+def _times(span_s: tuple[float, float], step_s: float, most: int) -> Array:
+    return np.linspace(*span_s, int(np.clip(round((span_s[1] - span_s[0]) / step_s) + 1, LEAST_TIMES, most)))
+
+
+def _rounded(knots: Array) -> Array:
+    return np.asarray(np.round(knots, 6))
+
+
+def _zero(
+    kind: str, covariates: tuple[str, ...], knots: Sequence[Array], stamp_0_ns: int | None = None, log: object = None
+) -> Field:
+    count = int(np.prod([len(k) for k in knots]))
+    rows = tuple(tuple(float(v) for v in _rounded(k)) for k in knots)
+    return Field(kind, covariates, rows, ((0.0,) * KINDS[kind][1],) * count, (), stamp_0_ns, log)  # type: ignore[arg-type]
+
+
+def _row_form(count: int) -> FieldForm:
+    field, more = _zero("delay", ("row",), [np.linspace(0, 1, count)]), 2 * count - 1
+    refine = (lambda _profile, _known: _row_form(more)) if more <= MOST_KNOTS else None
+    return FieldForm((field,), np.eye(count)[:, 1:-1], refine=refine)
+
+
+def _place_form(profile: CameraProfile, count: int) -> FieldForm:
+    """Nought at the principal point, with neither scale nor turn there, and orthogonal to a cubic radial part."""
+    lens = profile.intrinsics
+    assert lens is not None
+    knots = [np.linspace(0, side - 1, count) for side in (profile.width, profile.height)]
+    field = _zero("displacement", ("x", "y"), knots)
+    half = 0.5 * max(profile.width, profile.height)
+    x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
+    u, v = (x - lens.cx_px) / half, (y - lens.cy_px) / half
+
+    def weights(px: float, py: float) -> Array:
+        one, two = cardinal_weights(field.knots[0], px), cardinal_weights(field.knots[1], py)
+        return np.outer(one, two).ravel()
+
+    middle = weights(lens.cx_px, lens.cy_px)
+    per_x = weights(lens.cx_px + 1, lens.cy_px) - weights(lens.cx_px - 1, lens.cy_px)
+    per_y = weights(lens.cx_px, lens.cy_px + 1) - weights(lens.cx_px, lens.cy_px - 1)
+    nothing = np.zeros_like(middle)
+    cubic = u**2 + v**2
+    conditions = [(middle, nothing), (nothing, middle), (per_x, per_y), (per_y, -per_x), (cubic * u, cubic * v)]
+    rows = np.array([np.stack(pair, axis=-1).ravel() for pair in conditions])
+    free, more = null_space(rows / np.linalg.norm(rows, axis=1, keepdims=True)), count + PLACE_KNOTS - 1
+    refine = (lambda profile, _known: _place_form(profile, more)) if more <= MOST_PLACE_KNOTS else None
+    return FieldForm((field,), free, build=lambda profile, _known: _place_form(profile, count), refine=refine)
+
+
+def _drift_form(
+    kind: str, knots: Array, stamp_0_ns: int | None, known: frozenset[str], local: bool = False
+) -> FieldForm:
+    """Over time: a focal length from where it begins, rates about their mean (bias), a delay.
+
+    Where an offset or a skew of the clocks is in the model the delay has no mean or slope.
+    """
+    count, field = len(knots), _zero(kind, (TIME,), [knots], stamp_0_ns)
+
+    def again(knots: Array) -> Recipe:
+        return lambda _profile, now: _drift_form(kind, knots, stamp_0_ns, now, local)
+
+    free = np.eye(count)
+    if kind == "scale":
+        free = free[:, 1:]
+    elif kind == "rate":
+        free = np.kron(null_space(np.ones((1, count))), np.eye(3))
+    else:
+        line = {"time_offset": np.ones(count), "clock_skew": np.linspace(-1, 1, count)}
+        held = [row for name, row in line.items() if name in known]
+        free = null_space(np.stack(held)) if held else free
+    more = np.linspace(knots[0], knots[-1], 2 * count - 1)
+    refine = again(more) if len(more) <= (MOST_RATE_KNOTS if kind == "rate" else MOST_KNOTS) else None
+    return FieldForm((field,), free, local=local, build=again(knots), refine=refine)
+
+
+def step_forms(capture: Capture, at_s: Array) -> list[FieldForm]:
+    """A focal length that is another from one instant on, for each of some instants (n,)."""
+    edges = [np.array([t - STEP_EDGE_S / 2, t + STEP_EDGE_S / 2]) for t in at_s]
+    fields = [_zero("scale", (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
+    return [FieldForm((f,), np.array([[0.0], [1.0]]), float(t)) for f, t in zip(fields, at_s, strict=True)]
+
+
+def coarse_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
+    """Instants at which a sudden change is looked for."""
+    frames = sum(span_s[0] <= frame.time_s <= span_s[1] for frame in capture.frames)
+    return np.linspace(*span_s, min(frames // FRAMES_PER_STEP, MOST_STEPS) + 2)[1:-1]
+
+
+def _focus_form(capture: Capture) -> FieldForm | None:
+    """Over the logged focus distance, from where the capture begins."""
+    log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
+    values = np.array([value for _, value in log])
+    if len(log) < 0.5 * len(capture.frames) or np.ptp(values) < LEAST_FOCUS_CHANGE:
+        return None
+    knots: Array = np.unique(np.round(np.linspace(values.min(), values.max(), FOCUS_KNOTS), 6))
+    times = tuple(float(time_s) for time_s, _ in log)
+    field = _zero("scale", ("focus",), [knots], None, (times, tuple(values.tolist())))
+    return FieldForm((field,), null_space(cardinal_weights(field.knots[0], values[0])[None]))
+
+
+def _rate_form(imu: ImuSamples, profile: CameraProfile) -> FieldForm:
+    """Each axis over its own reading: nought and flat at rest."""
+
+    def conditions(knots: tuple[float, ...], reading: Array) -> Array:
+        least = 0.01 * knots[-1]
+        at, before, after = (cardinal_weights(knots, r) for r in (0.0, -least, least))
+        return np.stack([at, 50 * (after - before)])
+
+    return _over_rates(imu, profile, np.linspace(-1.0, 1.0, RATE_KNOTS), conditions)
+
+
+def _fine_rate_form(
+    imu: ImuSamples, profile: CameraProfile, known: frozenset[str], count: int = FINE_RATE_KNOTS
+) -> FieldForm:
+    """The same with more knots near rest, where a gyroscope may stick: flat nowhere.
+
+    Where a scale is in the model, a value in proportion to the log's readings is left to it.
+    """
+
+    def conditions(knots: tuple[float, ...], reading: Array) -> Array:
+        at = cardinal_weights(knots, 0.0)
+        mean = reading @ cardinal_weights(knots, reading) / float(reading @ reading)
+        return np.stack([at, mean] if "gyro_scale" in known else [at])
+
+    def again(count: int) -> Recipe:
+        return lambda _profile, now: _fine_rate_form(imu, profile, now, count)
+
+    steps = np.sinh(NEAR_REST * np.linspace(-1.0, 1.0, count)) / np.sinh(NEAR_REST)
+    more = 2 * count - 1
+    made = _over_rates(imu, profile, steps, conditions, OFTEN)
+    return replace(made, build=again(count), refine=again(more) if more <= MOST_RATE_KNOTS else None)
+
+
+def _over_rates(
+    imu: ImuSamples, profile: CameraProfile, steps: Array, conditions: Callable[[tuple[float, ...], Array], Array],
+    part: float = 1.0,
+) -> FieldForm:  # fmt: skip
+    """Each axis over its own reading; steps: knots as parts of how far a part of the readings reaches.
+
+    conditions: rows on the values there.
+    """
+    fields, bases = [], []
+    for axis, (name, reach) in enumerate(zip(RATES, _reaches(imu, profile, part), strict=True)):
+        reading = (imu.gyro_rad_s[:, axis] - profile.gyro_bias_rad_s[axis]) / profile.gyro_scale[axis]
+        field = _zero("rate", (name,), [steps * reach])
+        own = np.zeros((3, 1))
+        own[axis] = 1.0
+        fields.append(field)
+        bases.append(np.kron(null_space(conditions(field.knots[0], reading)), own))
+    return FieldForm(tuple(fields), block_diag(*bases))
+
+
+def _force_form() -> FieldForm:
+    """Rates in proportion to the specific force: three by three numbers, by the value at FORCE_REACH_M_S2."""
+    fields = tuple(_zero("rate", (name,), [np.array([-FORCE_REACH_M_S2, FORCE_REACH_M_S2])]) for name in FORCES)
+    odd = np.array([[-1.0], [1.0]]) / np.sqrt(2)
+    return FieldForm(fields, block_diag(*[np.kron(odd, np.eye(3))] * 3))
