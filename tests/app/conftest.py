@@ -23,7 +23,7 @@ def rates_rad_s(time_s: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 def write_movie(folder: Path) -> None:
     """Write what the profile's camera sees of a far texture while it turns so, with a key frame every 8."""
-    from virest.camera.profile import read_profile
+    from virest.camera.profile_file import read_profile
     from virest.simulation.exposure import expose, make_view
     from virest.simulation.recorded_motion import recorded_motion
     from virest.simulation.scenes import Scene
