@@ -33,7 +33,8 @@ from motion.synthetic_tracks import Recording, Setup
 from virest.diagnosis import candidates
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import make_evidence
-from virest.diagnosis.geometric_ladder import climb, findings_of
+from virest.diagnosis.geometric_findings import findings_of
+from virest.diagnosis.geometric_ladder import climb
 
 alike = ("time_offset", "timestamp_reference", "readout_time", "gyro_bias", "focal_length")
 candidates.GEOMETRIC_EFFECTS = tuple(effect for effect in GEOMETRIC_EFFECTS if effect.name in alike)
