@@ -300,3 +300,11 @@ def test_levels_are_asked_alike_of_all_evidence() -> None:
     assert [levels.gains(HeldOutGain(PHOTOMETRY, 2.0, after, 2.0)) for after in (1.94, 1.96)] == [True, False]
     asked = ((0.05, 0.0), (0.2, 0.009), (0.2, 0.02), (0.4, 0.02), (0.4, 0.06))
     assert [levels.holds(*one) for one in asked] == [False, True, False, True, False]
+
+
+@pytest.mark.parametrize(("name", "change"), [("exposure_time", 0.19), ("defocus", 1.0)])
+def test_blur_names_a_cause_by_the_probability_that_it_tells(name: str, change: float) -> None:
+    """Deviations come from the scatter of a few blocks: four of them are too few, by Student's distribution."""
+    named = {z: picture_ladder._is_named(name, change, change / z) for z in (4.2, 12.0)}
+    assert named == {4.2: False, 12.0: True}
+    assert picture_ladder._blur_p_value(name, 4.2) > MAX_P

@@ -32,7 +32,7 @@ from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judg
 from virest.diagnosis.photometry_patches import observe_photometry
 from virest.diagnosis.selection import BLUR_LEVELS, LIGHT_LEVELS, MIXING_LEVELS
 from virest.effects.table import EFFECTS
-from virest.inference.chance import normal_tail, student_tail
+from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.motion.trajectory import Trajectory
 
@@ -390,7 +390,7 @@ def climb_blur(
     std = fitted.std
     if fitted.determined[0] and (is_exposure or _is_named("exposure_time", abs(np.log(scale)), float(std[0]) / scale)):
         named.append(0)
-    if fitted.determined[1] and _is_named("defocus", sigma, 2 * float(std[1])):
+    if fitted.determined[1] and _is_named("defocus", sigma, float(std[1])):
         named.append(1)
     if 1 not in named and fitted.determined[1] and sigma > SOFT_Z * float(std[1]):
         soft = float(np.hypot(sigma, fitted.nuisance[0]))
@@ -401,9 +401,9 @@ def climb_blur(
         alone = tuple(effects[j] for j in named)
         held = local_blur_fit.held_out(observations, profile, trajectory, alone)
         changes = _blur_change(k, profile, scale, sigma, std)
-        z = abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / (2 * std[1])
-        p_value = (2 if k == 0 else 1) * student_tail(z, local_blur.BLOCKS - 1)
+        z = float(abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / std[1])
         name = effects[k].name
+        p_value = _blur_p_value(name, z)
         verdict.findings.append(Finding(name, changes, held, (), p_value, sentence_of(name, changes)))
         verdict.rungs.append(Rung(name, {name: held.after}, held.before, BLUR))
         values = np.array([scale]) if k == 0 else np.array([sigma])
@@ -412,8 +412,13 @@ def climb_blur(
 
 
 def _is_named(name: str, change: float, std: float) -> bool:
-    """Whether a change that blur shows is significant, two-sided, and large enough."""
-    return BLUR_LEVELS.matters(name, change) and BLUR_LEVELS.significant(2 * normal_tail(change / std))
+    """Whether a change that blur shows is significant, by the probability that is told, and large enough."""
+    return BLUR_LEVELS.matters(name, change) and BLUR_LEVELS.significant(_blur_p_value(name, change / std))
+
+
+def _blur_p_value(name: str, deviations: float) -> float:
+    """Of a value whose deviation comes from the scatter of a few blocks; defocus has no other side."""
+    return (2 if name == "exposure_time" else 1) * student_tail(deviations, local_blur.BLOCKS - 1)
 
 
 def _exposure_holds(fitted: local_blur_fit.BlurFit, hypothesis: float | None) -> bool:
