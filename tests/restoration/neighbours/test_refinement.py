@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from virest.motion.trajectory import Trajectory
-from virest.restoration.neighbours.refinement import FollowingTurn, following_turn
+from virest.restoration.neighbours.refinement import FollowingTurn, believed_turn, following_turn
 from virest.restoration.neighbours.registration import PairTurn
 
 PERIOD_S = 1 / 30
@@ -59,3 +61,16 @@ def test_turns_that_follow_nothing_are_not_explained(rng: np.random.Generator) -
     assert abs(found.lag_s) < 1.5e-3
     assert abs(found.part) < 0.03
     assert FollowingTurn().left_of(_turns(0.0, 0.0, 0.05, rng)[0], _Waving()).rate_rad_s.any()
+
+
+def test_a_rest_that_interpolation_tells_better_follows_nothing(rng: np.random.Generator) -> None:
+    """A slow turn that is unrelated to the predicted rate is left to interpolation; a lag is not."""
+    slow = [
+        replace(turn, rate_rad_s=turn.rate_rad_s + 0.2 * np.sin(2 * np.pi * 0.8 * turn.start_s + PHASE_RAD))
+        for turn in _turns(0.0, 0.0, 0.002, rng)
+    ]
+    assert believed_turn([slow], _Waving())[0] == FollowingTurn()
+    following, bend = believed_turn([_turns(0.004, 0.0, 0.002, rng)], _Waving())
+    assert following.lag_s == pytest.approx(0.004, abs=5e-4)
+    assert bend is not None
+    assert bend < 0.01**2

@@ -35,6 +35,11 @@ HALF_SPACING = 0.25
 LAG_STD_S, PART_STD = 0.003, 0.1
 """What is usual of both: recorders stamp frames and samples to some milliseconds, and what a stabiliser or a low pass
 keeps from the picture or from the log is about a tenth."""
+BELIEVED = 0.5
+"""What follows from the predicted rate is taken where it leaves less than this part of what interpolation left, in
+variance: a stabiliser that holds slow turns only follows no rate, and a fit of two values always leaves a little less
+(captures with 0.75 and more lost up to 2 dB by it, those with 0.3 and less gained).
+"""
 NODE_S = 0.004
 """Spacing of instants between which the missing rate is linear: hands shake at up to some 12 Hz."""
 
@@ -158,16 +163,9 @@ def missing_turn(
     variance = _variance(turns)
     if variance <= 0:
         return None
-    following = following_turn(turns, trajectory)
-    runs = [[None if turn is None else following.left_of(turn, trajectory) for turn in run] for run in runs]
-    rest = max(_variance([turn for run in runs for turn in run if turn is not None]), 0.0)
-    bends = [
-        (here.rate_rad_s - (a.rate_rad_s + b.rate_rad_s) / 2, here.covariance + (a.covariance + b.covariance) / 4)
-        for run in runs
-        for a, here, b in zip(run, run[1:], run[2:], strict=False)
-        if a is not None and here is not None and b is not None
-    ]
-    bend = np.mean([max(e @ e - np.trace(c), 0.0) / 3 for e, c in bends]) if bends else rest
+    following, bend = believed_turn(runs, trajectory)
+    rest = max(_variance([following.left_of(turn, trajectory) for turn in turns]), 0.0)
+    bend = rest if bend is None else bend
     found = MissingTurn(
         float(np.sqrt(variance)),
         float(np.sqrt(rest)),
@@ -202,6 +200,29 @@ def _variance(turns: Sequence[PairTurn]) -> float:
     """Of the rates about 0, each axis, beyond that of their own errors."""
     noise = np.mean([np.trace(t.covariance) / 3 for t in turns])
     return float(np.median([t.rate_rad_s @ t.rate_rad_s for t in turns]) / chi2_median(3) - noise)
+
+
+def believed_turn(
+    runs: Sequence[Sequence[PairTurn | None]], trajectory: Trajectory
+) -> tuple[FollowingTurn, float | None]:
+    """What follows from the predicted rate, if it makes the rest that smooth, and :func:`_bend` of that rest."""
+    none, bend = FollowingTurn(), _bend(runs)
+    if bend is None:
+        return none, None
+    tried = following_turn([turn for run in runs for turn in run if turn is not None], trajectory)
+    left = _bend([[None if turn is None else tried.left_of(turn, trajectory) for turn in run] for run in runs])
+    return (tried, left) if left is not None and left < BELIEVED * bend else (none, bend)
+
+
+def _bend(runs: Sequence[Sequence[PairTurn | None]]) -> float | None:
+    """Variance of the rates about what neighbouring intervals on both sides tell, each axis; None: nowhere seen."""
+    bends = [
+        (here.rate_rad_s - (a.rate_rad_s + b.rate_rad_s) / 2, here.covariance + (a.covariance + b.covariance) / 4)
+        for run in runs
+        for a, here, b in zip(run, run[1:], run[2:], strict=False)
+        if a is not None and here is not None and b is not None
+    ]
+    return float(np.mean([max(e @ e - np.trace(c), 0.0) / 3 for e, c in bends])) if bends else None
 
 
 def _path_change_px(motion: RowMotion, rate_rad_s: float) -> float:
