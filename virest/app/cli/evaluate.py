@@ -111,7 +111,7 @@ def deblur(
     method                          MSE  PSNR dB    SSIM  matches  in place
     blurred                       606.2    20.30  0.7466      197       171
     skimage richardson_lucy       358.9    22.58  0.7600      306       276
-    virest balanced                90.9    28.55  0.9167      691       648
+    virest balanced                88.0    28.69  0.9200      719       672
     ...
     $ virest evaluate deblur --over-time
     $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames
