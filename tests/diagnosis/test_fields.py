@@ -349,7 +349,7 @@ def test_a_focal_length_that_comes_back_at_once_is_no_step() -> None:
 
 @pytest.mark.scenario
 def test_a_gyroscope_that_sticks_near_rest_is_no_scale() -> None:
-    """A dead zone of 0.02 rad/s: the ladder's scale only stands in for it."""
+    """A dead zone of 0.02 rad/s is found, though the ladder first takes it for a wrong gyroscope scale."""
     stuck = Strange(gyro=lambda t, reading, _: np.sign(reading) * np.maximum(np.abs(reading) - 0.02, 0))
     phone = StrangePhone(replace(HAND, seed=92, points=40), stuck)
     verdict, (field,) = judged(phone, phone.profile, rungs=2)

@@ -19,11 +19,12 @@ from scipy import stats
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
-from virest.diagnosis.field.screening import Design, Scored, score_forms, t_ratio
+from virest.diagnosis.field.screening import Design, Scored, score_forms
 from virest.diagnosis.field.words import SAMPLES, curve_shape
 from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
 from virest.diagnosis.local_blur import LENS_SIGMA_PX, LENS_STD_PX, BlurObservations, predicted_blur
 from virest.diagnosis.local_blur_model import fitted_width
+from virest.inference.chance import t_ratio
 from virest.inference.robust import CAUCHY
 from virest.motion.trajectory import Trajectory
 

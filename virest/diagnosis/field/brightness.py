@@ -16,9 +16,10 @@ from scipy.linalg import null_space
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.diagnosis.field.screening import MAX_P, MIN_T, Design, score_forms, t_ratio
+from virest.diagnosis.field.screening import MAX_P, MIN_T, Design, score_forms
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
+from virest.inference.chance import t_ratio
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from virest.inference.chance import t_ratio
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 FLIPS, DRAWS = 500, 60
@@ -156,13 +158,6 @@ def select(scored: Sequence[Scored], total_weight: float, seed: int = 1) -> Sele
         return None
     size = float(np.sqrt(max(best.gain.sum(), 0.0) / (2 * total_weight)))
     return Selection(best, tuple(entry.name for entry in alike if entry is not best), stability, size)
-
-
-def t_ratio(values: Array) -> float:
-    """Mean over its standard error."""
-    if len(values) < 3:
-        return 0.0
-    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))
 
 
 def _orthonormal(columns: Array) -> Array:

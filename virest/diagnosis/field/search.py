@@ -19,7 +19,7 @@ from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
 from virest.diagnosis.field.forms import OVER, FieldForm
 from virest.diagnosis.field.records import FittedField
-from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, Design, Scored, Selection, score_forms, select, t_ratio
+from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, Design, Scored, Selection, score_forms, select
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
@@ -30,6 +30,7 @@ from virest.diagnosis.geometric_ladder import (
     GeometricVerdict,
     p_of,
 )
+from virest.inference.chance import t_ratio
 from virest.inference.track_fit import Term, TrackFit
 
 log = logging.getLogger(__name__)

@@ -243,7 +243,7 @@ def tile_agreement(
     if kernels is None:
         return None
     source = view.map_px(times=tiles.times)
-    there = cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    there = _read(second, source)
     wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles.tops_lefts, tiles.times), TILE // 4)
     here, there_blurred = _inner(wide), _inner(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
     a, b = _spectra(here), _spectra(there_blurred)
@@ -290,7 +290,7 @@ def judged_change(
     if kernels is None:
         return None
     source = view.map_px(times=times)
-    brought = cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    brought = _read(second, source)
     unknown = _near_lamps(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
     seen = _cut(np.float32(1) - unknown, tops_lefts)
     b = _spectra(_cut(brought, tops_lefts), seen)
@@ -398,13 +398,17 @@ def _inner(wide: NDArray[np.complex64]) -> Image:
     return np.asarray(fft.irfft(rows, WIDE, axis=2)[:, :, INNER])
 
 
-def _brought(view: NeighbourView, second: Image, times: int, apart: Array | None = None) -> Image:
+def _brought(view: NeighbourView, second: Image, times: int, apart: Array) -> Image:
     """The neighbour's reduced picture where the prediction puts the frame's, less a common shift (2,), reduced pixels.
 
     Row by row: over the rows of a tile, 5 ms, a hand's shake bends the map by up to half a pixel.
     """
-    source = view.map_px(times=times) if apart is None else view.map_px(lambda p: p - times * apart, times)
-    return cv2.remap(second, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return _read(second, view.map_px(lambda p: p - times * apart, times))
+
+
+def _read(picture: Image, source: NDArray[np.float32]) -> Image:
+    """A reduced picture at the places of a map (h, w, 2); beyond its edges, these."""
+    return cv2.remap(picture, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _spectra(tiles: Image, seen: Image | None = None) -> NDArray[np.complex64]:

@@ -82,8 +82,8 @@ def survey_gain(
     """What deblurring gains by the neighbours' account.
 
     tried: a frame's luma in light, as recorded and as restored, at the middle of its exposures and reduced; None: it is
-    left alone.  Lively frames are restored, one for each run and where runs are few one more, each held against both
-    its neighbours; one that neither judges gives its place to the next.
+    left alone.  One blurred frame of each run is restored, and one more where runs are few.  Each is compared with both
+    its neighbours; if neither can judge it, the next frame takes its place.
     """
     found: list[tuple[float, float, float, float]] = []
     path_px = {n: path_length_px(s.motion) for n, s in sights.items() if s.usable and s.motion is not None}
