@@ -74,7 +74,21 @@ def test_a_mask_is_seen(rng, scene, amount, radius_px):
         assert found == pytest.approx(truth, rel=0.34), frequency
 
 
-@pytest.mark.parametrize("scene", [strokes, discs])
+def with_tails(rng):
+    """A picture of which three fifths are soft and hazy: there an edge comes up to its plateau slowly."""
+    sharp = discs(rng)
+    hazy = 0.75 * cv2.GaussianBlur(sharp, (0, 0), 0.8) + 0.25 * cv2.GaussianBlur(sharp, (0, 0), 4.0)
+    return np.where(np.arange(SIZE) < 0.6 * SIZE, hazy, sharp)
+
+
+def test_a_mask_is_seen_among_soft_edges(rng):
+    """Most edges hide it in their tails; the sharpest tell."""
+    mask = seen(rng, with_tails, amount=0.8, radius_px=1.0)
+    assert mask is not None
+    assert mask.amount * mask.radius_px**2 == pytest.approx(0.8, rel=0.34)
+
+
+@pytest.mark.parametrize("scene", [strokes, discs, with_tails])
 def test_what_nobody_sharpened_has_none(rng, scene):
     """Print and plain surfaces, in focus and out of focus."""
     assert seen(rng, scene) is None

@@ -243,3 +243,18 @@ def test_a_coders_noise_is_level_where_the_picture_stands_out_of_it() -> None:
     rings = ring_index(128)
     truth = np.array([error[rings == number].mean() for number in np.flatnonzero(low)[1:]])
     assert (luma.noise[low][1:] < 2 * truth).all()
+
+
+@pytest.mark.parametrize("turned_deg", [10, 145])
+@pytest.mark.parametrize("length_px", [2.0, 3.5])
+def test_stripes_across_a_short_path_are_no_noise(length_px: float, turned_deg: int) -> None:
+    """A path of a few pixels cancels little: detail that is strongest along it must not pass for noise there."""
+    field, rng = _field(length_px, angle_rad=0.0), np.random.default_rng(3)
+    stripes = cv2.blur(cv2.GaussianBlur(rng.standard_normal((900, 900)), (0, 0), 0.7), (1, 25))
+    stripes = cv2.warpAffine(stripes, cv2.getRotationMatrix2D((450, 450), turned_deg, 1.0), (900, 900))
+    stripes = stripes[200 : 200 + HEIGHT, 150 : 150 + WIDTH]
+    sharp = 85 + 77 * texture(HEIGHT, WIDTH, seed=5) + 30 * stripes / stripes.std()
+    blurred = cv2.filter2D(sharp, -1, field.arrays()[0].astype(float)) + rng.standard_normal(sharp.shape)
+    noisy = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
+    luma, _ = measure_picture(np.repeat(noisy[..., None], 3, -1), field, STRAIGHT)
+    assert luma.noise_levels < 3

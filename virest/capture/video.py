@@ -507,7 +507,7 @@ def _upsample(chroma: NDArray[Any], shape: tuple[int, ...], *, centred: bool) ->
         between = cv2.addWeighted(chroma, 0.5, right, 0.5, 0.0)
         chroma, factor_x = cv2.merge([chroma, between]).reshape(len(chroma), -1), 1
     size = (chroma.shape[1] * factor_x, chroma.shape[0] * factor_y)
-    return np.ascontiguousarray(cv2.resize(chroma, size, interpolation=cv2.INTER_LINEAR)[:height, :width])
+    return np.ascontiguousarray(cv2.resize(chroma, size, interpolation=cv2.INTER_CUBIC)[:height, :width])
 
 
 def to_gray(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:

@@ -23,6 +23,9 @@ COLOUR_TILE_PX = 384
 
 The coarse scale, with few iterations, costs up to 0.05 dB.
 """
+COARSE_COLOUR_BLUR_PX = COARSE_COLOUR_SCALE * 3**0.5
+"""Path that blurs as much as the coarse scale does: a mean over its squares, variance s²/12, and linear interpolation,
+s²/6, against L²/12.  Colours that were blurred by less would lose by it."""
 NEARBY_SIDE, FINE_SIDE = 5, 3
 """Sides, in pixels of the colour differences, of squares in which these are compared with the luma: for blurred ones
 besides the path to both sides, and for sharp ones."""
@@ -36,7 +39,8 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
     dark grey levels.
     """
     height, width = blurred.light[0].shape
-    scale = COLOUR_SCALE if settings.iterations > FEW_ITERATIONS else COARSE_COLOUR_SCALE
+    coarse = settings.iterations <= FEW_ITERATIONS and blurred.longest_px > COARSE_COLOUR_BLUR_PX
+    scale = COARSE_COLOUR_SCALE if coarse else COLOUR_SCALE
     small = _shrunk(sharp, blurred, scale)
     small_grey, *differences = _grey_differences(blurred, small, *_sharp_differences(blurred, small, settings, scale))
     slopes = _slopes_on(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
