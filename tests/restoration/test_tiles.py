@@ -304,7 +304,8 @@ def _joined(
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], count, 0), 16)
     sharp, noise = (np.full((deconvolution.size,) * 2, value, np.float32) for value in (sharpness, ratio))
     trust = np.ones_like(picture) if trust is None else trust
-    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), [sharp] * count, trust, weight)
+    kept = [(sharp, 1 - sharp * sharp)] * count
+    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), kept, trust, weight)
     deconvolution.join([picture], [other], noise)
     return deconvolution
 

@@ -152,7 +152,7 @@ class TileDeconvolution:
         others = [_Joining(self, one) for one in further]
         least = cv2.add(ratio, LEAST_RATIO)
         self._joined = [np.empty_like(self.kernels) for _ in channels]
-        one, sums, *_ = buffers = np.empty((5, self.size, self.size), np.float32)
+        one, sums, *_ = buffers = np.empty((4, self.size, self.size), np.float32)
         for number, corner in enumerate(self.grid.corners()):
             power, projected = self.powers[number], [joined[number] for joined in self._joined]
             for plane, back in zip(padded, projected, strict=True):
@@ -313,16 +313,8 @@ class _Joining:
 
         known: what is known of the sharp channels without it.  ratios: N / S, and the same and a little more.
         """
-        one, sums, weight, factor, back = buffers
+        one, sums, weight, back = buffers
         kernel = next(self._spectra)
-        _whole_power(kernel, one)
-        sharpness, lost = self._sharpness[number]
-        ratio, least = ratios
-        cv2.add(cv2.multiply(lost, one, weight), least, weight)
-        cv2.divide(ratio, weight, weight, self._weights[number])
-        cv2.multiply(sharpness, weight, factor)
-        cv2.accumulateProduct(one, weight, power)
-        cv2.accumulateProduct(kernel, factor, sums)
         tiles, corner, share = self._tiles, self._corners[number], None
         if not self.whole[number]:
             share = np.zeros_like(one)  # a bridge is no measurement
@@ -330,14 +322,22 @@ class _Joining:
             part = self._trusted[top : top + tiles.patch, left : left + tiles.patch]
             cv2.multiply(part, 1 / self._most[number], share[: tiles.patch, : tiles.patch])
             forward = cv2.multiply(kernel, _conjugating(tiles.size))
+        sharpness, lost = self._sharpness[number]
+        ratio, least = ratios
+        _whole_power(kernel, one)
+        cv2.add(cv2.multiply(lost, one, weight), least, weight)
+        cv2.divide(ratio, weight, weight, self._weights[number])
+        cv2.accumulateProduct(one, weight, power)
+        cv2.multiply(kernel, cv2.multiply(sharpness, weight, weight), kernel)
+        cv2.accumulate(kernel, sums)
         for channel, (plane, joined) in enumerate(zip(self._padded, projected, strict=True)):
             tile = tiles.periodic(plane, *corner)
             if share is not None:
                 _product(known[channel], forward, back)
                 predicted = transforms.inverse(back, one)
                 tile = cv2.add(cv2.multiply(share, cv2.subtract(tile, predicted, back), back), predicted, back)
-            _product(transforms.forward(tile, one), kernel, back)
-            cv2.accumulateProduct(back, factor, joined)
+            _product(transforms.forward(tile, one), kernel, one)
+            cv2.accumulate(one, joined)
 
 
 def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
@@ -431,9 +431,10 @@ def _ends(packed: Image) -> Image:
 
 
 def _product(first: Image, second: Image, into: Image) -> None:
-    """Write the product of two packed spectra."""
+    """Write the product of two packed spectra, which may be one of the two."""
+    ends = _ends_product(np.array(_ends(first)), np.array(_ends(second)))
     np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(into))
-    _ends(into)[:] = _ends_product(np.array(_ends(first)), np.array(_ends(second)))
+    _ends(into)[:] = ends
 
 
 def _whole_power(spectrum: Image, power: Image) -> None:
