@@ -169,7 +169,7 @@ def _with_residual(
 ) -> Iterator[Image]:
     """Each tile's spectrum with fine texture that the prior took for noise.
 
-    That is the residual g − K f, filtered as a picture of little power.
+    That is the residual g − K f, filtered as a picture of little power.  Good until the next.
     """
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
     guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
