@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pytest
 
 from virest.image_formation.kernels import KernelField
-from virest.restoration.clipped_light import _along_paths
+from virest.restoration.clipped_light import _along_paths, unseen_masks
 
 WIDTH, HEIGHT, LENGTH = 160, 120, 12.0
 
@@ -37,12 +38,23 @@ def test_a_highlight_reaches_along_the_path_of_where_it_lies() -> None:
     assert np.ptp(np.flatnonzero(right.any(axis=0))) <= 4
 
 
-def test_parts_meet_without_a_seam() -> None:
-    """Where all paths are one, the parts make what the whole picture would."""
+@pytest.mark.parametrize("level", [0.05, 0.2])
+def test_parts_meet_without_a_seam(level: float) -> None:
+    """Where all paths are one, the parts make what the whole picture would; with half of it clipped and with little."""
     rng = np.random.default_rng(4)
-    mask = (cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 3) > 0.05).astype(np.uint8)
+    mask = (cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 3) > level).astype(np.uint8)
     same = SimpleNamespace(field=lambda c: field(np.zeros_like(c)), longest_px=LENGTH)
     path = field(np.zeros((1, 2))).arrays(positive=True)[0]
     reach = (path + path[::-1, ::-1] > 2e-3).astype(np.uint8)
     for operation in (cv2.dilate, cv2.erode):
         np.testing.assert_array_equal(_along_paths(mask, same, operation), operation(mask, reach))  # type: ignore[arg-type]
+
+
+def test_a_clipped_pixel_alone_is_kept_nowhere() -> None:
+    """The path is longer than it: its neighbours tell what light there was, and nothing needs to be copied."""
+    clipped = np.zeros((HEIGHT, WIDTH), np.float32)
+    clipped[55:57, 40] = 1.0
+    blurred = SimpleNamespace(field=field, light=[clipped] * 3, dark=[None] * 3, clipped=[clipped, None, None])
+    assert unseen_masks(blurred) == [None] * 3  # type: ignore[arg-type]
+    clipped[40:80, 20:60] = 1.0
+    assert unseen_masks(blurred)[0] is not None  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,11 @@ from virest.restoration.deconvolution import (
     shrink,
     shrinkage_table,
 )
+from virest.restoration.statistics.on_tiles import on_spectrum
+from virest.restoration.statistics.records import unknown_picture
+from virest.restoration.statistics.rings import RINGS
+from virest.restoration.tile_layout import BORDER_NOISE_TO_SIGNAL
+from virest.restoration.tile_methods import RESIDUAL_SHARE, _with_residual
 
 Image = NDArray[np.float32]
 
@@ -217,3 +223,20 @@ def test_over_relaxed_steps_of_richardson_lucy_get_further(rng: np.random.Genera
     plain, far = (richardson_lucy(observed, apply, adjoint, start, weight, 8, r) for r in (1.0, 1.7))
     assert np.abs(apply(far) - observed).sum() < np.abs(apply(plain) - observed).sum()
     assert far.min() > 0
+
+
+def test_texture_too_faint_for_the_prior_comes_back_on_each_tiles_own_spectrum(rng: np.random.Generator) -> None:
+    """Where the solution explains all that was recorded nothing is added, else a part of what it leaves."""
+    size = 32
+    powers, solved = rng.random((2, 2, size, size)).astype(np.float32)
+    deconvolution = SimpleNamespace(powers=powers, at_border=[False, True], size=size)
+
+    def restored(projected: Image) -> list[Image]:
+        return [tile.copy() for tile in _with_residual(deconvolution, projected, solved, unknown_picture())]  # type: ignore[arg-type]
+
+    np.testing.assert_allclose(restored(powers * solved), solved, rtol=1e-6)
+    found = restored((powers + 1) * solved)
+    ratio = on_spectrum(unknown_picture(), np.full(RINGS, 1 / RESIDUAL_SHARE), size)
+    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
+    for tile, spectrum, power, noise in zip(found, solved, powers, (ratio, guarded), strict=True):
+        np.testing.assert_allclose(tile, spectrum + spectrum / (power + noise), rtol=1e-4)

@@ -20,6 +20,7 @@ from virest.restoration.tiles import (
     _inner_numbers,
     _power_at_ends,
     _power_inside,
+    _product,
     gradient_power,
     inverse_filter,
     quick_grid,
@@ -59,7 +60,11 @@ def packed_power(spectrum: Image) -> Image:
 
 
 def packed_product(first: Image, second: Image) -> Image:
-    """Multiply packed spectra as tiles do."""
+    """Multiply packed spectra as tiles do, one at a time or in place of the first."""
+    if first.ndim == 2:
+        product = first.copy()
+        _product(product, second, product)
+        return product
     product = np.empty_like(first)
     np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(product))
     _ends(product)[:] = _ends_product(_ends(first), _ends(second))
@@ -304,7 +309,8 @@ def _joined(
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], count, 0), 16)
     sharp, noise = (np.full((deconvolution.size,) * 2, value, np.float32) for value in (sharpness, ratio))
     trust = np.ones_like(picture) if trust is None else trust
-    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), [sharp] * count, trust, weight)
+    kept = [(sharp, 1 - sharp * sharp)] * count
+    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), kept, trust, weight)
     deconvolution.join([picture], [other], noise)
     return deconvolution
 

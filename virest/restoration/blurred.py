@@ -118,9 +118,17 @@ def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
     table = curve.clipped_table(CLIPPED_LEVELS)
     if not table[int(channel.max())]:
         return None
-    clipped = cv2.LUT(channel, table.astype(np.uint8))
-    near = cv2.dilate(clipped, np.ones((5, 5), np.uint8))
-    return (near & cv2.LUT(channel, curve.clipped_table(PULLED_DOWN_LEVELS).astype(np.uint8))).astype(np.float32)
+    clipped, found = cv2.LUT(channel, table.astype(np.uint8)), np.zeros(channel.shape, np.float32)
+    near = around(clipped, 2)
+    pulled_down = cv2.LUT(channel[near], curve.clipped_table(PULLED_DOWN_LEVELS).astype(np.uint8))
+    found[near] = cv2.dilate(clipped[near], np.ones((5, 5), np.uint8)) & pulled_down
+    return found
+
+
+def around(mask: NDArray[np.uint8], reach: int) -> tuple[slice, slice]:
+    """Rows and columns of all that is not 0 in a mask (height, width), widened on each side by a margin in pixels."""
+    left, top, width, height = cv2.boundingRect(mask)
+    return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
 
 
 def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.uint8] | None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image
-from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
+from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture, around
 from virest.restoration.row_chunks import RowRenderer
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
@@ -41,16 +41,10 @@ def measured_part(holes: Image) -> Image:
     A sharp edge of the weights would show as an outline around the lamp.
     """
     part = np.ones_like(holes)
-    near = _around(holes, int(4 * CODEC_REACH_PX) + 3)
+    near = around(holes.astype(np.uint8), int(4 * CODEC_REACH_PX) + 3)
     wide = cv2.GaussianBlur(cv2.dilate(holes[near], np.ones((5, 5), np.uint8)), (0, 0), CODEC_REACH_PX)
     part[near] = (1 - holes[near]) * (1 - wide)
     return part
-
-
-def _around(mask: Image, reach: int) -> tuple[slice, slice]:
-    """Rows and columns of all that is not 0 in a mask (height, width), widened on each side by a margin in pixels."""
-    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
 
 
 def measured_share(blurred: BlurredPicture) -> Image | None:
@@ -74,7 +68,8 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     masks: list[NDArray[np.uint8] | None] = []
     for pair in zip(blurred.dark, blurred.clipped, strict=True):
         eroded = [_along_paths(mask.astype(np.uint8), blurred, cv2.erode) for mask in pair if mask is not None]
-        masks.append(np.maximum.reduce(eroded) if eroded else None)
+        mask = np.maximum.reduce(eroded) if eroded else None
+        masks.append(mask if mask is not None and cv2.hasNonZero(mask) else None)
     return masks
 
 
@@ -90,7 +85,7 @@ def unseen_kept(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: Blurre
     def kept(rows: slice) -> Image:
         levels = sharp(rows)
         for channel, unseen in enumerate(masks):
-            if unseen is not None:
+            if unseen is not None and cv2.hasNonZero(unseen[rows]):
                 np.copyto(levels[..., channel], recorded[rows, :, channel], where=unseen[rows] > 0)
         return levels
 
@@ -103,7 +98,8 @@ def _along_paths(
     """A mask (height, width) dilated or eroded along the blur path of each place, to both sides.
 
     Paths change over a picture by the rows' times and the lens: each of PLACES x PLACES parts takes that of its middle.
-    Parts in which the mask is the same all over, with the path's length around them, stay as they are.
+    Parts in which the mask is the same all over, with the path's length around them, stay as they are, and so does what
+    lies further than that from all of the mask.
     """
     height, width = mask.shape
     rows, columns = (np.linspace(0, length, PLACES + 1).astype(int) for length in (height, width))
@@ -117,9 +113,11 @@ def _along_paths(
     found, margin = mask.copy(), len(paths[0])
     for (r, c), path in zip(parts, paths, strict=True):
         top, left = max(r.start - margin, 0), max(c.start - margin, 0)
-        around = mask[top : r.stop + margin, left : c.stop + margin]
-        if around.size and around.min() < around.max():
+        seen = mask[top : r.stop + margin, left : c.stop + margin]
+        if seen.size and seen.min() < seen.max():
             reach = (path + path[::-1, ::-1] > TOUCHED).astype(np.uint8)
             inner = slice(r.start - top, r.stop - top), slice(c.start - left, c.stop - left)
-            found[r, c] = operation(around, reach)[inner]
+            near, changed = around(seen, 2 * margin), np.zeros_like(seen)
+            changed[near] = operation(seen[near], reach)
+            found[r, c] = changed[inner]
     return found

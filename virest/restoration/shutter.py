@@ -89,7 +89,7 @@ def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int,
     """
     height, width = source_px.shape[:2]
     columns, rows = _every(width, step), _every(height, step)
-    x, y = np.moveaxis(source_px[rows][:, columns], -1, 0)
+    x, y = np.moveaxis(source_px[np.ix_(rows, columns)], -1, 0)
     missing = (x < -0.5) | (x > width - 0.5) | (y < -0.5) | (y > height - 0.5)
     sums = cv2.integral(missing.astype(np.uint8))
 

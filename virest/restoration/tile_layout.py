@@ -150,6 +150,7 @@ def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
 
 
 @lru_cache(maxsize=128)
-def _kept_sharpness(shift_std_px: float, size: int) -> Image:
-    """What is left on average of a picture that lies this far off, each axis, on a packed spectrum."""
-    return np.exp(-0.5 * (2 * np.pi * shift_std_px * packed_frequency(size)) ** 2)
+def _kept_sharpness(shift_std_px: float, size: int) -> tuple[Image, Image]:
+    """What is left on average of a picture that lies this far off, each axis, on a packed spectrum: s, and 1 − s²."""
+    kept = np.exp(-0.5 * (2 * np.pi * shift_std_px * packed_frequency(size)) ** 2)
+    return kept, 1 - kept * kept

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import cv2
@@ -117,14 +117,16 @@ def tile_hyper_laplacian(
     linear = sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
     extra_noise = _extra_noise(statistics, deconvolution.size)
     before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
-    for step, beta in enumerate(beta_schedule(settings.iterations)):
+    betas = beta_schedule(settings.iterations)
+    for step, beta in enumerate(betas):
         ahead, before = _extrapolated(sharp, before, step), sharp
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
         pulled = deconvolution.pulled(projected, pull, beta / trust, beta / guarded)
         inner, at_border = (gradients * np.float32(beta / t) + extra_noise for t in (trust, guarded))
-        sharp = deconvolution.blend(deconvolution.solutions(pulled, inner, at_border))
-    if settings.iterations > FEW_ITERATIONS:
-        sharp += _returned_residual(deconvolution, projected, sharp, statistics)
+        solved = deconvolution.solutions(pulled, inner, at_border)
+        if step == len(betas) - 1 and not few:
+            solved = _with_residual(deconvolution, projected, solved, statistics)
+        sharp = deconvolution.blend(solved)
     if statistics.unevenness:
         share = LINEAR_SHARE * statistics.unevenness
         sharp = cv2.addWeighted(linear, share, sharp, 1 - share, 0.0)
@@ -162,17 +164,22 @@ def _border_noise(blurred: BlurredPicture) -> float:
     return max(statistics.noise_levels, float(np.sqrt(BORDER_NOISE_TO_SIGNAL * power)))
 
 
-def _returned_residual(
-    deconvolution: tiles.TileDeconvolution, projected: Image, sharp: Image, statistics: PictureStatistics
-) -> Image:
-    """Fine texture that the prior took for noise: the residual g − K f, filtered as a picture of little power."""
+def _with_residual(
+    deconvolution: tiles.TileDeconvolution, projected: Image, solved: Iterable[Image], statistics: PictureStatistics
+) -> Iterator[Image]:
+    """Each tile's spectrum with fine texture that the prior took for noise.
+
+    That is the residual g − K f, filtered as a picture of little power.  Good until the next.
+    """
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
     guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
-    left = (
-        cv2.subtract(back, cv2.multiply(power, spectrum))
-        for back, power, spectrum in zip(projected, deconvolution.powers, deconvolution.spectra(sharp), strict=True)
-    )
-    return deconvolution.blend(deconvolution.solutions(left, ratio, guarded))
+    left, divisor = np.empty((2, *ratio.shape), np.float32)
+    for spectrum, back, power, border in zip(
+        solved, projected, deconvolution.powers, deconvolution.at_border, strict=True
+    ):
+        cv2.subtract(back, cv2.multiply(power, spectrum, left), left)
+        cv2.divide(left, cv2.add(power, guarded if border else ratio, divisor), left)
+        yield cv2.add(spectrum, left, left)
 
 
 def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:

@@ -42,8 +42,8 @@ class FurtherPicture:
     """(height, width) each."""
     kernels: Image
     """(tiles, k, k)."""
-    sharpness: Sequence[Image]
-    """What its uncertain place leaves of it on average in each tile, a packed real factor s."""
+    sharpness: Sequence[tuple[Image, Image]]
+    """What its uncertain place leaves of it on average in each tile, a packed real factor s, and 1 − s²."""
     trust: Image
     """(height, width) 0 to 1."""
     weight: float = 1.0
@@ -150,8 +150,9 @@ class TileDeconvolution:
         """
         padded = [self.padded(channel) for channel in channels]
         others = [_Joining(self, one) for one in further]
+        least = cv2.add(ratio, LEAST_RATIO)
         self._joined = [np.empty_like(self.kernels) for _ in channels]
-        one, sums, *_ = buffers = np.empty((5, self.size, self.size), np.float32)
+        one, sums, *_ = buffers = np.empty((4, self.size, self.size), np.float32)
         for number, corner in enumerate(self.grid.corners()):
             power, projected = self.powers[number], [joined[number] for joined in self._joined]
             for plane, back in zip(padded, projected, strict=True):
@@ -168,7 +169,7 @@ class TileDeconvolution:
                     divisor = cv2.add(power, ratio)
                     rest = self._rest.get(number)
                     known = [cv2.divide(b, divisor) for b in projected] if rest is None else [rest]
-                other.add(number, known, ratio, power, projected, buffers)
+                other.add(number, known, (ratio, least), power, projected, buffers)
             _whole_power(sums, one)
             evidence = cv2.divide(power, cv2.max(cv2.max(one, power), LEAST_RATIO), one)
             for spectrum in (power, *projected):
@@ -232,12 +233,6 @@ class TileDeconvolution:
                 cv2.accumulateProduct(part, self._windows[number], whole[top : top + side, left : left + side])
         shares, lamps = (whole[: grid.height, : grid.width] for whole in (shares, lamps))
         return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), lamps)
-
-    def spectra(self, channel: Image) -> Iterator[Image]:
-        """Spectrum of each tile of a channel (height, width)."""
-        padded = self.padded(channel)
-        for top, left in self.grid.corners():
-            yield transforms.forward(self.periodic(padded, top, left))
 
     def solutions(self, projected: Iterable[Image], inner: Image, at_border: Image) -> Iterator[Image]:
         """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border.
@@ -309,26 +304,17 @@ class _Joining:
         self,
         number: int,
         known: Sequence[Image],
-        ratio: Image,
+        ratios: tuple[Image, Image],
         power: Image,
         projected: Sequence[Image],
         buffers: Image,
     ) -> None:
         """Add it to a tile's power and projected channels, and w K to the second of the buffers; tiles in order.
 
-        known: what is known of the sharp channels without it.
+        known: what is known of the sharp channels without it.  ratios: N / S, and the same and a little more.
         """
-        one, sums, weight, factor, back = buffers
+        one, sums, weight, back = buffers
         kernel = next(self._spectra)
-        _whole_power(kernel, one)
-        sharpness = self._sharpness[number]
-        np.multiply(sharpness, sharpness, out=weight)
-        cv2.multiply(cv2.subtract(1.0, weight, weight), one, weight)
-        cv2.add(cv2.add(weight, ratio, weight), LEAST_RATIO, weight)
-        cv2.divide(ratio, weight, weight, self._weights[number])
-        cv2.multiply(sharpness, weight, factor)
-        cv2.accumulateProduct(one, weight, power)
-        cv2.accumulateProduct(kernel, factor, sums)
         tiles, corner, share = self._tiles, self._corners[number], None
         if not self.whole[number]:
             share = np.zeros_like(one)  # a bridge is no measurement
@@ -336,14 +322,22 @@ class _Joining:
             part = self._trusted[top : top + tiles.patch, left : left + tiles.patch]
             cv2.multiply(part, 1 / self._most[number], share[: tiles.patch, : tiles.patch])
             forward = cv2.multiply(kernel, _conjugating(tiles.size))
+        sharpness, lost = self._sharpness[number]
+        ratio, least = ratios
+        _whole_power(kernel, one)
+        cv2.add(cv2.multiply(lost, one, weight), least, weight)
+        cv2.divide(ratio, weight, weight, self._weights[number])
+        cv2.accumulateProduct(one, weight, power)
+        cv2.multiply(kernel, cv2.multiply(sharpness, weight, weight), kernel)
+        cv2.accumulate(kernel, sums)
         for channel, (plane, joined) in enumerate(zip(self._padded, projected, strict=True)):
             tile = tiles.periodic(plane, *corner)
             if share is not None:
                 _product(known[channel], forward, back)
                 predicted = transforms.inverse(back, one)
                 tile = cv2.add(cv2.multiply(share, cv2.subtract(tile, predicted, back), back), predicted, back)
-            _product(transforms.forward(tile, one), kernel, back)
-            cv2.accumulateProduct(back, factor, joined)
+            _product(transforms.forward(tile, one), kernel, one)
+            cv2.accumulate(one, joined)
 
 
 def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
@@ -437,9 +431,10 @@ def _ends(packed: Image) -> Image:
 
 
 def _product(first: Image, second: Image, into: Image) -> None:
-    """Write the product of two packed spectra."""
+    """Write the product of two packed spectra, which may be one of the two."""
+    ends = _ends_product(np.array(_ends(first)), np.array(_ends(second)))
     np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(into))
-    _ends(into)[:] = _ends_product(np.array(_ends(first)), np.array(_ends(second)))
+    _ends(into)[:] = ends
 
 
 def _whole_power(spectrum: Image, power: Image) -> None:
