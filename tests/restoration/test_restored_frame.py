@@ -20,7 +20,7 @@ from virest.restoration.frame import (
     copied_frame,
     restore_frame,
 )
-from virest.restoration.parameters import degradation_parameters
+from virest.restoration.parameters import degradation_parameters, unknown_parameters
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 from virest.restoration.statistics.of_picture import most_blurred
 from virest.simulation.phone_pictures import sharpen
@@ -391,3 +391,11 @@ def test_where_nothing_was_blurred_the_mask_stays_as_well() -> None:
     np.testing.assert_allclose(restored[middle], shown[middle], atol=1)
     assert np.abs(unmasked.astype(int) - shown)[middle].max() > 2
     assert np.abs(restored - shown)[:40, :40].mean() > 2
+
+
+def test_the_log_of_a_frame_without_motion_holds_the_readout_where_it_is_known() -> None:
+    """And null where it is not."""
+    profile = phone(64, 64, 80.0, readout_time_s=0.02)
+    assert unknown_parameters(profile).as_json()["shutter"]["readout_time_s"] == 0.02
+    unknown = replace(profile, readout_known=False)
+    assert unknown_parameters(unknown).as_json()["shutter"]["readout_time_s"] is None
