@@ -18,6 +18,7 @@ _SCAN_STEP_CYCLES = 0.3
 """Scan step times the capture's length."""
 _LEAST_SINC = 0.03
 """An exposure of nearly whole periods leaves less of the flicker than this: not looked for."""
+Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class PhotometricEffect(Protocol):
@@ -41,6 +42,11 @@ class PhotometricEffect(Protocol):
     @property
     def per_frame(self) -> bool:
         """Whether each value belongs to one frame only, so that other frames cannot judge it; other places can."""
+        ...
+
+    @property
+    def bounds(self) -> Bounds:
+        """Least and greatest of each value."""
         ...
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
@@ -67,6 +73,7 @@ class ResponseGamma:
     name: str = "response_curve"
     parameters: tuple[str, ...] = ("gamma",)
     per_frame: bool = False
+    bounds: Bounds = ((0.2,), (5.0,))
 
     @property
     def scale(self) -> Array:
@@ -78,8 +85,8 @@ class ResponseGamma:
         return [np.array([profile.response.extra_gamma if profile.response else 1.0])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Kept within the profile's limits."""
-        return _curve(profile, extra_gamma=float(np.clip(values[0], 0.2, 5.0)))
+        """Set the curve's further gamma."""
+        return _curve(profile, extra_gamma=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +96,7 @@ class BlackLevel:
     name: str = "black_level"
     parameters: tuple[str, ...] = ("black_level",)
     per_frame: bool = False
+    bounds: Bounds = ((0.0,), (0.5,))
 
     @property
     def scale(self) -> Array:
@@ -100,8 +108,8 @@ class BlackLevel:
         return [np.array([profile.response.black_level if profile.response else 0.0])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Never below 0."""
-        return _curve(profile, black_level=float(np.clip(values[0], 0.0, 0.5)))
+        """Set the curve's black level."""
+        return _curve(profile, black_level=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +119,7 @@ class Vignetting:
     name: str = "vignetting"
     parameters: tuple[str, ...] = ("corner_loss",)
     per_frame: bool = False
+    bounds: Bounds = ((-0.9,), (0.95,))
 
     @property
     def scale(self) -> Array:
@@ -122,8 +131,8 @@ class Vignetting:
         return [np.array([profile.extensions.vignetting_corner_loss])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Kept within the profile's limits."""
-        return _extend(profile, vignetting_corner_loss=float(np.clip(values[0], -0.9, 0.95)))
+        """Set extensions.vignetting_corner_loss."""
+        return _extend(profile, vignetting_corner_loss=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +142,7 @@ class Flicker:
     name: str = "flicker"
     parameters: tuple[str, ...] = ("amplitude", "frequency_hz", "phase_rad")
     per_frame: bool = False
+    bounds: Bounds = ((-0.95, 1.0, -np.inf), (0.95, np.inf, np.inf))
     search_hz: tuple[float, float] = (20.0, 400.0)
     candidates: int = 4
     """How many peaks of the scan a fit begins at: aliases of each other look alike until they are refined."""
@@ -156,8 +166,8 @@ class Flicker:
         phase = float(np.mod(phase + (np.pi if amplitude < 0 else 0.0), 2 * np.pi))
         return _extend(
             profile,
-            flicker_amplitude=min(abs(amplitude), 0.95),
-            flicker_frequency_hz=max(frequency, 1.0),
+            flicker_amplitude=abs(amplitude),
+            flicker_frequency_hz=frequency,
             flicker_phase_rad=phase,
         )
 
@@ -181,6 +191,11 @@ class GainDrift:
     def scale(self) -> Array:
         """A tenth of the light."""
         return np.full(len(self.frames), 0.1)
+
+    @property
+    def bounds(self) -> Bounds:
+        """None."""
+        return (-np.inf,) * len(self.frames), (np.inf,) * len(self.frames)
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
         """What the profile has."""
