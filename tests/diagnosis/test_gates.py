@@ -34,7 +34,7 @@ from virest.diagnosis.photometry_effects import Vignetting
 from virest.diagnosis.photometry_fit import fit_photometry, judge, time_blocks
 from virest.diagnosis.selection import Levels
 from virest.inference import profile_terms as terms_of
-from virest.inference.descent import FreshLook, System
+from virest.inference.descent import Residuals, System
 from virest.inference.parallel import one_by_one
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
@@ -279,7 +279,7 @@ def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypa
     for left in (common, rng.permutation(common)):
         # no damping changes them
         monkeypatch.setattr(local_blur_fit._Widths, "left", lambda *_, r=left: r)
-        look, none = FreshLook(left, slope), np.zeros(3)
+        look, none = Residuals(left, slope, left), np.zeros(3)
         found = System(none, look, slope[:, None], left[:, None], np.zeros(400), 1.0, np.array([0.0, 1.0, 1.0]), none)
         variances.append(evidence.covariance(found)[0, 0])
     assert variances[0] > 8 * variances[1]

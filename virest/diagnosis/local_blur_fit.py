@@ -24,7 +24,7 @@ from virest.diagnosis.local_blur import (
 )
 from virest.diagnosis.local_blur_model import predicted_ratios
 from virest.inference.clustered import scatter
-from virest.inference.descent import FreshLook, Slopes, System, descend, slices, slopes_by_steps
+from virest.inference.descent import Residuals, Slopes, System, descend, slices, slopes_by_steps
 from virest.inference.robust import robust_std
 from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
@@ -230,13 +230,13 @@ class _Widths:
             self.known[key] = predicted_blur(self.observations, profile, self.trajectory)
         return residuals(self.observations, profile, self.trajectory, float(lens), damping, self.known[key])[self.use]
 
-    def look(self, values: Array, before: FreshLook | None = None, limit: Slopes = Slopes.HERE) -> FreshLook:
+    def look(self, values: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
         """Residuals, and slopes by finite differences."""
         left, steps = self.left(values), self._with_nuisances(_STEP, _NUISANCE_STEP)
         high = self._with_nuisances(_HIGH, _NUISANCE_HIGH)
-        return FreshLook(left, slopes_by_steps(lambda at: -self.left(at), -left, values, steps, high))
+        return Residuals(left, slopes_by_steps(lambda at: -self.left(at), -left, values, steps, high), left)
 
-    def weighed(self, values: Array, look: FreshLook) -> System[Array, FreshLook]:
+    def weighed(self, values: Array, look: Residuals) -> System[Array, Residuals]:
         """Edges and spectra each have their own deviation, which their residuals tell."""
         scale, edge = np.empty(len(look.left)), self.observations.is_edge[self.use]
         for kind in (edge, ~edge):
@@ -254,22 +254,21 @@ class _Widths:
     def _with_nuisances(self, of_effects: float, of_nuisances: Array) -> Array:
         return np.append(np.full(self.count, of_effects), of_nuisances)
 
-    def covariance(self, found: System[Array, FreshLook]) -> Array:
+    def covariance(self, found: System[Array, Residuals]) -> Array:
         """H⁻¹ (Σ g g' over time blocks + prior) H⁻¹ of all values, and what an unknown damping adds.
 
         The damping is not fitted: beside the length of the path it would be told by the ratios' curvature alone,
         which coding changes too.
         """
-        block, inverse = time_blocks(self.observations.time_s)[self.use], found.inverse()
-        meat = scatter(found.score, block) + np.diag(found.prior)
+        block = time_blocks(self.observations.time_s)[self.use]
         by_damping = (self.left(found.state, 1.0 + _DAMPING_STEP) - found.look.left) / _DAMPING_STEP
-        pulled = inverse @ found.pull(by_damping[:, None])
+        pulled = found.inverse() @ found.pull(by_damping[:, None])
         pulled = pulled * np.hypot(self.observations.damping_std, 2 * PATH_STD)
-        return inverse @ meat @ inverse + np.outer(pulled, pulled)
+        return found.sandwich(scatter(found.score, block)) + np.outer(pulled, pulled)
 
 
 def _as_fit(
-    evidence: _Widths, effects: Sequence[BlurEffect], known: tuple[bool, ...], found: System[Array, FreshLook]
+    evidence: _Widths, effects: Sequence[BlurEffect], known: tuple[bool, ...], found: System[Array, Residuals]
 ) -> BlurFit:
     """Spread the free effects' values among all that were asked for."""
     sizes, count = [len(e.parameters) for e in effects], evidence.count

@@ -27,7 +27,7 @@ from virest.diagnosis.photometry import (
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
 from virest.inference.chance import chi2_tail, normal_deviate
 from virest.inference.clustered import raised, scatter
-from virest.inference.descent import FreshLook, Slopes, System, descend, slices, slopes_by_steps
+from virest.inference.descent import Residuals, Slopes, System, descend, slices, slopes_by_steps
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.robust import CAUCHY, cauchy_weight
 from virest.inference.time_blocks import halves, varied_blocks
@@ -306,13 +306,20 @@ class _Brightness:
         """Measured minus predicted (n,), in noises."""
         return self.predicted(values, weight).residual / self.observations.noise
 
-    def look(self, values: Array, before: FreshLook | None = None, limit: Slopes = Slopes.HERE) -> FreshLook:
-        """Residuals whose robust weights the patches' light takes into account too; exact slopes for gains."""
-        weight, noise = np.ones(len(self.observations)), self.observations.noise
+    def look(self, values: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
+        """Residuals whose robust weights the patches' light takes into account too."""
+        weight = np.ones(len(self.observations))
         for _ in range(2):
             left = self.left(values, weight)
             weight = cauchy_weight(left**2, CAUCHY)
-        slope, steps = np.zeros((len(left), len(values))), np.append(np.zeros(len(values) - 1), _MEMORY_STEP)
+        if before is not None and not (kept := replace(before, left=left)).is_stale(limit):
+            return kept
+        return Residuals(left, self._slope(values, weight), left)
+
+    def _slope(self, values: Array, weight: Array) -> Array:
+        """Change (n, k) of the prediction per unit of each value, in noises; exact for gains."""
+        slope, noise = np.zeros((len(weight), len(values))), self.observations.noise
+        steps = np.append(np.zeros(len(values) - 1), _MEMORY_STEP)
         for effect, own in _parts(self.effects):
             if isinstance(effect, GainDrift):
                 columns = effect.columns(self.observations)
@@ -327,9 +334,9 @@ class _Brightness:
             return -self.left(changed, weight)
 
         slope[:, which] = slopes_by_steps(at, at(values[which]), values[which], steps[which], self._bounds[1][which])
-        return FreshLook(left, slope)
+        return slope
 
-    def weighed(self, values: Array, look: FreshLook) -> System[Array, FreshLook]:
+    def weighed(self, values: Array, look: Residuals) -> System[Array, Residuals]:
         """The noise is known; each value, and the memory, is held weakly to where it began."""
         spread = [_PRIOR_SCALES * effect.scale for effect in self.effects]
         prior = 1 / np.concatenate([*spread, [_MEMORY_SPREAD]]) ** 2
@@ -351,19 +358,18 @@ class _Brightness:
 # ── covariance ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _covariance(evidence: _Brightness, found: System[Array, FreshLook]) -> Array:
+def _covariance(evidence: _Brightness, found: System[Array, Residuals]) -> Array:
     """Sandwich of the scores summed over blocks of time and over places; never below what white noise gives.
 
     Values per frame leave nothing of a block's sum, so with them only places count.
     """
     observations, effects, values = evidence.observations, evidence.effects, found.state
-    prior, inverse, score = np.diag(found.prior), found.inverse(), found.score
-    by_frame = any(effect.per_frame for effect in effects)
+    score, by_frame = found.score, any(effect.per_frame for effect in effects)
     spread = scatter(score, observations.place)
     if not by_frame:
         spread = spread + scatter(score, time_blocks(observations)) - score.T @ score
-    white: Array = inverse * max(float(np.sum(found.weight * found.squared) / np.sum(found.weight)), 1.0)
-    sandwich = inverse @ (spread + prior) @ inverse
+    white: Array = found.inverse() * max(float(np.sum(found.weight * found.squared) / np.sum(found.weight)), 1.0)
+    sandwich = found.sandwich(spread)
     doubt = MEMORY_DOUBT * values[-1] * _pull_of_memory(found.normal)
     lag = LAG_DOUBT * _changes(observations, effects, values)
     model = np.outer(doubt, doubt) + np.diag(lag**2) + _resolution(observations, evidence.profile, effects, values)

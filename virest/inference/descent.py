@@ -35,6 +35,10 @@ class Slopes(Enum):
     HERE = "at the very values"
 
 
+STALE = {Slopes.ON_THE_WAY: 0.1, Slopes.AT_THE_END: 0.02, Slopes.HERE: 0.0}
+"""Reuse slopes until what they predict moves this far (median, standard deviations of a residual)."""
+
+
 class Look(Protocol):
     """What values predict, with slopes that were taken there or not far away."""
 
@@ -44,17 +48,19 @@ class Look(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class FreshLook:
-    """What values leave, with slopes that were taken there."""
+class Residuals:
+    """What values leave, with slopes that were taken where they left ``taken``."""
 
     left: Array
     """(n,) measured minus predicted."""
     slope: Array
     """(n, k) change of the prediction per unit of each value."""
+    taken: Array
+    """(n,) what was left where the slopes were taken, in standard deviations as ``left``."""
 
     def is_stale(self, limit: Slopes) -> bool:
-        """Never."""
-        return False
+        """Whether the prediction has moved by more than STALE since."""
+        return self.left is not self.taken and float(np.median(np.abs(self.left - self.taken))) > STALE[limit]
 
 
 S = TypeVar("S")
@@ -135,6 +141,11 @@ class System(Generic[S, L]):
         size = np.sqrt(np.maximum(np.diag(self.normal), 1e-30))
         whole = np.outer(size, size)
         return np.asarray(np.linalg.pinv(self.normal / whole, rcond=1e-12, hermitian=True)) / whole
+
+    def sandwich(self, scatter: Array) -> Array:
+        """Covariance (k, k) where the scores of what errs together have this scatter (k, k), with the priors'."""
+        inverse = self.inverse()
+        return np.asarray(inverse @ (scatter + np.diag(self.prior)) @ inverse)
 
 
 class Evidence(Protocol[S, L]):
