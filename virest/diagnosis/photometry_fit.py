@@ -171,11 +171,6 @@ def judge(
     return HeldOutGain.of_folds(PHOTOMETRY, judged)
 
 
-def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:
-    """RMS over the held-out observations alone; their patches' light is found among themselves."""
-    return normalised_rms(observations.subset(held), profile)[0]
-
-
 def significance(fit: PhotometricFit, effect_name: str, observations: PhotometricObservations) -> tuple[float, float]:
     """(how many standard deviations from no effect, p value), RESOLUTION and the search for a frequency counted in."""
     values, covariance = fit.of(effect_name)

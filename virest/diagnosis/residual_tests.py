@@ -7,7 +7,7 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.diagnosis import picture_ladder
+from virest.diagnosis import photometry, picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
@@ -122,7 +122,7 @@ def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Str
 def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
     observations = photometric.observations
     assert observations is not None
-    left = picture_ladder.residual_levels(observations, photometric.profile)
+    left = photometry.residuals(observations, photometric.profile)
     covariates = {
         name: values
         for name, values in observations.covariates(photometric.profile).items()
