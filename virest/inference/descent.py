@@ -5,8 +5,8 @@ What was measured, how values predict it, how far off a residual may be and what
 found is the same for all: Cauchy weights, priors, steps within limits and bounds, Marquardt's damping where a step does
 not lower the loss, and an end where a step is small in the values' own standard deviations.
 
-What differs between kinds of evidence is physics: deviations of points and of blur are known but for a factor, which what
-is left tells, those of brightness are measured beforehand; points' slopes are dear and judged in pixels.
+What differs between kinds of evidence is physics: deviations of points and of blur are known but for a factor, which
+what is left tells, those of brightness are measured beforehand; points' slopes are dear and judged in pixels.
 """
 
 from __future__ import annotations
