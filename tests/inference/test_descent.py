@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 import virest
-from virest.inference.descent import Slopes, System, descend, slices, slopes_by_steps
+from virest.inference.descent import Residuals, Slopes, System, descend, slices, slopes_by_steps
 from virest.inference.robust import CAUCHY
 
 Array = NDArray[np.float64]
@@ -104,6 +104,18 @@ def test_slopes_near_by_serve(curve: Curve) -> None:
     found = descend(curve, curve.start)
     assert len(curve.taken) < len(curve.seen)
     assert not found.look.is_stale(Slopes.AT_THE_END)
+
+
+def test_slopes_are_stale_once_the_prediction_has_moved(rng: np.random.Generator) -> None:
+    """By a part of what is left, whatever its unit; taken where they serve they never are."""
+    for unit in (1.0, 1e-3):
+        left = unit * rng.normal(size=500)
+        slope = np.ones((500, 1))
+        here = Residuals(left, slope, left)
+        near, far = (Residuals(left + part * unit * rng.normal(size=500), slope, left) for part in (0.1, 1.0))
+        assert [one.is_stale(Slopes.HERE) for one in (here, near, far)] == [False, True, True]
+        assert [one.is_stale(Slopes.AT_THE_END) for one in (here, near, far)] == [False, True, True]
+        assert [one.is_stale(Slopes.ON_THE_WAY) for one in (here, near, far)] == [False, False, True]
 
 
 def test_a_step_that_does_not_lower_the_loss_is_damped() -> None:

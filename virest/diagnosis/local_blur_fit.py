@@ -233,6 +233,8 @@ class _Widths:
     def look(self, values: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
         """Residuals, and slopes by finite differences."""
         left, steps = self.left(values), self._with_nuisances(_STEP, _NUISANCE_STEP)
+        if before is not None and not (kept := replace(before, left=left)).is_stale(limit):
+            return kept
         high = self._with_nuisances(_HIGH, _NUISANCE_HIGH)
         return Residuals(left, slopes_by_steps(lambda at: -self.left(at), -left, values, steps, high), left)
 

@@ -264,7 +264,7 @@ def _best_start(
     if len(starts) == 1:
         return starts[0]
     part = _thinned(observations, _TRIAL_OBSERVATIONS)
-    tried = [descend(_Brightness(part, profile, effects, start), start) for start in starts]
+    tried = [descend(_Brightness(part, profile, effects, start), start, fresh=False) for start in starts]
     return min(tried, key=lambda found: found.cost(1.0)).state
 
 

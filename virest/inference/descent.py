@@ -21,7 +21,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.inference.robust import CAUCHY, cauchy_weight
+from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 Array = NDArray[np.float64]
 MAX_ITERATIONS = 15
@@ -38,8 +38,8 @@ class Slopes(Enum):
     HERE = "at the very values"
 
 
-STALE = {Slopes.ON_THE_WAY: 0.1, Slopes.AT_THE_END: 0.02, Slopes.HERE: 0.0}
-"""Reuse slopes until what they predict moves this far (median, standard deviations of a residual)."""
+STALE = {Slopes.ON_THE_WAY: 0.5, Slopes.AT_THE_END: 0.02, Slopes.HERE: 0.0}
+"""Reuse slopes until what they predict moves by this part of what is left (robust standard deviations of both)."""
 
 
 class Look(Protocol):
@@ -59,11 +59,11 @@ class Residuals:
     slope: Array
     """(n, k) change of the prediction per unit of each value."""
     taken: Array
-    """(n,) what was left where the slopes were taken, in standard deviations as ``left``."""
+    """(n,) what was left where the slopes were taken."""
 
     def is_stale(self, limit: Slopes) -> bool:
         """Whether the prediction has moved by more than STALE since."""
-        return self.left is not self.taken and float(np.median(np.abs(self.left - self.taken))) > STALE[limit]
+        return robust_std(self.left - self.taken) > STALE[limit] * robust_std(self.taken)
 
 
 S = TypeVar("S")
