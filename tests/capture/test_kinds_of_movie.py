@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from virest.capture.folder import read_capture, resolve_profile
-from virest.capture.video import probe_movie, read_frames, read_gray, to_rgb
+from virest.capture.pixels import to_rgb
+from virest.capture.video import probe_movie, read_frames, read_gray
 from virest.errors import VideoError
 
 

@@ -12,7 +12,8 @@ import pytest
 from capture_writing import moving_pictures, write_movie
 
 from virest.capture import video
-from virest.capture.video import probe_movie, read_frames, read_gray, to_gray, to_rgb
+from virest.capture.pixels import to_gray, to_rgb
+from virest.capture.video import probe_movie, read_frames, read_gray
 from virest.errors import VideoError
 
 STEPS = [i * 33_400_000 for i in range(24)]

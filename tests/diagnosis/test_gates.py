@@ -34,6 +34,7 @@ from virest.diagnosis.photometry_effects import Vignetting
 from virest.diagnosis.photometry_fit import fit_photometry, judge, time_blocks
 from virest.diagnosis.selection import Levels
 from virest.inference import profile_terms as terms_of
+from virest.inference.descent import Residuals, System
 from virest.inference.parallel import one_by_one
 
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
@@ -270,20 +271,17 @@ def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypa
     """Residuals that are alike in a stretch of time tell less than as many that are not."""
     time_s = np.linspace(0.0, 4.0, 400)
     seen = SimpleNamespace(time_s=time_s, damping_std=0.1)
-    problem = local_blur_fit._Problem(
-        seen,
-        CameraProfile(64, 48),
-        None,
-        [local_blur_fit.ExposureTime()],
-        np.ones(400, bool),  # type: ignore[arg-type]
-    )
-    jacobian = np.stack([np.ones(400), np.zeros(400), np.zeros(400)], axis=-1)
+    effects = [local_blur_fit.ExposureTime()]
+    evidence = local_blur_fit._Widths(seen, CameraProfile(64, 48), None, effects, np.ones(400, bool))  # type: ignore[arg-type]
+    slope = np.stack([np.ones(400), np.zeros(400), np.zeros(400)], axis=-1)
     common = rng.normal(size=8)[local_blur.time_blocks(time_s)]
     variances = []
-    for residual in (common, rng.permutation(common)):
+    for left in (common, rng.permutation(common)):
         # no damping changes them
-        monkeypatch.setattr(local_blur_fit._Problem, "residual", lambda *_, r=residual: r)
-        variances.append(problem.covariance(np.zeros(3), residual, jacobian, np.ones(400))[0, 0])
+        monkeypatch.setattr(local_blur_fit._Widths, "left", lambda *_, r=left: r)
+        look, none = Residuals(left, slope, left), np.zeros(3)
+        found = System(none, look, slope[:, None], left[:, None], np.zeros(400), 1.0, np.array([0.0, 1.0, 1.0]), none)
+        variances.append(evidence.covariance(found)[0, 0])
     assert variances[0] > 8 * variances[1]
 
 

@@ -13,6 +13,7 @@ from virest.diagnosis.geometric_conclusion import lag_std_s
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_findings import findings_of
 from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.residual_tests import _more_than_noise
 from virest.image_formation.point_model import ground
 from virest.inference.chance import chance_of
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
@@ -42,6 +43,15 @@ def test_a_word_is_as_probable_as_its_gain_by_blocks() -> None:
     assert finding.p_value is not None
     assert 1e-9 < finding.p_value < 1e-3
     assert chance_of(np.array([0.1, 0.12, 0.11, 0.09])) < 1e-3 < chance_of(np.array([0.1, -0.12, 0.31, 0.09]))
+
+
+def test_two_pairs_prove_no_noise_beyond_tracking_s() -> None:
+    """Probabilities are numbers, however few pairs there are and however alike."""
+    for pairs in (0, 1, 2, 5):
+        pair = np.repeat(np.arange(pairs), 20)
+        noisier, stray = _more_than_noise(np.full(len(pair), 1.5), pair, 1.0)
+        assert noisier == (0.5 if pairs < 3 else 1.0)
+        assert stray == (0.5 if pairs < 3 else 1.0)
 
 
 def test_a_lag_is_as_well_known_as_its_pairs_tell_it() -> None:

@@ -9,7 +9,7 @@ import pytest
 from motion.synthetic_tracks import Setup, recorded
 
 from virest.inference import profile_terms as terms_of
-from virest.inference.track_descent import Linearisation, Problem
+from virest.inference.track_evidence import Linearisation, TrackEvidence
 from virest.inference.track_fit import fit_tracks, many_directions, one_direction
 from virest.inference.travel_direction import find_directions, without_directions
 from virest.motion.scene_motion import DirectedMotion
@@ -122,8 +122,8 @@ def test_slopes_serve_while_directions_are_found_anew(monkeypatch: pytest.Monkey
     recording = recorded(DRIVE)
     table, taken = recording.table(), []
     start = terms_of.shift_offset(recording.profile, np.array([0.004]))
-    of_terms = Problem._term_slopes
-    monkeypatch.setattr(Problem, "_term_slopes", lambda *given: taken.append(1) or of_terms(*given))
+    of_terms = TrackEvidence._term_slopes
+    monkeypatch.setattr(TrackEvidence, "_term_slopes", lambda *given: taken.append(1) or of_terms(*given))
     kept = fit_tracks(recording.imu, table, start, WANTED, one_direction())
     few = len(taken)
     monkeypatch.setattr(Linearisation, "is_stale", lambda look, _limit: look.prediction.second_px is not look.taken_px)

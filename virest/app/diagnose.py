@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.console import table
+from virest.app.diagnosis_text import SHOWN_COMPONENTS, describe
 from virest.app.outputs import capture_name, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
 from virest.camera.profile import CameraProfile
@@ -24,7 +23,7 @@ from virest.camera.profile_file import format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie, read_frames
-from virest.diagnosis.findings import CONSISTENT, Diagnosis, FieldFinding, Finding, Remaining, Rung
+from virest.diagnosis.findings import CONSISTENT, Diagnosis, FieldFinding, Finding, Rung
 from virest.diagnosis.restoration_gain import (
     RestorationGain,
     chosen_pairs,
@@ -35,7 +34,6 @@ from virest.errors import OutputError, VirestError
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
-from virest.report.words import residual_words
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.settings import PRESETS
 from virest.simulation.recreation import recreate_session
@@ -54,8 +52,6 @@ OWN_FIGURES = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.
 NOT_CONSISTENT = 10
 LADDER_PART, GAIN_PART = 0.85, 0.95
 """Where the ladder and the restorations end on the way from 0 to 1."""
-SHOWN_COMPONENTS = 4
-"""Longer lists are summed up."""
 MAX_RUNGS = 8
 
 
@@ -114,7 +110,7 @@ def run_diagnosis(
     files[DIAGNOSIS] = (json.dumps(facts, allow_nan=False, indent=2) + "\n").encode()
     _write_all(folder, files)
     say("done", 1.0)
-    text = describe(source.capture.name, found, gain, folder)
+    text = describe(source.capture.name, found, gain, f"{folder / DIAGNOSIS}, {EXTENDED} and figures")
     return DiagnosisOutcome(facts, text, found.verdict)
 
 
@@ -414,92 +410,3 @@ def _write_all(folder: Path, files: dict[str, bytes]) -> None:
         if isinstance(error, OSError):
             raise output_error(folder, error) from error
         raise
-
-
-# ── for people ───────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def describe(name: str, found: Diagnosis, gain: RestorationGain, folder: Path) -> str:
-    """The causes as a table with a sentence each, what they do for restored frames, what remains, the verdict."""
-    nominal = found.nominal
-    lines = [
-        f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, residual "
-        f"{residual_words(nominal.geometry_rms_px, nominal.geometry_noise_px)}"
-    ]
-    if found.causes:
-        header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain"]
-        lines.append(table(header, [row for cause in found.causes for row in _rows(cause)], words=0))
-        lines += [line for cause in found.causes for line in _sentences(cause)]
-    for field in found.fields:
-        lines.append(f"field: {_one_line(field.sentence)}")
-        lines.append(f"  likely: {field.reasons}; to tell: {field.next}")
-    lines += [_gain_line(gain), _remaining_line(found.unexplained)]
-    lines += [f"note: {_one_line(note)}" for note in found.notes]
-    lines.append(f"wrote {folder / DIAGNOSIS}, {EXTENDED} and figures")
-    return "\n".join([*lines, f"verdict: {found.verdict}"])
-
-
-def _sentences(cause: Finding) -> list[str]:
-    """The cause in words with the error that it was judged by, and what would explain as much."""
-    rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals)
-    told = f"{cause.name}: {_one_line(cause.sentence)} (held-out {cause.held_out.quantity})"
-    return [told, f"  as good an explanation: {rivals}"] if rivals else [told]
-
-
-def _rows(cause: Finding) -> list[list[str]]:
-    """A row for each number or word that changed; what the cause gains stands on its first."""
-    held_out = cause.held_out
-    gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
-    judged = [_number(held_out.before), _number(held_out.after), gain]
-    values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
-    return [
-        [cause.name if k == 0 else "", *value, *(judged if k == 0 else [""] * len(judged))]
-        for k, value in enumerate(values or [["-"] * 4])
-    ]
-
-
-def _values(parameter: str, change: Any) -> list[list[str]]:
-    """Name, given, found, ± of a parameter: a row for each component of a short list."""
-    found = change.estimate
-    if not isinstance(found, list | tuple | np.ndarray):
-        return [[parameter, *map(_number, (change.nominal, found, change.std))]]
-    count = len(found)
-    if count > SHOWN_COMPONENTS:
-        known = np.asarray(found, float)
-        return [[parameter, "-", f"{count} values, {_number(known.min())} to {_number(known.max())}", "-"]]
-    given, std = (_spread_out(values, count) for values in (change.nominal, change.std))
-    return [[f"{parameter}[{k}]", *map(_number, (given[k], found[k], std[k]))] for k in range(count)]
-
-
-def _spread_out(values: Any, count: int) -> list[Any]:
-    listed = isinstance(values, list | tuple | np.ndarray) and len(values) == count
-    return list(values) if listed else [values] * count
-
-
-def _number(value: Any) -> str:
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "-"
-    return value if isinstance(value, str) else f"{float(value):.4g}"
-
-
-def _gain_line(gain: RestorationGain) -> str:
-    if not gain.frames:
-        return "restored: the capture is too short to keep frames back from the fits"
-    if math.isnan(gain.sharpness_after):
-        return "restored: no two neighbouring frames could be registered"
-    return (
-        f"restored: sharpness {_number(gain.sharpness_recorded)} recorded, {_number(gain.sharpness_before)} as given, "
-        f"{_number(gain.sharpness_after)} extended; neighbours disagree by "
-        f"{_number(gain.disagreement_before_px)} -> {_number(gain.disagreement_after_px)} px"
-    )
-
-
-def _remaining_line(left: Remaining) -> str:
-    if left.significant:
-        return f"unexplained: {_one_line(left.sentence) or f'{_number(left.size)} along {left.strongest_along}'}"
-    unit = "px" if left.quantity.endswith("_px") else "levels"
-    return f"no significant residual: {_number(left.size)} {unit} along {left.strongest_along}"
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())

@@ -30,6 +30,7 @@ from virest.capture.join import (
 from virest.capture.location import locate
 from virest.capture.logged_focal import focal_scales
 from virest.capture.profile_source import default_profile, resolve_profile
+from virest.capture.recorder_metadata import summarise
 from virest.capture.records import NO_STAMP, STALL, STARTUP, Capture, CaptureMetadata, Frame, Note
 from virest.capture.rosbag import ENDINGS as BAG_ENDINGS
 from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source
@@ -52,15 +53,11 @@ __all__ = [
     "resolve_profile",
 ]
 
-PLAUSIBLE_FOCAL = (0.55, 1.1)
-"""fx over the long side of a phone's main camera."""
-BEARABLE_FOCAL = (0.4, 1.6)
-"""Outside, fx counts other pixels than the movie's: those of the sensor's whole array."""
 GUESSED_FOCAL = 0.8
 LARGE_RATE_RAD_S = 35.0
+"""2000 °/s, where phone gyroscopes end."""
 PLAUSIBLE_ACCEL_M_S2 = (5.0, 20.0)
 """Median length of the specific force: phones' accelerometers are off by a few percent, and hands shake evenly."""
-"""2000 °/s, where phone gyroscopes end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +92,7 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     zero_ns = joined.stamp_0_ns + shift_ns
     imu = ImuSamples((files.gyro.time_ns - zero_ns) / 1e9, files.gyro.gyro_rad_s, files.gyro.accel_m_s2)
     gaps = find_gaps(imu.time_s)
-    metadata = _summarise(files, notes)
+    metadata = summarise(files, notes)
     time_s = (joined.stamps_ns + shift_ns - zero_ns) / 1e9
     began = _startup(files, joined, time_s, imu, metadata, notes, look_at_pictures)
     frames = _frames(files, joined, shift_ns, time_s, imu, gaps, metadata, began, notes)
@@ -224,67 +221,6 @@ def _unix_lag_s(files: Source, alignment: Alignment, joined: NDArray[np.int64]) 
     left, right = out_ns[alignment.rows], in_ns[joined]
     known = (alignment.rows >= 0) & (joined >= 0) & (left > 0) & (right > 0)
     return np.where(known, (left - right) / 1e9, np.nan)
-
-
-# ── what the metadata say ────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
-    """Medians over the rows, and what the recorder says of camera and axes where the rows say nothing.
-
-    fx of the rows belongs to the sensor's long axis, which is vertical in a portrait picture.
-    """
-    lens = files.profile.intrinsics if files.profile else None
-    readout_s = files.profile.shutter.readout_time_s if files.profile and files.profile.readout_known else None
-    table, name = files.metadata, files.names.metadata
-    if table is None:
-        return CaptureMetadata(lens.fx_px if lens else None, lens.fy_px if lens else None, readout_s)
-    fx, fy = _median(table.fx_px), _median(table.fy_px)
-    if fx is None and lens is not None:
-        fx, fy = lens.fx_px, lens.fy_px
-    elif not _focal_plausible(fx, files.movie.width, files.movie.height, name, notes):
-        fx = fy = None
-    elif files.movie.height > files.movie.width:
-        fx, fy = fy, fx
-    logged_s = _median(table.readout_time_s)
-    if logged_s is None and readout_s is None:
-        notes.append(Note("info", "readout-unknown", f"{name} has no readout time"))
-    if _median(table.exposure_s) is None:
-        notes.append(Note("warning", "exposure-unknown", f"{name} has no exposure times: no deblurring"))
-    return CaptureMetadata(
-        fx_px=fx,
-        fy_px=fy,
-        readout_time_s=readout_s if logged_s is None else logged_s,
-        exposure_s=_median(table.exposure_s),
-        iso=_median(table.iso),
-        focal_length_mm=_median(table.focal_length_mm),
-    )
-
-
-def _median(values: NDArray[np.float64]) -> float | None:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else None
-
-
-def _focal_plausible(fx: float | None, width: int, height: int, name: str, notes: list[Note]) -> bool:
-    if fx is None:
-        text = f"{name} has no focal length: give fx_px in camera.yaml, or let `virest calibrate` find it"
-        notes.append(Note("warning", "fx-unknown", text))
-        return False
-    ratio = fx / max(width, height)
-    if not BEARABLE_FOCAL[0] <= ratio <= BEARABLE_FOCAL[1]:
-        text = (
-            f"fx {fx:.1f} is {ratio:.2f} of the picture's long side ({max(width, height)} px), a phone has "
-            f"{PLAUSIBLE_FOCAL[0]}–{PLAUSIBLE_FOCAL[1]}: it counts pixels of the sensor's whole array, not "
-            "the movie's; not used. Multiply it by long side / array width, or calibrate, and give fx_px in camera.yaml"
-        )
-        notes.append(Note("warning", "fx-active-array", text))
-        return False
-    if not PLAUSIBLE_FOCAL[0] <= ratio <= PLAUSIBLE_FOCAL[1]:
-        usual = f"{PLAUSIBLE_FOCAL[0]}–{PLAUSIBLE_FOCAL[1]}"
-        text = f"fx {fx:.1f} is {ratio:.2f} of the picture's long side, unusual for a phone ({usual})"
-        notes.append(Note("warning", "fx-unusual", text))
-    return True
 
 
 # ── start-up, frames, report ─────────────────────────────────────────────────────────────────────────────────────

@@ -2,10 +2,6 @@
 
 A frame is known by its presentation time (PTS), never by counting.  Pictures come as stored: the display rotation is
 left alone, so that the profile's intrinsics hold.
-
-Colour (contract, section 3): luma and chroma become RGB by the stream's own matrix and range, rounded; an untagged
-stream is BT.601, limited range, at any size.  Chroma is taken as lying in the middle of its 2 × 2 pixels, where
-software encoders put it whatever they tag; at the price of half a pixel of chroma where an encoder means the left.
 """
 
 from __future__ import annotations
@@ -23,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +26,7 @@ from virest.capture.coding_step import coding_step
 from virest.capture.files import label, require_regular_file
 from virest.capture.location import RemotePath, unreachable
 from virest.capture.pictures import PictureList, first_size, is_picture_source, read_picture_list, read_pictures
+from virest.capture.pixels import to_gray, to_rgb
 from virest.errors import VideoError
 
 log = logging.getLogger(__name__)
@@ -51,25 +47,10 @@ OTHER_MOVIES: dict[str, Callable[[bytes], bool]] = {
 """Containers that are not read, by their first bytes."""
 OWN_SUFFIXES = (".mp4", ".m4v", ".mov", ".3gp")
 MOVIE_SUFFIXES = (*OWN_SUFFIXES, ".mkv", ".webm", ".avi")
-KR_KB = {
-    1: (0.2126, 0.0722),  # BT.709
-    4: (0.30, 0.11),  # FCC
-    5: (0.299, 0.114),  # BT.601, 625 lines
-    6: (0.299, 0.114),  # BT.601, 525 lines
-    7: (0.212, 0.087),  # SMPTE 240M
-    9: (0.2627, 0.0593),  # BT.2020
-    10: (0.2627, 0.0593),
-}
-"""Weights of red and blue in luma, by the number that H.264 gives the matrix."""
-BT601 = 6
-FULL_RANGE = 2
 CENTRED_CHROMA = {"mjpeg", "mpeg1video"}
 """Codecs whose chroma lies between two columns of luma."""
 HDR_CURVES = {16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}
 """Transfer curves that no response curve here describes."""
-PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
-FIXED_POINT = 64
-"""Steps of a grey level in the 16-bit sums: luma and chroma together stay below 2^15."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,107 +395,3 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
     except av.FFmpegError as fault:
         log.warning("the movie's data end early: %s", _reason(fault))
         yield None
-
-
-# ── pixels ───────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-@dataclass(frozen=True, slots=True)
-class _ColourTables:
-    """Contribution of each 8-bit luma and chroma value to each of red, green and blue, in 1/FIXED_POINT levels."""
-
-    luma: NDArray[np.int16]
-    red_v: NDArray[np.int16]
-    green_u: NDArray[np.int16]
-    green_v: NDArray[np.int16]
-    blue_u: NDArray[np.int16]
-    gray: NDArray[np.uint8]
-    """Luma as full-range grey."""
-
-
-@lru_cache(maxsize=16)
-def _tables(matrix: int, full_range: bool) -> _ColourTables:
-    kr, kb = KR_KB[matrix]
-    kg = 1.0 - kr - kb
-    code = np.arange(256.0)
-    luma = code if full_range else (code - 16) * (255 / 219)
-    chroma = (code - 128) * (1.0 if full_range else 255 / 224)
-
-    def fixed(values: NDArray[np.float64]) -> NDArray[np.int16]:
-        return np.rint(values * FIXED_POINT).astype(np.int16)
-
-    return _ColourTables(
-        fixed(luma),
-        fixed(2 * (1 - kr) * chroma),
-        fixed(-2 * kb * (1 - kb) / kg * chroma),
-        fixed(-2 * kr * (1 - kr) / kg * chroma),
-        fixed(2 * (1 - kb) * chroma),
-        np.clip(np.rint(luma), 0, 255).astype(np.uint8),
-    )
-
-
-def _frame_tables(frame: Any) -> _ColourTables:
-    matrix = int(frame.colorspace)
-    full = int(frame.color_range) == FULL_RANGE or frame.format.name.startswith("yuvj")
-    return _tables(matrix if matrix in KR_KB else BT601, full)
-
-
-def _planes(frame: Any) -> list[NDArray[np.uint8]]:
-    """Views of the planes, padding cut off."""
-    return [
-        np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
-        for plane in frame.planes[:3]
-    ]
-
-
-def to_rgb(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
-    """RGB (h, w, 3) of a decoded PyAV frame, rounded; its size, matrix and range as the stream says.
-
-    centred: chroma lies between two columns of luma, not on the left one.
-    """
-    if frame.format.is_rgb:
-        return frame.to_ndarray(format="rgb24")
-    if frame.format.name not in PLANAR_8BIT:
-        frame = frame.reformat(format="yuv444p")
-    tables = _frame_tables(frame)
-    y_code, u_code, v_code = _planes(frame)
-    luma = cv2.LUT(y_code, tables.luma)
-    green = cv2.add(cv2.LUT(u_code, tables.green_u), cv2.LUT(v_code, tables.green_v))
-    channels = [
-        _levels(cv2.add(luma, _upsample(chroma, luma.shape, centred=centred)))
-        for chroma in (cv2.LUT(v_code, tables.red_v), green, cv2.LUT(u_code, tables.blue_u))
-    ]
-    return np.asarray(cv2.merge(channels), np.uint8)
-
-
-def _levels(fixed: NDArray[Any]) -> NDArray[Any]:
-    """Fixed-point sums to 8 bit, rounded, both ends clipped: two cheap passes, four times faster than one in float."""
-    return cv2.convertScaleAbs(cv2.max(fixed, 0), alpha=1 / FIXED_POINT)  # type: ignore[call-overload]
-
-
-def _upsample(chroma: NDArray[Any], shape: tuple[int, ...], *, centred: bool) -> NDArray[Any]:
-    """Chroma at the luma's size, bilinear.
-
-    A sample lies on the left one of its two columns of luma, as H.264 and its kin have it unless they say otherwise, or
-    between them (centred: JPEG and MPEG-1); always between its two rows.
-    """
-    height, width = shape[:2]
-    if chroma.shape[:2] == (height, width):
-        return chroma
-    factor_x, factor_y = -(-width // chroma.shape[1]), -(-height // chroma.shape[0])
-    if factor_x == 2 and not centred:
-        right = cv2.copyMakeBorder(chroma[:, 1:], 0, 0, 0, 1, cv2.BORDER_REPLICATE)
-        between = cv2.addWeighted(chroma, 0.5, right, 0.5, 0.0)
-        chroma, factor_x = cv2.merge([chroma, between]).reshape(len(chroma), -1), 1
-    size = (chroma.shape[1] * factor_x, chroma.shape[0] * factor_y)
-    return np.ascontiguousarray(cv2.resize(chroma, size, interpolation=cv2.INTER_CUBIC)[:height, :width])
-
-
-def to_gray(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
-    """Luma (h, w) of a decoded PyAV frame, scaled to the full range; centred: of the chroma, which is not used."""
-    del centred
-    if frame.format.is_rgb:
-        return cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
-    if frame.format.name not in PLANAR_8BIT:
-        frame = frame.reformat(format="yuv444p")
-    return np.asarray(cv2.LUT(_planes(frame)[0], _frame_tables(frame).gray), np.uint8)

@@ -31,7 +31,6 @@ from virest.diagnosis.selection import EDGE_LEVELS
 from virest.inference.chance import normal_tail
 from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
 from virest.inference.time_blocks import halves
-from virest.inference.unsharp_mask import PROFILE_STD
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -54,6 +53,8 @@ RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
 """Of phones' unsharp masks, and how far it varies (in the logarithm): 0.8 to 2 px."""
 AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
 """Of phones' unsharp masks, and how far it varies."""
+PROFILE_STD = 0.003
+"""Misfit of a mean profile, as part of the step; neighbours within a pixel share it."""
 BARE_OVERSHOOT, BARE_STD = 0.006, 0.007
 """Of decoded movies that nobody sharpened, mean and spread: coding, interpolation, and the choice of sharp edges."""
 BARE_RADII_PX = (0.6, 2.2)

@@ -246,14 +246,15 @@ class Trial:
     def rounds(self) -> Iterator[tuple[Judged, Judged, Array]]:
         """(cause, what choosing one gains, gain by block), best first, each time without those before it.
 
-        The cause is the best over all blocks; what it is judged by was chosen for each block by others.
+        The cause is the best over all blocks; what it is judged by was chosen for each block by others.  A lag shows in
+        one block, of which others tell nothing: it is judged as it is.
         """
         left = sorted(self.judged, key=lambda entry: float(entry.block_loss.mean()))
         while left:
             after = choose(self.evidence, [self.before, *left], self.allowed, self.scale)
             gain = self.before.block_loss - after.block_loss
             if left[0].candidate.name == "frame_lag":
-                gain = lagging_gain(self.evidence, self.before, left[0])
+                after, gain = left[0], lagging_gain(self.evidence, self.before, left[0])
             yield left[0], after, gain
             left = left[1:]
 

@@ -42,7 +42,7 @@ from virest.diagnosis.local_blur_spectra import (
 )
 from virest.inference.edges import EdgeSettings
 from virest.inference.parallel import ParallelMap, one_by_one
-from virest.inference.robust import robust_std
+from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 from virest.inference.time_blocks import even_blocks
 from virest.motion.trajectory import Trajectory
 
@@ -283,14 +283,8 @@ def _remembered(off: Array, columns: Array) -> Array:
         root = np.sqrt(weight)
         shares = np.linalg.lstsq(columns * root[:, None], off * root, rcond=None)[0]
         fitted = columns @ np.clip(shares, 0.0, 0.5)
-        weight = robust_weights(off - fitted)
+        weight = cauchy_weight((off - fitted) ** 2, CAUCHY * max(robust_std(off - fitted), 1e-9))
     return fitted
-
-
-def robust_weights(residual: Array) -> Array:
-    """Weights (1 + (r / 2 s)²)⁻², s from the median deviation: whatever lies far out counts ever less."""
-    scale = robust_std(residual)
-    return np.asarray((1.0 + (residual / (2.0 * max(scale, 1e-9))) ** 2) ** -2)
 
 
 def _motion_px(edges: EdgeWidths, profile: CameraProfile, trajectory: Trajectory) -> Array:

@@ -20,11 +20,11 @@ from virest.diagnosis.local_blur import (
     PredictedBlur,
     predicted_blur,
     residuals,
-    robust_weights,
     time_blocks,
 )
 from virest.diagnosis.local_blur_model import predicted_ratios
 from virest.inference.clustered import scatter
+from virest.inference.descent import Residuals, Slopes, System, descend, slices, slopes_by_steps
 from virest.inference.robust import robust_std
 from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
@@ -41,9 +41,10 @@ _NUISANCE = np.array([LENS_SIGMA_PX, 0.0])
 _NUISANCE_STD = np.array([LENS_STD_PX, SHIFT_STD_S])
 _NUISANCE_LOW = np.array([0.35, -0.03])
 _NUISANCE_HIGH = np.array([0.95, 0.03])
+_LOW, _HIGH, _STEP = 0.02, 50.0, 0.02
+"""Bounds of every effect's value, and its finite difference."""
 _NUISANCE_STEP = np.array([0.02, 5e-4])
-_DAMPING_STEP = 0.02
-_STEPS = 5
+_DAMPING_STEP, _LEAST_STD_PX = 0.02, 1e-3
 
 
 class BlurEffect(Protocol):
@@ -151,7 +152,7 @@ def fit(
     effects: Sequence[BlurEffect],
     use: Mask | None = None,
 ) -> BlurFit:
-    """Robust Gauss-Newton by finite differences for the effects' values and the nuisances, which have priors.
+    """Fit the effects' values and the nuisances, which have priors, robustly.
 
     use: mask over the residuals.  Effects that the capture does not determine, or whose values run to the end of what
     they may be, keep their values, with infinite deviations.  The covariance is a sandwich over time blocks: what lies
@@ -174,17 +175,9 @@ def _fit(
 ) -> BlurFit:
     """As :func:`fit`, for those effects that are known to be determined."""
     free = [e for e, yes in zip(effects, known, strict=True) if yes]
-    problem = _Problem(observations, profile, trajectory, free, use)
-    theta = np.concatenate([*(e.starts(observations, profile)[0] for e in free), _NUISANCE])
-    for _ in range(_STEPS):
-        residual, jacobian, weight = problem.linearised(theta)
-        move = problem.solve(residual, jacobian, weight, theta)
-        theta = problem.held(theta + move)
-        if np.all(np.abs(move) < 0.02 * problem.steps):
-            break
-    residual, jacobian, weight = problem.linearised(theta)
-    covariance = problem.covariance(theta, residual, jacobian, weight)
-    return _as_fit(problem, effects, known, theta, covariance, robust_std(residual))
+    evidence = _Widths(observations, profile, trajectory, free, use)
+    found = descend(evidence, np.concatenate([*(e.starts(observations, profile)[0] for e in free), _NUISANCE]))
+    return _as_fit(evidence, effects, known, found)
 
 
 def judge(observations: BlurObservations, found: BlurFit, trajectory: Trajectory, use: Mask) -> float:
@@ -205,8 +198,8 @@ def held_out(
 
 
 @dataclass(frozen=True, slots=True)
-class _Problem:
-    """The least squares of one fit: values of the effects, then the nuisances."""
+class _Widths:
+    """Widths and spectra as evidence: values of the effects, then the nuisances."""
 
     observations: BlurObservations
     profile: CameraProfile
@@ -221,94 +214,73 @@ class _Problem:
         """Values of the effects."""
         return sum(len(e.parameters) for e in self.effects)
 
-    @property
-    def steps(self) -> Array:
-        """Finite differences of all values."""
-        return np.concatenate([np.full(self.count, 0.02), _NUISANCE_STEP])
-
-    @property
-    def precision(self) -> Array:
-        """Diagonal of the priors' inverse covariance."""
-        return np.concatenate([np.zeros(self.count), _NUISANCE_STD**-2])
-
-    def applied(self, theta: Array) -> CameraProfile:
+    def applied(self, values: Array) -> CameraProfile:
         """The profile with the effects' values."""
-        profile, at = self.profile, 0
-        for effect in self.effects:
-            profile = effect.apply(profile, theta[at : at + len(effect.parameters)])
-            at += len(effect.parameters)
+        profile = self.profile
+        for effect, own in zip(self.effects, slices(len(e.parameters) for e in self.effects), strict=True):
+            profile = effect.apply(profile, values[own])
         return profile
 
-    def residual(self, theta: Array, damping: float = 1.0) -> Array:
-        """The used residuals."""
-        lens, shift = theta[self.count :]
-        profile = _shifted(self.applied(theta), float(shift))
+    def left(self, values: Array, damping: float = 1.0) -> Array:
+        """The used residuals, px."""
+        lens, shift = values[self.count :]
+        profile = _shifted(self.applied(values), float(shift))
         key = profile.shutter.exposure_scale, float(shift)
         if key not in self.known:
             self.known[key] = predicted_blur(self.observations, profile, self.trajectory)
         return residuals(self.observations, profile, self.trajectory, float(lens), damping, self.known[key])[self.use]
 
-    def linearised(self, theta: Array) -> tuple[Array, Array, Array]:
-        """Residuals, their derivatives (n, p), and robust weights over variance, each kind by its own scale."""
-        residual = self.residual(theta)
-        columns = [
-            (self.residual(theta + size * one) - residual) / size
-            for size, one in zip(self.steps, np.eye(len(theta)), strict=True)
-        ]
-        weight = np.zeros(len(residual))
-        edge = self.observations.is_edge[self.use]
+    def look(self, values: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
+        """Residuals, and slopes by finite differences."""
+        left, steps = self.left(values), self._with_nuisances(_STEP, _NUISANCE_STEP)
+        if before is not None and not (kept := replace(before, left=left)).is_stale(limit):
+            return kept
+        high = self._with_nuisances(_HIGH, _NUISANCE_HIGH)
+        return Residuals(left, slopes_by_steps(lambda at: -self.left(at), -left, values, steps, high), left)
+
+    def weighed(self, values: Array, look: Residuals) -> System[Array, Residuals]:
+        """Edges and spectra each have their own deviation, which their residuals tell."""
+        scale, edge = np.empty(len(look.left)), self.observations.is_edge[self.use]
         for kind in (edge, ~edge):
-            weight[kind] = robust_weights(residual[kind]) / max(robust_std(residual[kind]), 1e-3) ** 2
-        return residual, np.stack(columns, -1), weight
+            scale[kind] = max(robust_std(look.left[kind]), _LEAST_STD_PX)
+        prior = self._with_nuisances(0.0, _NUISANCE_STD**-2)
+        off = values - self._with_nuisances(0.0, _NUISANCE)
+        low, high = self._with_nuisances(_LOW, _NUISANCE_LOW), self._with_nuisances(_HIGH, _NUISANCE_HIGH)
+        rows, left = look.slope[:, None], look.left[:, None]
+        return System(values, look, rows, left, look.left**2, scale, prior, off, room=(low - values, high - values))
 
-    def solve(self, residual: Array, jacobian: Array, weight: Array, theta: Array) -> Array:
-        """The Gauss-Newton step."""
-        prior = np.concatenate([np.zeros(self.count), theta[self.count :] - _NUISANCE])
-        gradient = jacobian.T @ (weight * residual) + self.precision * prior
-        return -np.linalg.pinv(self._hessian(jacobian, weight)) @ gradient
+    def moved(self, values: Array, step: Array) -> Array:
+        """After a step."""
+        return values + step
 
-    def _hessian(self, jacobian: Array, weight: Array) -> Array:
-        return (jacobian * weight[:, None]).T @ jacobian + np.diag(self.precision)
+    def _with_nuisances(self, of_effects: float, of_nuisances: Array) -> Array:
+        return np.append(np.full(self.count, of_effects), of_nuisances)
 
-    def covariance(self, theta: Array, residual: Array, jacobian: Array, weight: Array) -> Array:
+    def covariance(self, found: System[Array, Residuals]) -> Array:
         """H⁻¹ (Σ g g' over time blocks + prior) H⁻¹ of all values, and what an unknown damping adds.
 
         The damping is not fitted: beside the length of the path it would be told by the ratios' curvature alone,
         which coding changes too.
         """
         block = time_blocks(self.observations.time_s)[self.use]
-        meat = scatter(jacobian * (weight * residual)[:, None], block) + np.diag(self.precision)
-        inverse = np.linalg.pinv(self._hessian(jacobian, weight))
-        by_damping = (self.residual(theta, 1.0 + _DAMPING_STEP) - residual) / _DAMPING_STEP
-        pulled = inverse @ (jacobian.T @ (weight * by_damping)) * np.hypot(self.observations.damping_std, 2 * PATH_STD)
-        return inverse @ meat @ inverse + np.outer(pulled, pulled)
-
-    def held(self, theta: Array) -> Array:
-        """Values inside what is possible."""
-        values = np.clip(theta[: self.count], 0.02, 50.0)
-        return np.concatenate([values, np.clip(theta[self.count :], _NUISANCE_LOW, _NUISANCE_HIGH)])
+        by_damping = (self.left(found.state, 1.0 + _DAMPING_STEP) - found.look.left) / _DAMPING_STEP
+        pulled = found.inverse() @ found.pull(by_damping[:, None])
+        pulled = pulled * np.hypot(self.observations.damping_std, 2 * PATH_STD)
+        return found.sandwich(scatter(found.score, block)) + np.outer(pulled, pulled)
 
 
 def _as_fit(
-    problem: _Problem,
-    effects: Sequence[BlurEffect],
-    known: tuple[bool, ...],
-    theta: Array,
-    covariance: Array,
-    rms_px: float,
+    evidence: _Widths, effects: Sequence[BlurEffect], known: tuple[bool, ...], found: System[Array, Residuals]
 ) -> BlurFit:
     """Spread the free effects' values among all that were asked for."""
-    total = sum(len(e.parameters) for e in effects)
-    spread = np.diag(np.full(total, np.inf))
-    place = np.flatnonzero([yes for e, yes in zip(effects, known, strict=True) for _ in e.parameters])
-    spread[np.ix_(place, place)] = covariance[: len(place), : len(place)]
-    values, at = [], 0
-    for effect, yes in zip(effects, known, strict=True):
-        size = len(effect.parameters)
-        values.append(theta[at : at + size] if yes else np.full(size, np.nan))
-        at += size if yes else 0
-    names = tuple(e.name for e in effects)
-    return BlurFit(names, tuple(values), spread, theta[problem.count :], problem.applied(theta), rms_px, known)
+    sizes, count = [len(e.parameters) for e in effects], evidence.count
+    place = np.flatnonzero(np.repeat(known, sizes))
+    values, spread = np.full(sum(sizes), np.nan), np.diag(np.full(sum(sizes), np.inf))
+    values[place] = found.state[:count]
+    spread[np.ix_(place, place)] = evidence.covariance(found)[:count, :count]
+    names, each = tuple(e.name for e in effects), tuple(values[own] for own in slices(sizes))
+    profile, rms_px = evidence.applied(found.state), robust_std(found.look.left)
+    return BlurFit(names, each, spread, found.state[count:], profile, rms_px, known)
 
 
 def _shifted(profile: CameraProfile, shift_s: float) -> CameraProfile:

@@ -10,6 +10,8 @@ import numpy as np
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import Array, PhotometricObservations, predict
+from virest.effects.changes import extended
+from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import ROW_MIDDLE
 
 _SCAN_OBSERVATIONS = 7_000
@@ -18,6 +20,7 @@ _SCAN_STEP_CYCLES = 0.3
 """Scan step times the capture's length."""
 _LEAST_SINC = 0.03
 """An exposure of nearly whole periods leaves less of the flicker than this: not looked for."""
+Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class PhotometricEffect(Protocol):
@@ -43,6 +46,11 @@ class PhotometricEffect(Protocol):
         """Whether each value belongs to one frame only, so that other frames cannot judge it; other places can."""
         ...
 
+    @property
+    def bounds(self) -> Bounds:
+        """Least and greatest of each value."""
+        ...
+
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
         """Values from which a fit may begin, best first."""
         ...
@@ -52,78 +60,76 @@ class PhotometricEffect(Protocol):
         ...
 
 
-def _curve(profile: CameraProfile, **changes: Any) -> CameraProfile:
+@dataclass(frozen=True, slots=True)
+class _OneValue:
+    """An effect of one value that the profile has."""
+
+    name: str
+    size: float
+    """Typical change."""
+    bounds: Bounds
+    per_frame: bool = False
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """As the table of effects has it."""
+        return tuple(parameter.name for parameter in EFFECTS[self.name].parameters)
+
+    @property
+    def scale(self) -> Array:
+        """The typical change."""
+        return np.array([self.size])
+
+    def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
+        """What the profile has."""
+        return [np.array(list(EFFECTS[self.name].read(profile, profile).values()))]
+
+
+def _bent(profile: CameraProfile, **changes: Any) -> CameraProfile:
     return replace(profile, response=replace(profile.response or ResponseCurve("srgb"), **changes))
 
 
-def _extend(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    return replace(profile, extensions=replace(profile.extensions, **changes))
-
-
 @dataclass(frozen=True, slots=True)
-class ResponseGamma:
+class ResponseGamma(_OneValue):
     """Another gamma on top of the profile's curve."""
 
     name: str = "response_curve"
-    parameters: tuple[str, ...] = ("gamma",)
-    per_frame: bool = False
-
-    @property
-    def scale(self) -> Array:
-        """A tenth."""
-        return np.array([0.1])
-
-    def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """What the profile has."""
-        return [np.array([profile.response.extra_gamma if profile.response else 1.0])]
+    size: float = 0.1
+    bounds: Bounds = ((0.2,), (5.0,))
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Kept within the profile's limits."""
-        return _curve(profile, extra_gamma=float(np.clip(values[0], 0.2, 5.0)))
+        """Set response.extra_gamma."""
+        return replace(
+            profile, response=replace(profile.response or ResponseCurve("srgb"), extra_gamma=float(values[0]))
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class BlackLevel:
-    """Grey where there is no light."""
+class BlackLevel(_OneValue):
+    """Grey where there is no light: a change of two grey levels or so."""
 
     name: str = "black_level"
-    parameters: tuple[str, ...] = ("black_level",)
-    per_frame: bool = False
-
-    @property
-    def scale(self) -> Array:
-        """Two grey levels or so."""
-        return np.array([0.01])
-
-    def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """What the profile has."""
-        return [np.array([profile.response.black_level if profile.response else 0.0])]
+    size: float = 0.01
+    bounds: Bounds = ((0.0,), (0.5,))
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Never below 0."""
-        return _curve(profile, black_level=float(np.clip(values[0], 0.0, 0.5)))
+        """Set response.black_level."""
+        return replace(
+            profile, response=replace(profile.response or ResponseCurve("srgb"), black_level=float(values[0]))
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class Vignetting:
+class Vignetting(_OneValue):
     """Loss of light towards the corners."""
 
     name: str = "vignetting"
-    parameters: tuple[str, ...] = ("corner_loss",)
-    per_frame: bool = False
-
-    @property
-    def scale(self) -> Array:
-        """A tenth of the light."""
-        return np.array([0.1])
-
-    def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """What the profile has."""
-        return [np.array([profile.extensions.vignetting_corner_loss])]
+    size: float = 0.1
+    bounds: Bounds = ((-0.9,), (0.95,))
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Kept within the profile's limits."""
-        return _extend(profile, vignetting_corner_loss=float(np.clip(values[0], -0.9, 0.95)))
+        """Set extensions.vignetting_corner_loss."""
+        return extended(profile, vignetting_corner_loss=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +139,7 @@ class Flicker:
     name: str = "flicker"
     parameters: tuple[str, ...] = ("amplitude", "frequency_hz", "phase_rad")
     per_frame: bool = False
+    bounds: Bounds = ((-0.95, 1.0, -np.inf), (0.95, np.inf, np.inf))
     search_hz: tuple[float, float] = (20.0, 400.0)
     candidates: int = 4
     """How many peaks of the scan a fit begins at: aliases of each other look alike until they are refined."""
@@ -154,10 +161,10 @@ class Flicker:
         """A negative amplitude is a positive one half a period later."""
         amplitude, frequency, phase = (float(v) for v in values)
         phase = float(np.mod(phase + (np.pi if amplitude < 0 else 0.0), 2 * np.pi))
-        return _extend(
+        return extended(
             profile,
-            flicker_amplitude=min(abs(amplitude), 0.95),
-            flicker_frequency_hz=max(frequency, 1.0),
+            flicker_amplitude=abs(amplitude),
+            flicker_frequency_hz=frequency,
             flicker_phase_rad=phase,
         )
 
@@ -182,6 +189,11 @@ class GainDrift:
         """A tenth of the light."""
         return np.full(len(self.frames), 0.1)
 
+    @property
+    def bounds(self) -> Bounds:
+        """None."""
+        return (-np.inf,) * len(self.frames), (np.inf,) * len(self.frames)
+
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
         """What the profile has."""
         gain = np.append(profile.extensions.gain, 1.0)
@@ -200,7 +212,7 @@ class GainDrift:
         """Median 1 over the movie."""
         log_gain = np.interp(np.arange(self.movie_frames), self.frames, values)
         gain = np.exp(np.clip(log_gain - np.median(log_gain), -3.0, 3.0))
-        return _extend(profile, gain=tuple((gain / np.median(gain)).tolist()))
+        return extended(profile, gain=tuple((gain / np.median(gain)).tolist()))
 
 
 def photometric_effects(observations: PhotometricObservations, movie_frames: int) -> tuple[PhotometricEffect, ...]:

@@ -1,46 +1,46 @@
 """Fit photometric effects, state how well they are known, and judge them where they were not fitted.
 
-Robust Gauss-Newton (Cauchy weights, iterated) on the residuals in units of their noise, derivatives by finite
-differences.  Residuals are not independent: those of one stretch of time share their frames' registration and coding,
-those of one place its texture.  Covariances count both (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
+Residuals are in units of their noise, each patch's light eliminated.  They are not independent: those of one stretch of
+time share their frames' registration and coding, those of one place its texture.  Covariances count both (Cameron,
+Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice, product
 
 import numpy as np
 
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
-from virest.diagnosis.photometry import Array, Indices, Mask, PhotometricObservations, normalised_rms, predict
+from virest.diagnosis.photometry import (
+    Array,
+    Indices,
+    Mask,
+    PhotometricObservations,
+    Prediction,
+    normalised_rms,
+    predict,
+)
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
 from virest.inference.chance import chi2_tail, normal_deviate
 from virest.inference.clustered import raised, scatter
+from virest.inference.descent import Residuals, Slopes, System, descend, slices, slopes_by_steps
 from virest.inference.parallel import ParallelMap, one_by_one
-from virest.inference.robust import cauchy_weight
+from virest.inference.robust import CAUCHY, cauchy_weight
 from virest.inference.time_blocks import halves, varied_blocks
 
-_CAUCHY = 2.5
-"""Residuals, in noises, at which the weight has fallen to a half."""
-_ITERATIONS = 12
 _MAX_STARTS = 8
-_FIRST_MEMORY = 0.2
-_MOST_MEMORY = 0.6
-_MEMORY_SPREAD = 0.2
+_FIRST_MEMORY, _MEMORY_SPREAD, _MOST_MEMORY = 0.2, 0.2, 0.6
 _PRIOR_SCALES = 10.0
 """Weak knowledge that keeps what the data leave open where it was: this many typical changes."""
-_FRESH_JACOBIAN = (0, 1, 3, 6)
-"""Steps at which the derivatives are taken anew; between them the old ones serve."""
 _SMALL_STEP = 1e-3
 _MEMORY_STEP = 0.01
 _TRIAL_OBSERVATIONS = 6_000
 _PER_FRAME = 100
 """Observations of a frame that its own value is fitted to; more cost much and tell little."""
-_SETTLED_FALL = 0.05
-"""Falls of the loss, in noises squared, that are no longer worth a step."""
 MEMORY_DOUBT = 0.25
 """One memory for a movie is a rough model of an encoder: this part of what it changes in a value counts as unsure."""
 LAG_DOUBT = 0.2
@@ -93,12 +93,9 @@ class PhotometricFit:
 
     def of(self, effect_name: str) -> tuple[Array, Array]:
         """(values, covariance) of one effect."""
-        start = 0
-        for effect in self.effects:
-            end = start + len(effect.parameters)
+        for effect, own in _parts(self.effects):
             if effect.name == effect_name:
-                return self.values[start:end], self.covariance[start:end, start:end]
-            start = end
+                return self.values[own], self.covariance[own, own]
         raise KeyError(effect_name)
 
 
@@ -121,11 +118,13 @@ def fit_photometry(
     effects = tuple(e.seen_in(chosen) if isinstance(e, GainDrift) else e for e in effects)
     all_starts = product(*(effect.starts(chosen, profile) for effect in effects))
     starts = [np.concatenate([*start, [_FIRST_MEMORY]]) for start in islice(all_starts, _MAX_STARTS)]
-    values, cost = _descend(chosen, profile, effects, _best_start(chosen, profile, effects, starts))
-    covariance = _covariance(chosen, profile, effects, values)[:-1, :-1]
-    final, memory = _applied(profile, effects, values), _memory(values)
+    start = _best_start(chosen, profile, effects, starts)
+    evidence = _Brightness(chosen, profile, effects, start)
+    found = descend(evidence, start)
+    covariance = _covariance(evidence, found)[:-1, :-1]
+    final, memory = evidence.applied(found.state), float(found.state[-1])
     rms = normalised_rms(chosen.with_memory(memory), final)[0]
-    return PhotometricFit(effects, values[:-1], covariance, final, rms, cost, memory)
+    return PhotometricFit(effects, found.state[:-1], covariance, final, rms, 2 * found.cost(1.0), memory)
 
 
 def pulls(
@@ -139,26 +138,13 @@ def pulls(
     changed: the profile that was fitted with one other value larger by a step, and the step, for each of the m.
     What all values per frame have in common is not observable and left out.
     """
-    chosen, effects = _fitted_part(observations, fitted.effects), fitted.effects
     values = np.append(fitted.values, fitted.memory)
-    weight = _settled(chosen, profile, effects, values)[1]
-    jacobian = _jacobian(chosen, profile, effects, values, weight)
-    weighted = jacobian * weight[:, None]
-    seen, full = chosen.with_memory(fitted.memory), weight / chosen.noise**2
-
-    def at(base: CameraProfile) -> Array:
-        return predict(seen, _applied(base, effects, values), full).residual / chosen.noise
-
-    here = at(profile)
-    moved = np.stack([(at(base) - here) / step for base, step in changed], axis=-1)
-    normal = weighted.T @ jacobian + np.diag(_prior(effects))
-    followed, start = -np.linalg.solve(normal, weighted.T @ moved)[:-1], 0
-    for effect in effects:
-        own = slice(start, start + len(effect.parameters))
-        if effect.per_frame:
-            followed[own] -= followed[own].mean(axis=0)
-        start = own.stop
-    return np.asarray(followed)
+    evidence = _Brightness(_fitted_part(observations, fitted.effects), profile, fitted.effects, values)
+    here = evidence.weighed(values, evidence.look(values))
+    left = evidence.left(values, here.weight)
+    moved = [(replace(evidence, profile=base).left(values, here.weight) - left) / step for base, step in changed]
+    pulled = here.pull(np.stack(moved, axis=-1)[:, None])
+    return np.asarray((_centring(fitted.effects) @ np.linalg.solve(here.normal, pulled))[:-1])
 
 
 def judge(
@@ -183,11 +169,6 @@ def judge(
         before, noise = normalised_rms(held.with_memory(without.memory), profile)
         judged.append((before, normalised_rms(held.with_memory(fit.memory), fit.profile)[0], noise))
     return HeldOutGain.of_folds(PHOTOMETRY, judged)
-
-
-def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:
-    """RMS over the held-out observations alone; their patches' light is found among themselves."""
-    return normalised_rms(observations.subset(held), profile)[0]
 
 
 def significance(fit: PhotometricFit, effect_name: str, observations: PhotometricObservations) -> tuple[float, float]:
@@ -283,139 +264,110 @@ def _best_start(
     if len(starts) == 1:
         return starts[0]
     part = _thinned(observations, _TRIAL_OBSERVATIONS)
-    return min((_descend(part, profile, effects, start) for start in starts), key=lambda found: found[1])[0]
+    tried = [descend(_Brightness(part, profile, effects, start), start, fresh=False) for start in starts]
+    return min(tried, key=lambda found: found.cost(1.0)).state
 
 
-# ── descent ────────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── brightness as evidence ─────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _applied(profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array) -> CameraProfile:
-    start = 0
-    for effect in effects:
-        profile = effect.apply(profile, values[start : start + len(effect.parameters)])
-        start += len(effect.parameters)
-    return profile
+def _parts(effects: Sequence[PhotometricEffect]) -> Iterator[tuple[PhotometricEffect, slice]]:
+    """Each effect, and where its values lie among all."""
+    return zip(effects, slices(len(effect.parameters) for effect in effects), strict=True)
 
 
-def _memory(values: Array) -> float:
-    return float(np.clip(values[-1], 0.0, _MOST_MEMORY))
+@dataclass(frozen=True, slots=True)
+class _Brightness:
+    """Observations, and what stays the same through a descent; values (k + 1,) of the effects, then the memory."""
 
+    observations: PhotometricObservations
+    profile: CameraProfile
+    effects: Sequence[PhotometricEffect]
+    start: Array
 
-def _cost(residual: Array) -> float:
-    return float(_CAUCHY**2 * np.sum(np.log1p((residual / _CAUCHY) ** 2)))
+    def applied(self, values: Array) -> CameraProfile:
+        """The profile with the effects' values."""
+        profile = self.profile
+        for effect, own in _parts(self.effects):
+            profile = effect.apply(profile, values[own])
+        return profile
 
+    def predicted(self, values: Array, weight: Array) -> Prediction:
+        """What the values make of the observations; weight: (n,) of each in its patch's light, beside its noise."""
+        seen = self.observations.with_memory(float(values[-1]))
+        return predict(seen, self.applied(values), weight / seen.noise**2)
 
-def _prior(effects: Sequence[PhotometricEffect]) -> Array:
-    """Precision of the weak knowledge about each value and the memory, (k + 1,)."""
-    spread = [_PRIOR_SCALES * effect.scale for effect in effects]
-    return 1 / np.concatenate([*spread, [_MEMORY_SPREAD]]) ** 2
+    def left(self, values: Array, weight: Array) -> Array:
+        """Measured minus predicted (n,), in noises."""
+        return self.predicted(values, weight).residual / self.observations.noise
 
+    def look(self, values: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
+        """Residuals whose robust weights the patches' light takes into account too."""
+        weight = np.ones(len(self.observations))
+        for _ in range(2):
+            left = self.left(values, weight)
+            weight = cauchy_weight(left**2, CAUCHY)
+        if before is not None and not (kept := replace(before, left=left)).is_stale(limit):
+            return kept
+        return Residuals(left, self._slope(values, weight), left)
 
-def _descend(
-    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], start: Array
-) -> tuple[Array, float]:
-    """Gauss-Newton with robust weights; steps that do not lower the loss are damped."""
-    prior, values = _prior(effects), start
+    def _slope(self, values: Array, weight: Array) -> Array:
+        """Change (n, k) of the prediction per unit of each value, in noises; exact for gains."""
+        slope, noise = np.zeros((len(weight), len(values))), self.observations.noise
+        steps = np.append(np.zeros(len(values) - 1), _MEMORY_STEP)
+        for effect, own in _parts(self.effects):
+            if isinstance(effect, GainDrift):
+                columns = effect.columns(self.observations)
+                slope[:, own] = -self.predicted(values, weight).respond(columns) / noise[:, None]
+            else:
+                steps[own] = effect.scale * _SMALL_STEP
+        which = np.flatnonzero(steps)
 
-    def loss(residual: Array, at: Array) -> float:
-        return _cost(residual) + float(prior @ (at - start) ** 2)
+        def at(some: Array) -> Array:
+            changed = values.copy()
+            changed[which] = some
+            return -self.left(changed, weight)
 
-    residual, weight = _settled(observations, profile, effects, values)
-    cost, damping = loss(residual, values), 1e-4
-    jacobian = np.zeros((0, 0))
-    for iteration in range(_ITERATIONS):
-        if iteration in _FRESH_JACOBIAN:
-            jacobian = _jacobian(observations, profile, effects, values, weight)
-        weighted = jacobian * weight[:, None]
-        normal = weighted.T @ jacobian + np.diag(prior)
-        right = -weighted.T @ residual - prior * (values - start)
-        for _ in range(5):
-            step = np.linalg.solve(normal + np.diag(damping * np.diag(normal)), right)
-            trial, trial_weight = _settled(observations, profile, effects, values + step)
-            if loss(trial, values + step) < cost:
-                break
-            damping *= 10
-        else:
-            break
-        values, residual, weight = values + step, trial, trial_weight
-        fall, cost, damping = cost - loss(trial, values), loss(trial, values), damping * 0.2
-        if fall < _SETTLED_FALL:
-            break
-    return values, cost
+        slope[:, which] = slopes_by_steps(at, at(values[which]), values[which], steps[which], self._bounds[1][which])
+        return slope
 
+    def weighed(self, values: Array, look: Residuals) -> System[Array, Residuals]:
+        """The noise is known; each value, and the memory, is held weakly to where it began."""
+        spread = [_PRIOR_SCALES * effect.scale for effect in self.effects]
+        prior = 1 / np.concatenate([*spread, [_MEMORY_SPREAD]]) ** 2
+        low, high = self._bounds
+        rows, left = look.slope[:, None], look.left[:, None]
+        room = low - values, high - values
+        return System(values, look, rows, left, look.left**2, 1.0, prior, values - self.start, room=room)
 
-def _settled(
-    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array
-) -> tuple[Array, Array]:
-    """Residuals in noises and their robust weights, which the patches' light takes into account too."""
-    observations, profile = observations.with_memory(_memory(values)), _applied(profile, effects, values)
-    weight = np.ones(len(observations))
-    for _ in range(2):
-        residual = predict(observations, profile, weight / observations.noise**2).residual / observations.noise
-        weight = cauchy_weight(residual**2, _CAUCHY)
-    return residual, weight
+    def moved(self, values: Array, step: Array) -> Array:
+        """After a step."""
+        return values + step
 
-
-def _jacobian(
-    observations: PhotometricObservations,
-    profile: CameraProfile,
-    effects: Sequence[PhotometricEffect],
-    values: Array,
-    weight: Array,
-) -> Array:
-    """Change of the residuals (in noises) with the values, (n, k); central differences, exact for gains."""
-    noise, start, parts = observations.noise, 0, []
-    full = weight / noise**2
-
-    def at(changed: Array) -> Array:
-        seen = observations.with_memory(_memory(changed))
-        return predict(seen, _applied(profile, effects, changed), full).residual / noise
-
-    for effect in effects:
-        if isinstance(effect, GainDrift):
-            here = predict(observations.with_memory(_memory(values)), _applied(profile, effects, values), full)
-            parts.append(here.respond(effect.columns(observations)) / noise[:, None])
-        else:
-            parts.append(_differences(at, values, start, effect.scale * _SMALL_STEP))
-        start += len(effect.parameters)
-    parts.append(_differences(at, values, start, np.array([_MEMORY_STEP])))
-    return np.concatenate(parts, axis=1)
-
-
-def _differences(at: Callable[[Array], Array], values: Array, start: int, steps: Array) -> Array:
-    columns = []
-    for i, step in enumerate(steps):
-        change = np.zeros_like(values)
-        change[start + i] = step
-        columns.append((at(values + change) - at(values - change)) / (2 * step))
-    return np.stack(columns, axis=-1)
+    @property
+    def _bounds(self) -> tuple[Array, Array]:
+        low, high = ([end for effect in self.effects for end in effect.bounds[side]] for side in (0, 1))
+        return np.array([*low, 0.0]), np.array([*high, _MOST_MEMORY])
 
 
 # ── covariance ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _covariance(
-    observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array
-) -> Array:
+def _covariance(evidence: _Brightness, found: System[Array, Residuals]) -> Array:
     """Sandwich of the scores summed over blocks of time and over places; never below what white noise gives.
 
     Values per frame leave nothing of a block's sum, so with them only places count.
     """
-    residual, weight = _settled(observations, profile, effects, values)
-    jacobian = _jacobian(observations, profile, effects, values, weight)
-    prior = np.diag(_prior(effects))
-    normal = (jacobian * weight[:, None]).T @ jacobian + prior
-    inverse = np.asarray(np.linalg.inv(normal), np.float64)
-    by_frame = any(effect.per_frame for effect in effects)
-    score = jacobian * (weight * residual)[:, None]
+    observations, effects, values = evidence.observations, evidence.effects, found.state
+    score, by_frame = found.score, any(effect.per_frame for effect in effects)
     spread = scatter(score, observations.place)
     if not by_frame:
         spread = spread + scatter(score, time_blocks(observations)) - score.T @ score
-    white: Array = inverse * max(float(np.sum(weight * residual**2) / np.sum(weight)), 1.0)
-    sandwich = inverse @ (spread + prior) @ inverse
-    doubt = MEMORY_DOUBT * _memory(values) * _pull_of_memory(normal)
+    white: Array = found.inverse() * max(float(np.sum(found.weight * found.squared) / np.sum(found.weight)), 1.0)
+    sandwich = found.sandwich(spread)
+    doubt = MEMORY_DOUBT * values[-1] * _pull_of_memory(found.normal)
     lag = LAG_DOUBT * _changes(observations, effects, values)
-    model = np.outer(doubt, doubt) + np.diag(lag**2) + _resolution(observations, profile, effects, values)
+    model = np.outer(doubt, doubt) + np.diag(lag**2) + _resolution(observations, evidence.profile, effects, values)
     if not by_frame:
         return raised(sandwich, white) + model
     shared, frames = np.ones(len(values)), _centring(effects)
@@ -427,15 +379,13 @@ def _resolution(
     observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array
 ) -> Array:
     """Covariance (k + 1, k + 1) that RESOLUTION adds to that of the values and the memory."""
-    added, start = np.zeros((len(values), len(values))), 0
-    for effect in effects:
-        own = slice(start, start + len(effect.parameters))
+    added = np.zeros((len(values), len(values)))
+    for effect, own in _parts(effects):
         square = RESOLUTION[effect.name] ** 2
         if effect.name == "flicker":
-            added[own, own] = square * _pulse_resolution(observations, profile, float(values[start]))
+            added[own, own] = square * _pulse_resolution(observations, profile, float(values[own.start]))
         else:
             added[own, own] = np.diag(np.full(len(effect.parameters), square))
-        start = own.stop
     return added
 
 
@@ -457,13 +407,12 @@ def _changes(observations: PhotometricObservations, effects: Sequence[Photometri
 
     0 for all other values and the memory.
     """
-    parts, start = [], 0
-    for effect in effects:
-        own = values[start : start + len(effect.parameters)]
-        exposed = _exposure_steps(observations, effect.frames) if isinstance(effect, GainDrift) else own
-        parts.append(np.abs(own - _frames_before(own, 1)) + exposed if effect.per_frame else np.zeros(len(own)))
-        start += len(own)
-    return np.concatenate([*parts, [0.0]])
+    changes = np.zeros(len(values))
+    for effect, own in _parts(effects):
+        if isinstance(effect, GainDrift):
+            exposed = _exposure_steps(observations, effect.frames)
+            changes[own] = np.abs(values[own] - _frames_before(values[own], 1)) + exposed
+    return changes
 
 
 def _exposure_steps(observations: PhotometricObservations, frames: Sequence[int]) -> Array:
@@ -475,13 +424,10 @@ def _exposure_steps(observations: PhotometricObservations, frames: Sequence[int]
 
 def _centring(effects: Sequence[PhotometricEffect]) -> Array:
     """Matrix (k + 1, k + 1) that takes the mean off the values per frame and leaves the others."""
-    size = sum(len(effect.parameters) for effect in effects) + 1
-    matrix, start = np.eye(size), 0
-    for effect in effects:
-        own = slice(start, start + len(effect.parameters))
+    matrix = np.eye(sum(len(effect.parameters) for effect in effects) + 1)
+    for effect, own in _parts(effects):
         if effect.per_frame:
             matrix[own, own] -= 1 / len(effect.parameters)
-        start = own.stop
     return matrix
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
 from virest.diagnosis.curve_from_blur import (
@@ -26,8 +25,14 @@ from virest.diagnosis.curve_from_blur import (
     observe_mixing,
 )
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
-from virest.diagnosis.photometry import PhotometricObservations, normalised_rms, residuals
-from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
+from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
+from virest.diagnosis.photometry_effects import (
+    BlackLevel,
+    GainDrift,
+    PhotometricEffect,
+    ResponseGamma,
+    photometric_effects,
+)
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
 from virest.diagnosis.selection import BLUR_LEVELS, LIGHT_LEVELS, MIXING_LEVELS
@@ -50,13 +55,13 @@ MAX_GAIN_FRAMES = 3000
 SAME_SPREAD = 0.05
 """Stretches whose log exposure × ISO spreads alike to this tell the curve alike."""
 MIN_OBSERVATIONS = 300
-CURVE, MOST_KEPT = ("response_curve", "black_level"), 0.45
+CURVE: dict[str, PhotometricEffect] = {"response_curve": ResponseGamma(), "black_level": BlackLevel()}
+MOST_KEPT = 0.45
 """An encoder that keeps this part of the last picture keeps more of dark patches than of bright ones, whatever the
 curve:
 a black level would only absorb that."""
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
-MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
 SOFT_Z = 5.0
 """Above this many deviations, note possible defocus; lenses vary, so as a cause it must be more significant."""
 
@@ -243,19 +248,8 @@ def _finding(
 
 
 def values_of(effect: PhotometricEffect, profile: CameraProfile) -> dict[str, Any]:
-    """What a profile says of an effect, by the names of the contract."""
-    extensions = profile.extensions
-    if effect.name == "gain_drift":
-        return {"gain": list(extensions.gain)}
-    values = {
-        "corner_loss": extensions.vignetting_corner_loss,
-        "amplitude": extensions.flicker_amplitude,
-        "frequency_hz": extensions.flicker_frequency_hz,
-        "phase_rad": extensions.flicker_phase_rad,
-        "gamma": _curve(profile).extra_gamma,
-        "black_level": _curve(profile).black_level,
-    }
-    return {name: values[name] for name in effect.parameters}
+    """What a profile says of an effect, by the names of the table of effects."""
+    return EFFECTS[effect.name].read(profile, profile)
 
 
 def frames_of(fitted: PhotometricFit) -> Sequence[int]:
@@ -277,10 +271,6 @@ def changes_of(
         spread[np.asarray(frames, np.intp)] = std
         return {"gain": ParameterChange([1.0] * len(gain), gain, spread.tolist())}
     return {name: ParameterChange(before[name], now[name], float(s)) for name, s in zip(now, std, strict=True)}
-
-
-def _curve(profile: CameraProfile) -> ResponseCurve:
-    return profile.response or ResponseCurve("srgb")
 
 
 def sentence_of(name: str, changes: dict[str, ParameterChange]) -> str:
@@ -322,13 +312,10 @@ def name_curve(verdict: PictureVerdict, evidence: MixingEvidence) -> None:
     name = min(sure, key=lambda k: sure[k][1].after)
     estimate, held = sure[name]
     rivals = tuple(Rival(other, sure[other][1].after) for other in sure if other != name)
-    before = _value_of_curve(verdict.profile, name)
-    changes = {MIXING_PARAMETER[name]: ParameterChange(before, estimate.value, estimate.std)}
+    ((parameter, before),) = values_of(CURVE[name], verdict.profile).items()
+    changes = {parameter: ParameterChange(before, estimate.value, estimate.std)}
     verdict.findings.append(Finding(name, changes, held, rivals, estimate.p_value, sentence_of(name, changes)))
-    curve = _curve(verdict.profile)
-    is_black = name == "black_level"
-    curve = replace(curve, black_level=estimate.value) if is_black else replace(curve, extra_gamma=estimate.value)
-    verdict.profile = replace(verdict.profile, response=curve)
+    verdict.profile = CURVE[name].apply(verdict.profile, np.array([estimate.value]))
     verdict.rungs.append(Rung(name, {k: one[1].after for k, one in found.items()}, held.before, PHOTOMETRY))
 
 
@@ -340,19 +327,10 @@ def _mixed(evidence: MixingEvidence, profile: CameraProfile, name: str) -> Mixed
 def _is_sure(found: Mixed, name: str, profile: CameraProfile) -> bool:
     """Whether a change of the curve is significant, worth naming, and gains where it was not fitted."""
     estimate, held = found
-    now = _value_of_curve(profile, name)
+    (now,) = values_of(CURVE[name], profile).values()
     size = estimate.value - now if name == "black_level" else abs(np.log(estimate.value / now))
     levels = MIXING_LEVELS
     return levels.significant(estimate.p_value) and levels.matters(name, float(size)) and levels.gains(held)
-
-
-def _value_of_curve(profile: CameraProfile, name: str) -> float:
-    return _curve(profile).black_level if name == "black_level" else _curve(profile).extra_gamma
-
-
-def residual_levels(observations: PhotometricObservations, profile: CameraProfile) -> Array:
-    """What is left of the patches' brightness (n,), grey levels."""
-    return np.asarray(residuals(observations, profile))
 
 
 # ── blur ─────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -7,13 +7,13 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.diagnosis import picture_ladder
+from virest.diagnosis import photometry, picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
 from virest.image_formation.point_model import seen_s
-from virest.inference.chance import chi2_tail, mean_tail
+from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.robust import cauchy_weight, robust_std
 
 log = logging.getLogger(__name__)
@@ -100,7 +100,7 @@ def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> t
     square = np.bincount(pair, np.minimum(distance, STRAY_DISTANCE) ** 2) / count
     stray = np.bincount(pair, distance > STRAY_DISTANCE) / count
     tests = ((square, 2 * (SCALE_EXCESS * noise) ** 2), (stray, STRAY_PART))
-    first, second = (mean_tail(v[used] - mean) for v, mean in tests)
+    first, second = (chance_of(v[used] - mean) for v, mean in tests)
     return first, second
 
 
@@ -122,7 +122,7 @@ def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Str
 def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
     observations = photometric.observations
     assert observations is not None
-    left = picture_ladder.residual_levels(observations, photometric.profile)
+    left = photometry.residuals(observations, photometric.profile)
     covariates = {
         name: values
         for name, values in observations.covariates(photometric.profile).items()

@@ -51,13 +51,6 @@ def t_ratio(values: NDArray[np.float64]) -> float:
     return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))
 
 
-def chance_of(gain: NDArray[np.float64]) -> float:
-    """Probability (one-sided t test) of so even a gain (blocks,) where there is none."""
-    return student_tail(t_ratio(gain), max(len(gain) - 1, 1))
-
-
-def mean_tail(values: NDArray[np.float64]) -> float:
-    """Probability of so large a mean of values (n,) by chance: a one-sided t test against 0; NaN for fewer than two."""
-    if len(values) < 2:
-        return float("nan")
-    return student_tail(values.mean() * np.sqrt(len(values)) / values.std(ddof=1), len(values) - 1)
+def chance_of(values: NDArray[np.float64]) -> float:
+    """Probability of so large a mean of values (n,) by chance: a one-sided t test; a half for fewer than three."""
+    return student_tail(t_ratio(values), max(len(values) - 1, 1))

@@ -20,6 +20,6 @@ def robust_std(values: Array) -> float:
     return MEDIAN_TO_STD * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
-def cauchy_weight(squared: Array, width: float) -> Array:
+def cauchy_weight(squared: Array, width: float | Array) -> Array:
     """Weights, 0 to 1, of values by their squares: a half at ``width``."""
     return np.asarray(1.0 / (1.0 + squared / width**2))

@@ -19,10 +19,18 @@ from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, ground, with_profile
 from virest.inference.clustered import CovarianceModel, Index, scatter
+from virest.inference.descent import MAX_ITERATIONS, descend, slices
 from virest.inference.robust import CAUCHY
 from virest.inference.term import Term
 from virest.inference.time_blocks import even_blocks
-from virest.inference.track_descent import ANY_DEPTH, Linearisation, State, System, cost, descend
+from virest.inference.track_evidence import (
+    ANY_DEPTH,
+    Linearisation,
+    State,
+    TrackEvidence,
+    TrackSystem,
+    lengths_and_ways,
+)
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 __all__ = [
@@ -37,7 +45,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-MAX_ITERATIONS = 15
 GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4
 PLACES = 5
@@ -92,8 +99,7 @@ class TrackFit:
         left = self.difference_px / self.noise_px[:, None]
         if self.along_px is None:
             return self.distance
-        length = np.linalg.norm(self.along_px, axis=-1)
-        way = self.along_px / np.maximum(length, 1e-12)[:, None]
+        length, way = lengths_and_ways(self.along_px)
         variance = 1 + (depth_spread_per_m * length / self.noise_px) ** 2
         along = (left * way).sum(axis=-1)
         return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
@@ -102,8 +108,7 @@ class TrackFit:
         """Differences (n, 2) in px, along the parallax only what the points' spread of depths does not explain."""
         if self.along_px is None:
             return self.difference_px
-        length = np.linalg.norm(self.along_px, axis=-1)
-        way = self.along_px / np.maximum(length, 1e-12)[:, None]
+        length, way = lengths_and_ways(self.along_px)
         shrink = 1 - 1 / np.sqrt(1 + (self.depth_spread_per_m * length / self.noise_px) ** 2)
         return self.difference_px - (shrink * (self.difference_px * way).sum(axis=-1))[:, None] * way
 
@@ -176,41 +181,40 @@ def fit_tracks(
         raise ImuError("no accelerometer to tell the camera's path", hint="fit a free motion")
     directed = isinstance(scene, DirectedMotion)
     state = State(known, scene, np.zeros(sum(map(len, terms))), ANY_DEPTH if directed else 0.0)
+    evidence = TrackEvidence(imu, table, terms, scene)
     look: Linearisation | None = None
     for _ in range(SPREAD_PASSES if inertial else 1):
-        state, system = descend(imu, table, terms, scene, state, max_iterations, look, covariances)
-        if inertial and abs(system.depth_spread - state.depth_spread) <= SPREAD_TOLERANCE * system.depth_spread:
+        system = descend(evidence, state, max_iterations, look, covariances)
+        spread, look = evidence.depth_spread(system), system.look
+        if not inertial or abs(spread - state.depth_spread) <= SPREAD_TOLERANCE * spread:
             break
-        state = replace(state, depth_spread=system.depth_spread if inertial else state.depth_spread)
-        look = system.look
-    return _conclude(table, terms, state, system, blocks)
+        state = replace(system.state, depth_spread=spread)
+    return _conclude(table, terms, system, spread, blocks)
 
 
-def _conclude(table: TrackTable, terms: tuple[Term, ...], state: State, system: System, blocks: int) -> TrackFit:
-    inverse = system.inverse()
-    doubt = replace(_doubt(table, system, inverse, blocks), relief=_relief(table, system, inverse))
+def _conclude(
+    table: TrackTable, terms: tuple[Term, ...], system: TrackSystem, depth_spread: float, blocks: int
+) -> TrackFit:
+    inverse, state, prediction = system.inverse(), system.state, system.look.prediction
+    relief = _relief(table, system, inverse, depth_spread)
+    doubt = replace(_doubt(table, system, inverse, blocks), relief=relief)
     stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
-    difference = system.difference
-    if isinstance(state.scene, DirectedMotion):
-        difference = system.left * table.noise_px[table.pair][:, None]
-    place, slices = 0, {}
-    for term in terms:
-        slices[term.name] = slice(place, place + len(term))
-        place += len(term)
+    noise_px, directed = table.noise_px[table.pair], isinstance(state.scene, DirectedMotion)
+    difference = system.left * noise_px[:, None] if directed else table.second_px - prediction.second_px
+    parts = zip((term.name for term in terms), slices(map(len, terms)), strict=True)
     return TrackFit(
         state.known.profile, state.scene, terms, state.change, doubt.of(np.eye(len(inverse))), doubt,
-        system.scale, system.depth_spread,
+        float(system.scale), depth_spread,
         difference, system.weight, np.sqrt(system.squared), stretches,
-        cost(system, 1.0), state.known,
-        system.prediction.second_s, table.noise_px[table.pair],
-        None if isinstance(state.scene, DirectedMotion) else system.prediction.along_px, slices,
+        system.cost(1.0), state.known, prediction.second_s, noise_px,
+        None if directed else prediction.along_px, dict(parts),
     )  # fmt: skip
 
 
 # ── covariance ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _doubt(table: TrackTable, system: System, inverse: Array, blocks: int) -> CovarianceModel:
+def _doubt(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> CovarianceModel:
     """Scatter of the points' pull on the values, by blocks of time and by parts of the picture.
 
     Points of one moment share its errors, and points of one part of the picture share the relief that stands there as
@@ -220,8 +224,7 @@ def _doubt(table: TrackTable, system: System, inverse: Array, blocks: int) -> Co
     if count < MIN_BLOCKS or not inverse.size:
         return CovarianceModel(inverse)
     block = even_blocks(table.pair, table.n_pairs, count)
-    weighted = system.left * (system.weight / system.scale**2)[:, None]
-    moved = np.einsum("nki,nk->ni", system.rows, weighted) @ inverse / _true_curvature(system)
+    moved = system.score @ inverse / _true_curvature(system)
     place = _parts_of_picture(table.first_px)
     by_place = scatter(moved, place, about_mean=True) - scatter(moved, block * PLACES**2 + place, about_mean=True)
     return CovarianceModel(
@@ -229,20 +232,19 @@ def _doubt(table: TrackTable, system: System, inverse: Array, blocks: int) -> Co
     )
 
 
-def _relief(table: TrackTable, system: System, inverse: Array) -> Array | None:
+def _relief(table: TrackTable, system: TrackSystem, inverse: Array, depth_spread: float) -> Array | None:
     """What depths that are off by their spread in each part of the picture do to the values (places, k)."""
-    along_px = system.prediction.along_px
-    if along_px is None or not inverse.size or system.depth_spread == ANY_DEPTH:
+    along_px = system.look.prediction.along_px
+    if along_px is None or not inverse.size or depth_spread == ANY_DEPTH:
         return None
-    length = np.linalg.norm(along_px, axis=-1)
-    way = along_px / np.maximum(length, 1e-12)[:, None]
+    length, way = lengths_and_ways(along_px)
     ratio = length / table.noise_px[table.pair]
-    pull = system.weight / system.scale**2 * ratio / np.sqrt(1 + (system.depth_spread * ratio) ** 2)
+    pull = system.weight / system.scale**2 * ratio / np.sqrt(1 + (depth_spread * ratio) ** 2)
     moved = np.einsum("ni,nik->nk", way, system.rows) @ inverse * pull[:, None]
     place = _parts_of_picture(table.first_px)
     points = np.maximum(np.bincount(place), 1)[:, None]
     together = np.stack([np.bincount(place, column) for column in moved.T], axis=-1)
-    return np.asarray(system.depth_spread * np.sqrt(len(table)) * together / np.sqrt(points))
+    return np.asarray(depth_spread * np.sqrt(len(table)) * together / np.sqrt(points))
 
 
 def _parts_of_picture(points_px: Array) -> Index:
@@ -252,14 +254,14 @@ def _parts_of_picture(points_px: Array) -> Index:
     return np.asarray(cell[:, 0] * PLACES + cell[:, 1])
 
 
-def _true_curvature(system: System) -> float:
+def _true_curvature(system: TrackSystem) -> float:
     """Curvature of the Cauchy loss over that of its weights, which the normal equations take for it."""
-    ways = 2 if (system.scene is not None and isinstance(system.scene, DirectedMotion)) else 1
+    ways = 2 if isinstance(system.state.scene, DirectedMotion) else 1
     bent = ways * system.weight**2 * system.squared / (CAUCHY * system.scale) ** 2
     return max(float((system.weight - bent).sum() / max(system.weight.sum(), 1e-12)), 0.3)
 
 
-def _stretches(table: TrackTable, system: System, inverse: Array, blocks: int) -> Array:
+def _stretches(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> Array:
     """Effective number of blocks that inform each parameter, (k,): about one where a single moment decides."""
     count = min(blocks, table.n_pairs)
     if not inverse.size:

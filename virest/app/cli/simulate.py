@@ -159,33 +159,13 @@ def simulate(
 
     with console.progress_bar(count, "simulate", quiet=quiet) as bar:
         facts = simulate_command(
-            out,
-            scene=scene,
-            width=width,
-            height=height,
-            frames=count,
-            fps=fps,
-            exposure_ms=exposures_ms,
-            auto_exposure_ev=auto_exposure_ev,
-            auto_exposure_steps=auto_exposure_steps,
-            readout_ms=readout_ms,
-            direction=direction,
-            focal_px=focal_px,
-            rate_rad_s=rate,
-            pan_rad_s=pan,
-            near_m=near_m,
-            moving_px_s=moving,
-            noise_levels=noise,
-            response=response,
-            depth_m=depth_m,
-            profile=read_profile(config) if config else None,
-            effects=effect or [],
-            reference=reference,
-            seed=seed,
-            overwrite=overwrite,
-            isp=phone,
+            out, scene=scene, width=width, height=height, frames=count, fps=fps, exposure_ms=exposures_ms,
+            auto_exposure_ev=auto_exposure_ev, auto_exposure_steps=auto_exposure_steps, readout_ms=readout_ms,
+            direction=direction, focal_px=focal_px, rate_rad_s=rate, pan_rad_s=pan, near_m=near_m, moving_px_s=moving,
+            noise_levels=noise, response=response, depth_m=depth_m, profile=read_profile(config) if config else None,
+            effects=effect or [], reference=reference, seed=seed, overwrite=overwrite, isp=phone,
             progress=(lambda _done, _total: bar.update(1)) if bar else None,
-        )
+        )  # fmt: skip
     emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
     return 0
 

@@ -1,0 +1,205 @@
+"""Tracked points as evidence: where named terms of a profile and the scene's motion put them, and how sure they are.
+
+How the points depend on the values changes little on the way: slopes are taken anew only where the points have moved
+far since, and once more where the descent ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
+from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict, with_profile
+from virest.inference.descent import Slopes, System, slices
+from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
+from virest.inference.term import Term, slopes_of
+from virest.inference.travel_direction import find_directions, without_directions
+from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
+
+Array = NDArray[np.float64]
+SMALLEST_SCALE = 0.03
+STALE = {Slopes.ON_THE_WAY: (1.5, 0.5), Slopes.AT_THE_END: (0.1, 0.05), Slopes.HERE: (0.0, 0.0)}
+"""Reuse the Jacobian until points move this far (median, px) or the scene changes by this fraction."""
+ANY_DEPTH = 1e6
+"""Spread of inverse depths that leaves a point free to lie anywhere along its parallax."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Where a descent stands."""
+
+    known: IntegratedMotion
+    scene: Motion | None
+    change: Array
+    """(k,) of the terms' values from the starting profile."""
+    depth_spread: float
+    """Standard deviation of points' inverse depths about the plane, 1/m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """The points as a state predicts them, with slopes that were taken there or not far away."""
+
+    scene: Motion | None
+    prediction: Prediction
+    slope: Array
+    """(n, 2, k) change of the predicted points per unit of each term's values and of the motion's entries, px."""
+    taken_px: Array
+    """(n, 2) where the points were predicted when the slopes were taken."""
+    taken_scene: Motion | None
+
+    def is_stale(self, limit: Slopes) -> bool:
+        """Whether points or scene have moved further than STALE since the slopes were taken."""
+        if self.prediction.second_px is self.taken_px:
+            return False
+        moved_px = float(np.median(np.abs(self.prediction.second_px - self.taken_px)))
+        most_px, most_part = STALE[limit]
+        return moved_px > most_px or _part_moved(self.taken_scene, self.scene) > most_part
+
+
+def _part_moved(before: Motion | None, after: Motion | None) -> float:
+    """By what part the planes and velocities of an inertial motion have changed."""
+    if not isinstance(before, InertialMotion) or not isinstance(after, InertialMotion):
+        return 0.0
+    parts = (
+        np.linalg.norm(new - old) / max(float(np.linalg.norm(old)), 1e-9)
+        for new, old in ((after.plane_per_m, before.plane_per_m), (after.velocity_m_s, before.velocity_m_s))
+    )
+    return float(max(parts))
+
+
+TrackSystem = System[State, Linearisation]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackEvidence:
+    """Tracked points, and what stays the same through a descent."""
+
+    imu: ImuSamples
+    table: TrackTable
+    terms: tuple[Term, ...]
+    start: Motion | None
+
+    def look(self, state: State, before: Linearisation | None, limit: Slopes) -> Linearisation:
+        """Predict the points of a state; slopes of an earlier look serve while they are not stale."""
+        table, scene = self.table, state.scene
+        like = None if before is None else before.prediction
+        directed = isinstance(scene, DirectedMotion)
+        if before is not None or directed:
+            prediction = predict(state.known, table, scene, like=like)
+            if isinstance(scene, DirectedMotion):
+                prediction, scene = _directed(table, prediction, scene)
+            if before is not None:
+                kept = Linearisation(scene, prediction, before.slope, before.taken_px, before.taken_scene)
+                if not kept.is_stale(limit):
+                    return kept
+            like = prediction
+        if directed:  # whose points do not depend on which way it goes
+            slope = self._term_slopes(replace(state, scene=None), prediction)
+            return Linearisation(scene, prediction, slope, prediction.second_px, scene)
+        prediction = predict(state.known, table, scene, slopes=scene is not None, like=like)
+        slopes = [self._term_slopes(state, prediction)]
+        slopes += [] if prediction.slopes is None or self.start is None else [prediction.slopes]
+        prediction = replace(prediction, slopes=None)
+        return Linearisation(scene, prediction, np.concatenate(slopes, axis=-1), prediction.second_px, scene)
+
+    def _term_slopes(self, state: State, at: Prediction) -> Array:
+        """(n, 2, k) change of the predicted points per unit of each term's values."""
+
+        def moved_by(profile: CameraProfile) -> Array:
+            moved = with_profile(state.known, self.imu, profile)
+            return predict(moved, self.table, state.scene, like=at).second_px - at.second_px
+
+        found = [slopes_of(term, state.known.profile, self.table, moved_by) for term in self.terms]
+        return np.concatenate(found, axis=-1) if found else np.zeros((len(self.table), 2, 0))
+
+    def weighed(self, state: State, look: Linearisation) -> TrackSystem:
+        """Whiten a look's rows by noise and spread of depths, and take out what directions of travel explain."""
+        table, scene = self.table, look.scene
+        difference = table.second_px - look.prediction.second_px
+        limit = [value for term in self.terms for value in term.limit]
+        prior = [std**-2.0 for term in self.terms for std in term.prior_std]
+        off = list(state.change)
+        if scene is not None and self.start is not None:
+            limit += list(scene.limits())
+            prior += list(scene.prior_std() ** -2.0)
+            off += list(scene.vector() - self.start.vector())
+        rows, left = _whitened(look.slope, difference, look.prediction, table, state.depth_spread)
+        squared = (left**2).sum(axis=-1)
+        typical = NORMAL_MEDIAN if state.depth_spread == ANY_DEPTH else RAYLEIGH_MEDIAN
+        scale = max(float(np.median(np.sqrt(squared))) / typical, SMALLEST_SCALE)
+        if isinstance(scene, DirectedMotion):
+            noise, flow = table.noise_px[table.pair], np.asarray(look.prediction.per_step)
+            rows, left = without_directions(
+                rows, left, cauchy_weight(squared, CAUCHY * scale), difference / noise[:, None],
+                flow / noise[:, None, None], scene.direction, scene.group(table.pair),
+            )  # fmt: skip
+        found = replace(state, scene=scene)
+        return System(found, look, rows, left, squared, scale, np.array(prior), np.array(off), np.array(limit))
+
+    def moved(self, state: State, step: Array) -> State:
+        """The state after a step: of the terms' values, then of the scene's."""
+        profile, count = state.known.profile, len(state.change)
+        for term, part in zip(self.terms, slices(map(len, self.terms)), strict=True):
+            profile = term.change(profile, step[part])
+        scene = None if state.scene is None else state.scene.with_vector(state.scene.vector() + step[count:])
+        known = with_profile(state.known, self.imu, profile)
+        return State(known, scene, state.change + step[:count], state.depth_spread)
+
+    def depth_spread(self, system: TrackSystem) -> float:
+        """Standard deviation of inverse depths: what differences along the parallax have more than those across."""
+        along_px = system.look.prediction.along_px
+        if along_px is None or system.state.depth_spread == ANY_DEPTH:
+            return 0.0 if along_px is None else ANY_DEPTH
+        noise = self.table.noise_px[self.table.pair]
+        length, way = lengths_and_ways(along_px)
+        telling = (ratio := length / noise) > np.quantile(ratio, 0.5)
+        if telling.sum() < 50 or np.median(ratio[telling]) < 1e-3:
+            return 0.0
+        off = ((self.table.second_px - system.look.prediction.second_px) / noise[:, None])[telling]
+        way, ratio = way[telling], ratio[telling]
+        along, across = (off * way).sum(axis=-1), off[:, 1] * way[:, 0] - off[:, 0] * way[:, 1]
+        base = (np.median(np.abs(across)) / NORMAL_MEDIAN) ** 2
+        more = along**2 - base * NORMAL_MEDIAN**2
+        return float(np.sqrt(max(np.median(more / ratio**2), 0.0))) / NORMAL_MEDIAN
+
+
+# ── one linearisation ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def lengths_and_ways(vectors: Array) -> tuple[Array, Array]:
+    """Lengths (n,) of vectors (n, 2), and the unit vectors (n, 2) along them."""
+    length = np.linalg.norm(vectors, axis=-1)
+    return length, vectors / np.maximum(length, 1e-12)[:, None]
+
+
+def _whitened(
+    slope: Array, difference: Array, at: Prediction, table: TrackTable, depth_spread: float
+) -> tuple[Array, Array]:
+    """Rows and differences over their standard deviations."""
+    noise = table.noise_px[table.pair][:, None]
+    rows, left = slope / noise[..., None], difference / noise
+    if at.along_px is None:
+        return rows, left
+    length, way = lengths_and_ways(at.along_px)
+    shrink = 1 - 1 / np.sqrt(1 + (depth_spread * length / noise[:, 0]) ** 2)
+    left = left - (shrink * (left * way).sum(axis=-1))[:, None] * way
+    rows = rows - way[:, :, None] * (shrink[:, None] * np.einsum("ni,nik->nk", way, rows))[:, None, :]
+    return rows, left
+
+
+def _directed(table: TrackTable, at: Prediction, motion: DirectedMotion) -> tuple[Prediction, DirectedMotion]:
+    """Directions found anew from the differences, and the prediction with what lies along them."""
+    assert at.per_step is not None
+    noise, group = table.noise_px[table.pair], motion.group(table.pair)
+    start = motion.direction if motion.direction.any() else None
+    found = find_directions(
+        at.per_step / noise[:, None, None], (table.second_px - at.second_px) / noise[:, None], group,
+        len(motion.direction), start,
+    )  # fmt: skip
+    along = np.squeeze(at.per_step @ found[group][..., None], -1)
+    return replace(at, along_px=along), DirectedMotion(found)
