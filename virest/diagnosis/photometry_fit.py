@@ -166,14 +166,16 @@ def judge(
     profile: CameraProfile,
     effects: Sequence[PhotometricEffect],
     each: ParallelMap = one_by_one,
+    *,
+    by_side: bool | None = None,
 ) -> HeldOutGain:
     """Fit on one half, judge on the other, and the reverse.
 
-    Halves are blocks of time; for effects with a value per frame, which no other frame knows, they are places: a
-    frame's gain is found on half its patches and has to hold for the others.
+    by_side: halves are the picture's sides instead of blocks of time: what a shadow makes a cause say on one does not
+    hold on the other.  None: for effects with a value per frame, which no other frame knows.
     """
-    by_place = any(effect.per_frame for effect in effects)
-    both = halves(observations.place if by_place else time_blocks(observations))
+    by_side = any(effect.per_frame for effect in effects) if by_side is None else by_side
+    both = _sides(observations) if by_side else halves(time_blocks(observations))
     folds = [fitted for fitted in both if fitted.any() and not fitted.all()]
     calls = [(observations, profile, some, fitted) for fitted in folds for some in (effects, ())]
     fits = each(fit_photometry, calls)
@@ -183,6 +185,12 @@ def judge(
         before, noise = normalised_rms(held.with_memory(without.memory), profile)
         judged.append((before, normalised_rms(held.with_memory(fit.memory), fit.profile)[0], noise))
     return HeldOutGain.of_folds(PHOTOMETRY, judged)
+
+
+def _sides(observations: PhotometricObservations) -> list[Mask]:
+    """Left and right, upper and lower half of the observations, (n,) each."""
+    lower = [at > np.median(at) for at in (observations.x_px, observations.y_px)]
+    return [side for half in lower for side in (half, ~half)]
 
 
 def held_out_rms(observations: PhotometricObservations, profile: CameraProfile, held: Mask) -> float:

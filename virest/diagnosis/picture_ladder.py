@@ -208,11 +208,21 @@ def _rung(
         forgetful = name not in CURVE or fits[name].memory <= MOST_KEPT
         if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not forgetful:
             continue
-        held_out = judge(observations, nominal, [*accepted, effect], each)
-        log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
-        if LIGHT_LEVELS.gains(held_out):
+        if _holds(observations, nominal, [*accepted, effect], each):
             return replace(nothing, entered=name), effect, fits[name]
     return nothing, None, plain
+
+
+def _holds(
+    observations: PhotometricObservations, nominal: CameraProfile, effects: list[PhotometricEffect], each: ParallelMap
+) -> bool:
+    """Whether effects gain at other times, or have a value per frame, and on other sides of the picture."""
+    for by_side in (False, True)[any(effect.per_frame for effect in effects) :]:
+        held_out = judge(observations, nominal, effects, each, by_side=by_side)
+        log.debug("%s, by side %s: %.3f -> %.3f", effects[-1].name, by_side, held_out.before, held_out.after)
+        if not LIGHT_LEVELS.gains(held_out):
+            return False
+    return True
 
 
 def _still_needed(

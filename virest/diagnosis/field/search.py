@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -226,6 +226,8 @@ class _Search:
     that an instant that is a frame off would be ruled out by the points that tell it best."""
     asked: int
     """How many forms are asked for in all."""
+    _effects: dict[int, tuple[FieldForm, Array]] = field(default_factory=dict, repr=False)
+    """By the identity of their form, which is kept so that no other takes its number."""
 
     def best(self, tangent: Array, forms: Sequence[FieldForm]) -> Selection | None:
         """The form that residuals ask for beside a tangent space (n, 2, m), if any."""
@@ -260,7 +262,12 @@ class _Search:
         return sorted(best.values(), key=lambda entry: -float(entry.gain.sum()))
 
     def effect(self, form: FieldForm) -> Array:
-        """Whitened change (n, 2, k) of the points per number of a form."""
+        """Whitened change (n, 2, k) of the points per number of a form; worked out once."""
+        if id(form) not in self._effects:
+            self._effects[id(form)] = form, self._effect(form)
+        return self._effects[id(form)][1]
+
+    def _effect(self, form: FieldForm) -> Array:
         seen = self.seen
         effect = seen.effect((form.term,))
         if form.step_s is not None and self.blind_s:
@@ -306,7 +313,8 @@ def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackF
     Where twice the knots gain nothing over time or rows, four times as many may: of what goes to and fro between two.
     """
     by_point = entered.form.over_time
-    last = _held_out(evidence, entered.model, fitted, by_point) if by_point else entered.after
+    judged_so = by_point == entered.form.local
+    last = entered.after if judged_so else _held_out(evidence, entered.model, fitted, by_point)
     names = frozenset(term.name for term in model.terms)
     finer, failed = entered.form.finer(model.profile, names), False
     while finer is not None:
@@ -341,7 +349,7 @@ def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool
     fold = (np.arange(len(table)) if by_point else block) % 2
     left = np.zeros(len(table))
     for number in (0, 1):
-        part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number))
+        part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number), covariances=False)
         left[fold != number] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[fold != number]
     return HeldOut(np.asarray(loss(left, 1.0)), None if by_point else block, capped_rms(left))
 
@@ -355,36 +363,62 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
         model = state.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, JUDGE_POINTS))
         state = replace(state, model=replace(model, profile=fitted.profile, scene=fitted.scene))
-        if (form := _idle_form(evidence, state, fitted)) is not None:
+        if not state.forms[1:] and not state.accepted:
+            return state
+        judge = _Usefulness.of(evidence, state, fitted)
+        if (form := _idle_form(judge, state)) is not None:
             log.debug("stood in for another form: %s", form.name)
             kept = tuple(known for known in state.forms if known is not form)
             state = replace(state, model=_without_form(state.model, form), forms=kept)
             continue
-        leaving = _stand_ins(evidence, found, state, fitted)
+        leaving = _stand_ins(judge, found, state)
         if not leaving:
             return state
         log.debug("stood in for a field: %s", [entry.name for entry in leaving])
         state = state.without(found, leaving)
 
 
-def _idle_form(evidence: Evidence, state: _Description, fitted: TrackFit) -> FieldForm | None:
+@dataclass(frozen=True, slots=True)
+class _Usefulness:
+    """What a whole description leaves of held-out blocks, to compare with what parts of it leave."""
+
+    evidence: Evidence
+    fitted: TrackFit
+    by_point: bool
+    """Whether points are judged, where knots lie as close as blocks."""
+    whole: HeldOut
+
+    @classmethod
+    def of(cls, evidence: Evidence, state: _Description, fitted: TrackFit) -> _Usefulness:
+        """Of a description and its fit."""
+        step_s = 2 * PAIRS_IN_BLOCK * evidence.period_s
+        by_point = any(form.is_dense(step_s) for form in state.forms)
+        return cls(evidence, fitted, by_point, _held_out(evidence, state.model, fitted, by_point))
+
+    def needs_more_than(self, less: Model) -> bool:
+        """Whether what a smaller model lacks, a cause or a form, is of use."""
+        before, after = _held_out(self.evidence, less, self.fitted, self.by_point), self.whole
+        gain = before.block_loss - after.block_loss
+        part = float(gain.mean() / before.block_loss.mean())
+        return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
+
+
+def _idle_form(judge: _Usefulness, state: _Description) -> FieldForm | None:
     """A form that the newest leaves nothing to say to, if any."""
     less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
-    return next((form for form, model in less if not _useful(evidence, model, state, fitted)), None)
+    return next((form for form, model in less if not judge.needs_more_than(model)), None)
 
 
-def _stand_ins(
-    evidence: Evidence, found: GeometricVerdict, state: _Description, fitted: TrackFit
-) -> tuple[Accepted, ...]:
+def _stand_ins(judge: _Usefulness, found: GeometricVerdict, state: _Description) -> tuple[Accepted, ...]:
     """The cause, or the two, that a model can do without; nothing where it needs all."""
     fitting = [entry for entry in state.accepted if entry.effect is not None and entry.effect.term is not None]
     depth = [(entry,) for entry in state.accepted if entry.name == DEPTH]
     weakest: list[tuple[Accepted, ...]] = []
     if fitting:
-        doubts = {entry.name: _doubt(evidence, found, fitted, entry) for entry in fitting}
+        doubts = {entry.name: _doubt(judge.evidence, found, judge.fitted, entry) for entry in fitting}
         weakest = [(max(fitting, key=lambda entry: doubts[entry.name]),)]
     for leaving in (*depth, *weakest, *combinations(fitting, 2)):
-        if not _useful(evidence, state.without(found, leaving).model, state, fitted):
+        if not judge.needs_more_than(state.without(found, leaving).model):
             return leaving
     return ()
 
@@ -392,13 +426,3 @@ def _stand_ins(
 def _doubt(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:
     assert entry.effect is not None
     return p_of(fitted, entry.effect, fitted.profile, found.nominal.profile, evidence.typical_px)
-
-
-def _useful(evidence: Evidence, less: Model, more: _Description, fitted: TrackFit) -> bool:
-    """Whether held-out blocks, or points where knots lie as close as blocks, are better off with a cause or a form."""
-    step_s = 2 * PAIRS_IN_BLOCK * evidence.period_s
-    by_point = any(form.is_dense(step_s) for form in more.forms)
-    before, after = (_held_out(evidence, m, fitted, by_point) for m in (less, more.model))
-    gain = before.block_loss - after.block_loss
-    part = float(gain.mean() / before.block_loss.mean())
-    return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
