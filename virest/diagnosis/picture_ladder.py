@@ -208,18 +208,23 @@ def _rung(
         forgetful = name not in CURVE or fits[name].memory <= MOST_KEPT
         if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not forgetful:
             continue
-        if _holds(observations, nominal, [*accepted, effect], each):
+        if _holds(observations, nominal, accepted, effect, each):
             return replace(nothing, entered=name), effect, fits[name]
     return nothing, None, plain
 
 
 def _holds(
-    observations: PhotometricObservations, nominal: CameraProfile, effects: list[PhotometricEffect], each: ParallelMap
+    observations: PhotometricObservations,
+    nominal: CameraProfile,
+    accepted: Sequence[PhotometricEffect],
+    effect: PhotometricEffect,
+    each: ParallelMap,
 ) -> bool:
-    """Whether effects gain at other times, or have a value per frame, and on other sides of the picture."""
-    for by_side in (False, True)[any(effect.per_frame for effect in effects) :]:
-        held_out = judge(observations, nominal, effects, each, by_side=by_side)
-        log.debug("%s, by side %s: %.3f -> %.3f", effects[-1].name, by_side, held_out.before, held_out.after)
+    """Whether an effect beside those in gains at other times, unless it is known by frames, and on other sides."""
+    effects = [*accepted, effect]
+    for by_side in (False, True)[any(e.per_frame for e in effects) :]:
+        held_out = judge(observations, nominal, effects, each, beside=accepted, by_side=by_side)
+        log.debug("%s, by side %s: %.3f -> %.3f", effect.name, by_side, held_out.before, held_out.after)
         if not LIGHT_LEVELS.gains(held_out):
             return False
     return True
