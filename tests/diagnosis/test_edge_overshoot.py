@@ -28,7 +28,8 @@ def edges(rng, shape, count=600, widths=(0.6, 1.4)):
     """Edges of a scene in 24 frames: some sharper, some softer, with a decoded movie's noise."""
     profile = np.stack([shape(width) for width in rng.uniform(*widths, count)])
     noise = np.repeat(0.02 * rng.standard_normal((count, (len(GRID_PX) + 3) // 4)), 4, axis=1)[:, : len(GRID_PX)]
-    half_width = np.array([np.interp(0.84, row, GRID_PX) for row in np.maximum.accumulate(profile, axis=1)])
+    rising = np.maximum.accumulate(profile, axis=1)
+    half_width = np.array([0.5 * np.ptp(np.interp((0.16, 0.84), row, GRID_PX)) for row in rising])
     return EdgeProfiles(profile + noise, half_width, np.arange(count) % 24 / 30, np.arange(count) // 4)
 
 
@@ -72,7 +73,7 @@ def test_a_scene_that_has_lines_beside_its_edges_is_not_sharpened(rng):
     assert found(rng, seamed).p_value > MAX_P
 
 
-@pytest.mark.parametrize("texture", [0.05, 0.1])
+@pytest.mark.parametrize("texture", [0.1, 0.3])
 def test_surfaces_that_are_brighter_beside_some_edges_are_not_sharpened(texture):
     """As many edges overshoot as fall short; those that overshoot are the steepest, which must not be taken for all."""
     for seed in range(4):
