@@ -77,7 +77,8 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
         asked = _asked_for(evidence, capture, state.model, fitted)
-        steps = (_step(evidence, found, state, one, fitted) for one in asked)
+        judged = _Judged(evidence, state.model, fitted)
+        steps = (_step(judged, found, state, one) for one in asked)
         if (step := next((step for step in steps if step is not None), None)) is None:
             break
         chosen, entered, after = step
@@ -117,6 +118,10 @@ class _Description:
     accepted: tuple[Accepted, ...]
     forms: tuple[FieldForm, ...]
 
+    def is_dense(self, period_s: float) -> bool:
+        """Whether the knots of a form lie as close as blocks of frames that follow each other by this."""
+        return any(form.is_dense(2 * PAIRS_IN_BLOCK * period_s) for form in self.forms)
+
     def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _Description:
         """The same without some causes, their values back where the profile had them.
 
@@ -142,11 +147,27 @@ class _Description:
         return _Description(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
 
 
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """A model on held-out blocks and on held-out points, each worked out once, where it is asked for."""
+
+    evidence: Evidence
+    model: Model
+    fitted: TrackFit
+    _known: dict[bool, HeldOut] = field(default_factory=dict, repr=False)
+
+    def held_out(self, by_point: bool) -> HeldOut:
+        """On points, or on blocks."""
+        if by_point not in self._known:
+            self._known[by_point] = _held_out(self.evidence, self.model, self.fitted, by_point)
+        return self._known[by_point]
+
+
 def _step(
-    evidence: Evidence, found: GeometricVerdict, state: _Description, asked: _Asked, fitted: TrackFit
+    judged: _Judged, found: GeometricVerdict, state: _Description, asked: _Asked
 ) -> tuple[_Asked, _Entered, _Description] | None:
     """A form that was asked for, in the model, and all that stays beside it; None where it gains nothing."""
-    entered = _entered(evidence, state.model, asked, fitted)
+    evidence, entered = judged.evidence, _entered(judged, asked)
     if entered is None:
         return None
     more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
@@ -289,11 +310,11 @@ class _Entered:
     after: HeldOut
 
 
-def _entered(evidence: Evidence, model: Model, asked: _Asked, fitted: TrackFit) -> _Entered | None:
+def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
     """The model with a form in it, with as many knots as pay; None where held-out blocks do not gain."""
-    form = asked.form
+    evidence, model, fitted, form = judged.evidence, judged.model, judged.fitted, asked.form
     extended = replace(model, terms=(*model.terms, form.term))
-    before, after = (_held_out(evidence, m, fitted, form.local) for m in (model, extended))
+    before, after = judged.held_out(form.local), _held_out(evidence, extended, fitted, form.local)
     gain = before.block_loss - after.block_loss
     log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
     holds = t_ratio(gain) > (MIN_LOCAL_T if form.over_time and not form.local else MIN_T)
@@ -363,62 +384,44 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
         model = state.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, JUDGE_POINTS))
         state = replace(state, model=replace(model, profile=fitted.profile, scene=fitted.scene))
-        if not state.forms[1:] and not state.accepted:
-            return state
-        judge = _Usefulness.of(evidence, state, fitted)
-        if (form := _idle_form(judge, state)) is not None:
+        judged = _Judged(evidence, state.model, fitted)
+        if (form := _idle_form(judged, state)) is not None:
             log.debug("stood in for another form: %s", form.name)
             kept = tuple(known for known in state.forms if known is not form)
             state = replace(state, model=_without_form(state.model, form), forms=kept)
             continue
-        leaving = _stand_ins(judge, found, state)
+        leaving = _stand_ins(judged, found, state)
         if not leaving:
             return state
         log.debug("stood in for a field: %s", [entry.name for entry in leaving])
         state = state.without(found, leaving)
 
 
-@dataclass(frozen=True, slots=True)
-class _Usefulness:
-    """What a whole description leaves of held-out blocks, to compare with what parts of it leave."""
-
-    evidence: Evidence
-    fitted: TrackFit
-    by_point: bool
-    """Whether points are judged, where knots lie as close as blocks."""
-    whole: HeldOut
-
-    @classmethod
-    def of(cls, evidence: Evidence, state: _Description, fitted: TrackFit) -> _Usefulness:
-        """Of a description and its fit."""
-        step_s = 2 * PAIRS_IN_BLOCK * evidence.period_s
-        by_point = any(form.is_dense(step_s) for form in state.forms)
-        return cls(evidence, fitted, by_point, _held_out(evidence, state.model, fitted, by_point))
-
-    def needs_more_than(self, less: Model) -> bool:
-        """Whether what a smaller model lacks, a cause or a form, is of use."""
-        before, after = _held_out(self.evidence, less, self.fitted, self.by_point), self.whole
-        gain = before.block_loss - after.block_loss
-        part = float(gain.mean() / before.block_loss.mean())
-        return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
+def _needs_more(judged: _Judged, by_point: bool, less: Model) -> bool:
+    """Whether held-out blocks, or points, are better off with what a smaller model lacks, a cause or a form."""
+    before, after = _held_out(judged.evidence, less, judged.fitted, by_point), judged.held_out(by_point)
+    gain = before.block_loss - after.block_loss
+    part = float(gain.mean() / before.block_loss.mean())
+    return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
 
 
-def _idle_form(judge: _Usefulness, state: _Description) -> FieldForm | None:
+def _idle_form(judged: _Judged, state: _Description) -> FieldForm | None:
     """A form that the newest leaves nothing to say to, if any."""
+    by_point = state.is_dense(judged.evidence.period_s)
     less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
-    return next((form for form, model in less if not judge.needs_more_than(model)), None)
+    return next((form for form, model in less if not _needs_more(judged, by_point, model)), None)
 
 
-def _stand_ins(judge: _Usefulness, found: GeometricVerdict, state: _Description) -> tuple[Accepted, ...]:
+def _stand_ins(judged: _Judged, found: GeometricVerdict, state: _Description) -> tuple[Accepted, ...]:
     """The cause, or the two, that a model can do without; nothing where it needs all."""
     fitting = [entry for entry in state.accepted if entry.effect is not None and entry.effect.term is not None]
     depth = [(entry,) for entry in state.accepted if entry.name == DEPTH]
     weakest: list[tuple[Accepted, ...]] = []
     if fitting:
-        doubts = {entry.name: _doubt(judge.evidence, found, judge.fitted, entry) for entry in fitting}
+        doubts = {entry.name: _doubt(judged.evidence, found, judged.fitted, entry) for entry in fitting}
         weakest = [(max(fitting, key=lambda entry: doubts[entry.name]),)]
     for leaving in (*depth, *weakest, *combinations(fitting, 2)):
-        if not judge.needs_more_than(state.without(found, leaving).model):
+        if not _needs_more(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
             return leaving
     return ()
 
