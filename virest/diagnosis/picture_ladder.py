@@ -30,7 +30,7 @@ from virest.diagnosis.photometry import PhotometricObservations, normalised_rms,
 from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, photometric_effects
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
-from virest.diagnosis.selection import BLUR_LEVELS, LIGHT_LEVELS, MIXING_LEVELS
+from virest.diagnosis.selection import BLUR_LEVELS, FRAME_LEVELS, LIGHT_LEVELS, MIXING_LEVELS
 from virest.effects.table import EFFECTS
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
@@ -225,7 +225,7 @@ def _holds(
     for by_side in (False, True)[any(e.per_frame for e in effects) :]:
         held_out = judge(observations, nominal, effects, each, beside=accepted, by_side=by_side)
         log.debug("%s, by side %s: %.3f -> %.3f", effect.name, by_side, held_out.before, held_out.after)
-        if not LIGHT_LEVELS.gains(held_out):
+        if not (FRAME_LEVELS if effect.per_frame else LIGHT_LEVELS).gains(held_out):
             return False
     return True
 
