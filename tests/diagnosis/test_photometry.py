@@ -39,7 +39,14 @@ from virest.diagnosis.photometry_effects import (
 from virest.diagnosis.photometry_fit import RESOLUTION, fit_photometry, judge, pulls, significance, time_blocks
 from virest.diagnosis.photometry_noise import measured_noise
 from virest.diagnosis.photometry_patches import observe_photometry
-from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, climb_observations, name_curve, values_of
+from virest.diagnosis.picture_ladder import (
+    UNEVEN,
+    PictureVerdict,
+    changes_of,
+    climb_observations,
+    name_curve,
+    values_of,
+)
 from virest.diagnosis.refit_photometry import settle_light
 from virest.motion.integration import integrate_gyro
 
@@ -156,7 +163,10 @@ def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(seed: int)
     side, while_there = 1 / (1 + np.exp(-(x - 0.5) / 0.06)), np.exp(-(((t - 0.5) / 0.2) ** 2))
     one_side = 1 / (1 + np.exp(-(x - 0.6) / 0.06))
     for shade in (one_side, side * while_there, np.exp(-(((x - 1.4 * t + 0.2) / 0.2) ** 2))):
-        assert not named(dimmed(observed, 1 - 0.2 * shade))
+        verdict = PictureVerdict(NOMINAL)
+        climb_observations(verdict, dimmed(observed, 1 - 0.2 * shade), FRAMES)
+        assert not verdict.findings
+        assert verdict.notes == [UNEVEN]
     assert list(named(dimmed(observed, 1 - 0.2 * while_there))) == ["gain_drift"]
 
 

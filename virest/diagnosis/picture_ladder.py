@@ -57,6 +57,10 @@ a black level would only absorb that."""
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
 MIXING_PARAMETER = {"response_curve": "gamma", "black_level": "black_level"}
+UNEVEN = (
+    "brightness changes from frame to frame, and not alike on all sides of the picture: a shadow that comes or moves, "
+    "or light from one side; no cause was named for it"
+)
 SOFT_Z = 5.0
 """Above this many deviations, note possible defocus; lenses vary, so as a cause it must be more significant."""
 
@@ -163,12 +167,15 @@ def climb_observations(
         effects = tuple(e for e in effects if e.name not in CURVE)
     accepted: list[PhotometricEffect] = []
     plain = fit_photometry(observations, nominal, ())
+    notes: list[str] = []
     for _ in range(MAX_RUNGS):
-        rung = _rung(observations, nominal, plain, effects, accepted, each)
+        notes.clear()
+        rung = _rung(observations, nominal, plain, effects, accepted, each, notes)
         verdict.rungs.append(rung[0])
         if rung[1] is None:
             break
         accepted, plain = _still_needed(observations, nominal, [*accepted, rung[1]], rung[2])
+    verdict.notes += notes
     if not accepted:
         verdict.observations = observations.with_memory(plain.memory)
         return
@@ -192,8 +199,12 @@ def _rung(
     effects: Sequence[PhotometricEffect],
     accepted: list[PhotometricEffect],
     each: ParallelMap,
+    notes: list[str] | None = None,
 ) -> tuple[Rung, PhotometricEffect | None, PhotometricFit]:
-    """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part."""
+    """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part.
+
+    notes: takes what changes brightness from frame to frame and is no gain of whole frames.
+    """
     before = normalised_rms(observations.with_memory(plain.memory), plain.profile)[0]
     others = [e for e in effects if e not in accepted]
     found = each(fit_photometry, [(observations, nominal, [*accepted, e]) for e in others])
@@ -210,6 +221,8 @@ def _rung(
             continue
         if _holds(observations, nominal, accepted, effect, each):
             return replace(nothing, entered=name), effect, fits[name]
+        if effect.per_frame and notes is not None:
+            notes.append(UNEVEN)
     return nothing, None, plain
 
 
