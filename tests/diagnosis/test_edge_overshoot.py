@@ -1,5 +1,6 @@
 """Sharpening is found by the overshoot beside edges, and told from what else shapes an edge."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,9 @@ def edges(rng, shape, count=600, widths=(0.6, 1.4)):
     """Edges of a scene in 24 frames: some sharper, some softer, with a decoded movie's noise."""
     profile = np.stack([shape(width) for width in rng.uniform(*widths, count)])
     noise = np.repeat(0.02 * rng.standard_normal((count, (len(GRID_PX) + 3) // 4)), 4, axis=1)[:, : len(GRID_PX)]
-    half_width = np.array([np.interp(0.84, row, GRID_PX) for row in np.maximum.accumulate(profile, axis=1)])
-    return EdgeProfiles(profile + noise, half_width, np.arange(count) % 24 / 30)
+    rising = np.maximum.accumulate(profile, axis=1)
+    half_width = np.array([0.5 * np.ptp(np.interp((0.16, 0.84), row, GRID_PX)) for row in rising])
+    return EdgeProfiles(profile + noise, half_width, np.arange(count) % 24 / 30, np.arange(count) // 4)
 
 
 def found(rng, shape, **kind) -> Sharpening:
@@ -69,6 +71,29 @@ def test_a_scene_that_has_lines_beside_its_edges_is_not_sharpened(rng):
         return ndtr(GRID_PX / width) + 0.12 * np.exp(-0.5 * ((GRID_PX - 2.0) / 0.8) ** 2)
 
     assert found(rng, seamed).p_value > MAX_P
+
+
+@pytest.mark.parametrize("texture", [0.1, 0.3])
+def test_surfaces_that_are_brighter_beside_some_edges_are_not_sharpened(texture):
+    """As many edges overshoot as fall short; those that overshoot are the steepest, which must not be taken for all."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+
+        def textured(width, rng=rng):
+            step = ndtr(GRID_PX / width)
+            bright, dark = 1 + texture * rng.standard_normal(2)
+            beside = np.exp(-0.5 * (GRID_PX / 2.0) ** 2)
+            return 0.5 + (step - 0.5) * (1 + beside * (np.where(GRID_PX > 0, bright, dark) - 1))
+
+        assert found(rng, textured, widths=(0.7, 0.9)).p_value > 0.01
+
+
+def test_one_place_seen_in_many_frames_counts_once(rng):
+    """A board's one bright rim in all frames: as sure as one place can make it, and that is not sure."""
+    seen = edges(rng, lambda width: sharpened_step(width, 0.6, 1.2))
+    one = replace(seen, place=np.zeros(len(seen), int))
+    assert fit_sharpening(seen) is not None
+    assert fit_sharpening(one) is None
 
 
 def test_few_edges_tell_nothing(rng):

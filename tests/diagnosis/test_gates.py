@@ -30,7 +30,7 @@ from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import Trial, _best_single
 from virest.diagnosis.geometric_significance import significant
-from virest.diagnosis.photometry_effects import Vignetting
+from virest.diagnosis.photometry_effects import Flicker, GainDrift, Vignetting
 from virest.diagnosis.photometry_fit import fit_photometry, judge, time_blocks
 from virest.diagnosis.selection import Levels
 from virest.inference import profile_terms as terms_of
@@ -231,11 +231,31 @@ def test_brightness_gains_too(
         SimpleNamespace(cost=1.0, memory=0.0, rms=1.0, of=lambda _name: (np.zeros(1), np.zeros((1, 1)))),
     )
     monkeypatch.setattr(picture_ladder, "fit_photometry", lambda *_: better)
-    monkeypatch.setattr(picture_ladder, "judge", lambda *_: held)
+    monkeypatch.setattr(picture_ladder, "judge", lambda *_, **__: held)
     monkeypatch.setattr(picture_ladder, "significance", lambda *_: (9.0, p_value))
     rung, effect, _ = picture_ladder._rung(observed, NOMINAL, plain, [Vignetting()], [], one_by_one)  # type: ignore[arg-type]
     assert isinstance(rung, Rung)
     assert (effect is not None) is named
+
+
+@pytest.mark.parametrize(("after", "named"), [(1.2, True), (1.6, False)])
+def test_a_gain_of_each_frame_takes_half_of_the_excess_on_other_sides(
+    after: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vignette needs less, at other times and on other sides; either is judged beside what is in."""
+    observed = made_observations(hidden(), rng)
+    held, beside = HeldOutGain(PHOTOMETRY, 2.0, after, 0.9), []
+
+    def judge(*_: object, **how: object) -> HeldOutGain:
+        beside.append(how["beside"])
+        return held
+
+    monkeypatch.setattr(picture_ladder, "judge", judge)
+    gain = GainDrift((0, 1), 2)
+    assert picture_ladder._holds(observed, NOMINAL, [Flicker()], gain, one_by_one) is named
+    assert beside == [[Flicker()]]
+    assert picture_ladder._holds(observed, NOMINAL, [], Vignetting(), one_by_one)
+    assert len(beside) == 3
 
 
 # ── errors that hang together ────────────────────────────────────────────────────────────────────────────────────

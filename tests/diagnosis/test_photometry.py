@@ -18,7 +18,13 @@ from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
 from virest.capture.video import probe_movie, read_frames
 from virest.diagnosis.curve_from_blur import MixingEvidence, estimate_mixing, judge_mixing, observe_mixing
-from virest.diagnosis.field.brightness import instead_of_flicker, light_field, with_light_field
+from virest.diagnosis.field.brightness import (
+    SLOPE,
+    instead_of_cause,
+    instead_of_flicker,
+    light_field,
+    with_light_field,
+)
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
 from virest.diagnosis.photometry_effects import (
@@ -33,7 +39,14 @@ from virest.diagnosis.photometry_effects import (
 from virest.diagnosis.photometry_fit import RESOLUTION, fit_photometry, judge, pulls, significance, time_blocks
 from virest.diagnosis.photometry_noise import measured_noise
 from virest.diagnosis.photometry_patches import observe_photometry
-from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, climb_observations, name_curve, values_of
+from virest.diagnosis.picture_ladder import (
+    UNEVEN,
+    PictureVerdict,
+    changes_of,
+    climb_observations,
+    name_curve,
+    values_of,
+)
 from virest.diagnosis.refit_photometry import settle_light
 from virest.motion.integration import integrate_gyro
 
@@ -127,6 +140,61 @@ def test_flicker_that_stands_still_is_a_shadow_where_that_explains_more(rng: np.
     lamp = hidden(flicker_amplitude=0.15, flicker_frequency_hz=4 * 29.7, flicker_phase_rad=2.0)
     assert instead_of_flicker(made_observations(lamp, rng), lamp) is None
     assert instead_of_flicker(shaded, hidden(**standing | {"flicker_frequency_hz": 31.0})) is None
+
+
+def dimmed(observed: PhotometricObservations, factor: NDArray[np.float64]) -> PhotometricObservations:
+    """The patches under less light, (n,)."""
+    linear = NOMINAL.response.linearise(observed.grey / 255) * factor
+    return replace(observed, grey=np.asarray(NOMINAL.response.encode(linear)) * 255)
+
+
+def named(observed: PhotometricObservations) -> dict[str, PictureVerdict]:
+    """What the ladder of brightness says, by the causes that it names."""
+    verdict = PictureVerdict(NOMINAL)
+    climb_observations(verdict, observed, FRAMES)
+    return dict.fromkeys([finding.name for finding in verdict.findings], verdict)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(seed: int) -> None:
+    """It stands on one side, comes over it for a while, or passes through; a cloud before the sun dims all alike."""
+    observed = made_observations(hidden(), np.random.default_rng(seed))
+    x, t = observed.x_px / 639, observed.frame / FRAMES
+    side, while_there = 1 / (1 + np.exp(-(x - 0.5) / 0.06)), np.exp(-(((t - 0.5) / 0.2) ** 2))
+    one_side = 1 / (1 + np.exp(-(x - 0.6) / 0.06))
+    for shade in (one_side, side * while_there, np.exp(-(((x - 1.4 * t + 0.2) / 0.2) ** 2))):
+        verdict = PictureVerdict(NOMINAL)
+        climb_observations(verdict, dimmed(observed, 1 - 0.2 * shade), FRAMES)
+        assert not verdict.findings
+        assert verdict.notes == [UNEVEN]
+    assert list(named(dimmed(observed, 1 - 0.2 * while_there))) == ["gain_drift"]
+
+
+def test_a_vignette_keeps_its_name_beside_a_shadow(rng: np.random.Generator) -> None:
+    """And nearly its size; the lamps, whose frequency would be that of the frames, are not blamed."""
+    observed = made_observations(hidden(vignetting_corner_loss=0.2), rng)
+    shade = 1 / (1 + np.exp(-(observed.x_px / 639 - 0.6) / 0.06))
+    found = named(dimmed(observed, 1 - 0.2 * shade))
+    assert list(found) == ["vignetting"]
+    assert found["vignetting"].profile.extensions.vignetting_corner_loss == pytest.approx(0.2, abs=0.05)
+
+
+def test_a_slope_of_the_light_is_no_gain_that_follows_the_camera(rng: np.random.Generator) -> None:
+    """Where all patches move alike the two are the same for patches; the few numbers are told, and the rival is."""
+    observed = made_observations(hidden(), rng)
+    found = named(dimmed(observed, 1 - 0.15 * observed.x_px / 639))
+    verdict = found["gain_drift"]
+    assert verdict.observations is not None
+    name, without, slope = instead_of_cause(verdict.observations, verdict.profile)
+    assert name == "gain_drift"
+    assert slope is not None
+    assert slope.finding.shape == SLOPE
+    assert slope.finding.confounded == ("gain_drift",)
+    assert not without(found["gain_drift"].profile).extensions.gain
+    walk = np.cumsum(rng.normal(size=FRAMES))
+    drift = named(dimmed(observed, np.exp(0.15 * walk / np.ptp(walk))[observed.frame]))["gain_drift"]
+    assert drift.observations is not None
+    assert instead_of_cause(drift.observations, drift.profile)[2] is None
 
 
 def test_each_effect_comes_back_within_its_deviation(rng: np.random.Generator) -> None:

@@ -11,6 +11,7 @@ from virest.camera.profile_file import profile_mapping, read_profile
 from virest.errors import SettingsError
 from virest.simulation.effects import EffectContext, effect_names, hide_effects
 from virest.simulation.hand_motion import random_hand_motion
+from virest.simulation.hidden import Hidden, shaded
 from virest.simulation.phone_gyro import before_low_pass, low_passed_rate
 from virest.simulation.session import nominal_camera
 
@@ -242,3 +243,14 @@ def test_a_motion_is_taken_again_from_behind_a_low_pass(rng):
     found = before_low_pass(time_s, logged, 12.0)
     inner = slice(60, -60)
     assert np.std((found - true)[inner]) < 0.02 * np.std((logged - true)[inner])
+
+
+def test_a_shadow_passes_at_its_time_over_its_place():
+    """On top of what always darkens the picture; x to the right, y down, as parts of the picture."""
+    hidden = Hidden(
+        light=lambda x, y: 1 - 0.5 * y, shadow=lambda stamp_s, x, y: np.where((stamp_s > 1) & (x > 0.5), 0.25, 1.0)
+    )
+    light = np.ones((3, 4, 3), np.float32)
+    before, there = (shaded(hidden, light, stamp_s)[..., 0] for stamp_s in (0.5, 1.5))
+    np.testing.assert_allclose(before, np.array([[1.0], [0.75], [0.5]]) * np.ones((1, 4)))
+    np.testing.assert_allclose(there, before * (1, 1, 0.25, 0.25))

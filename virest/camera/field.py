@@ -94,11 +94,11 @@ class Field:
         """Values (..., components) where the covariates are (...) each."""
         table = np.array(self.values)
         if len(self.knots) == 1:
-            return cardinal_weights(self.knots[0], covariates[0], 1 if self.kind == "blur" else 3) @ table
-        both = np.broadcast_arrays(*covariates)
-        first, second = (cardinal_weights(k, c) for k, c in zip(self.knots, both, strict=True))
-        across = (first @ table.reshape(len(self.knots[0]), -1)).reshape(*first.shape[:-1], len(self.knots[1]), -1)
-        return np.asarray((second[..., None] * across).sum(axis=-2))
+            return interpolated(self.knots[0], table, covariates[0], 1 if self.kind == "blur" else 3)
+        first, second = np.broadcast_arrays(*covariates)
+        by_first = np.moveaxis(table.reshape(len(self.knots[0]), len(self.knots[1]), -1), 0, 1)
+        weights = cardinal_weights(self.knots[0], first)
+        return np.asarray((weights[..., None] * interpolated(self.knots[1], by_first, second)).sum(axis=-2))
 
     def at_time(self, time_s: Any, *first: Any) -> Array:
         """Values (..., components) of a field over time, or over what is logged, at times (...) of its own clock.
@@ -158,6 +158,14 @@ class Field:
         if self.log is None:
             return self.with_times(lambda time_s: time_s - seconds)
         return replace(self, log=(tuple(t - seconds for t in self.log[0]), self.log[1]))
+
+
+def interpolated(knots: tuple[float, ...], values: Array, covariate: Any, degree: int = 3) -> Array:
+    """The interpolating spline through values (knots, ...) where a covariate is (...); held beyond its ends."""
+    held = np.clip(np.asarray(covariate, float), knots[0], knots[-1])
+    cardinal = _cardinal(knots, degree)
+    along = np.tensordot(cardinal.c, values, axes=1)
+    return np.asarray(BSpline.construct_fast(cardinal.t, along, cardinal.k)(held))
 
 
 def cardinal_weights(knots: tuple[float, ...], covariate: Any, degree: int = 3) -> Array:

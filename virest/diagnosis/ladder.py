@@ -25,10 +25,9 @@ from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
 from virest.diagnosis.field.brightness import (
-    instead_of_flicker,
+    instead_of_cause,
     light_field,
     with_light_field,
-    without_flicker,
 )
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
@@ -261,10 +260,10 @@ class DiagnosisSession:
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         extended, light = self.curve.profile, self.light
         if (patches := light.observations) is not None:
-            instead = instead_of_flicker(patches, extended)
+            name, without, instead = instead_of_cause(patches, extended)
             if instead is not None:
-                extended, light = without_flicker(extended), replace(light, profile=without_flicker(light.profile))
-                findings = [finding for finding in findings if finding.name != "flicker"]
+                extended, light = without(extended), replace(light, profile=without(light.profile))
+                findings = [finding for finding in findings if finding.name != name]
             if (found := instead or light_field(patches, extended)) is not None:
                 extended, fields = with_light_field(extended, found), [*fields, found.finding]
                 light = replace(light, profile=with_light_field(light.profile, found))

@@ -152,23 +152,32 @@ def judge(
     profile: CameraProfile,
     effects: Sequence[PhotometricEffect],
     each: ParallelMap = one_by_one,
+    *,
+    beside: Sequence[PhotometricEffect] = (),
+    by_side: bool | None = None,
 ) -> HeldOutGain:
-    """Fit on one half, judge on the other, and the reverse.
+    """Fit on one half, judge on the other, and the reverse.  beside: effects that are in already.
 
-    Halves are blocks of time; for effects with a value per frame, which no other frame knows, they are places: a
-    frame's gain is found on half its patches and has to hold for the others.
+    by_side: halves are the picture's sides instead of blocks of time: what a shadow makes a cause say on one does not
+    hold on the other.  None: for effects with a value per frame, which no other frame knows.
     """
-    by_place = any(effect.per_frame for effect in effects)
-    both = halves(observations.place if by_place else time_blocks(observations))
+    by_side = any(effect.per_frame for effect in effects) if by_side is None else by_side
+    both = _sides(observations) if by_side else halves(time_blocks(observations))
     folds = [fitted for fitted in both if fitted.any() and not fitted.all()]
-    calls = [(observations, profile, some, fitted) for fitted in folds for some in (effects, ())]
+    calls = [(observations, profile, some, fitted) for fitted in folds for some in (effects, beside)]
     fits = each(fit_photometry, calls)
     judged = []
     for fitted, fit, without in zip(folds, fits[::2], fits[1::2], strict=True):
         held = _seen_twice(observations.subset(~fitted))
-        before, noise = normalised_rms(held.with_memory(without.memory), profile)
+        before, noise = normalised_rms(held.with_memory(without.memory), without.profile)
         judged.append((before, normalised_rms(held.with_memory(fit.memory), fit.profile)[0], noise))
     return HeldOutGain.of_folds(PHOTOMETRY, judged)
+
+
+def _sides(observations: PhotometricObservations) -> list[Mask]:
+    """Left and right, upper and lower half of the observations, (n,) each."""
+    lower = [at > np.median(at) for at in (observations.x_px, observations.y_px)]
+    return [side for half in lower for side in (half, ~half)]
 
 
 def significance(fit: PhotometricFit, effect_name: str, observations: PhotometricObservations) -> tuple[float, float]:

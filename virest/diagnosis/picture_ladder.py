@@ -35,7 +35,7 @@ from virest.diagnosis.photometry_effects import (
 )
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judge, significance
 from virest.diagnosis.photometry_patches import observe_photometry
-from virest.diagnosis.selection import BLUR_LEVELS, LIGHT_LEVELS, MIXING_LEVELS
+from virest.diagnosis.selection import BLUR_LEVELS, FRAME_LEVELS, LIGHT_LEVELS, MIXING_LEVELS
 from virest.effects.table import EFFECTS
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
@@ -62,6 +62,10 @@ curve:
 a black level would only absorb that."""
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
+UNEVEN = (
+    "brightness changes from frame to frame, and not alike on all sides of the picture: a shadow that comes or moves, "
+    "or light from one side; no cause was named for it"
+)
 SOFT_Z = 5.0
 """Above this many deviations, note possible defocus; lenses vary, so as a cause it must be more significant."""
 
@@ -168,12 +172,15 @@ def climb_observations(
         effects = tuple(e for e in effects if e.name not in CURVE)
     accepted: list[PhotometricEffect] = []
     plain = fit_photometry(observations, nominal, ())
+    notes: list[str] = []
     for _ in range(MAX_RUNGS):
-        rung = _rung(observations, nominal, plain, effects, accepted, each)
+        notes.clear()
+        rung = _rung(observations, nominal, plain, effects, accepted, each, notes)
         verdict.rungs.append(rung[0])
         if rung[1] is None:
             break
         accepted, plain = _still_needed(observations, nominal, [*accepted, rung[1]], rung[2])
+    verdict.notes += notes
     if not accepted:
         verdict.observations = observations.with_memory(plain.memory)
         return
@@ -197,8 +204,12 @@ def _rung(
     effects: Sequence[PhotometricEffect],
     accepted: list[PhotometricEffect],
     each: ParallelMap,
+    notes: list[str] | None = None,
 ) -> tuple[Rung, PhotometricEffect | None, PhotometricFit]:
-    """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part."""
+    """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part.
+
+    notes: takes what changes brightness from frame to frame and is no gain of whole frames.
+    """
     before = normalised_rms(observations.with_memory(plain.memory), plain.profile)[0]
     others = [e for e in effects if e not in accepted]
     found = each(fit_photometry, [(observations, nominal, [*accepted, e]) for e in others])
@@ -213,11 +224,28 @@ def _rung(
         forgetful = name not in CURVE or fits[name].memory <= MOST_KEPT
         if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not forgetful:
             continue
-        held_out = judge(observations, nominal, [*accepted, effect], each)
-        log.debug("%s: p %.2g, held out %.3f -> %.3f", name, p_value, held_out.before, held_out.after)
-        if LIGHT_LEVELS.gains(held_out):
+        if _holds(observations, nominal, accepted, effect, each):
             return replace(nothing, entered=name), effect, fits[name]
+        if effect.per_frame and notes is not None:
+            notes.append(UNEVEN)
     return nothing, None, plain
+
+
+def _holds(
+    observations: PhotometricObservations,
+    nominal: CameraProfile,
+    accepted: Sequence[PhotometricEffect],
+    effect: PhotometricEffect,
+    each: ParallelMap,
+) -> bool:
+    """Whether an effect beside those in gains at other times, unless it is known by frames, and on other sides."""
+    effects = [*accepted, effect]
+    for by_side in (False, True)[any(e.per_frame for e in effects) :]:
+        held_out = judge(observations, nominal, effects, each, beside=accepted, by_side=by_side)
+        log.debug("%s, by side %s: %.3f -> %.3f", effect.name, by_side, held_out.before, held_out.after)
+        if not (FRAME_LEVELS if effect.per_frame else LIGHT_LEVELS).gains(held_out):
+            return False
+    return True
 
 
 def _still_needed(

@@ -59,6 +59,9 @@ POINT_LEVELS = Levels(least_gain=0.004, evenness=((0.0, 0.01), (0.05, 0.05)))
 a capture with nothing wrong passes both this and the value's test at most as often as the latter alone.  Of a large
 gain less evenness is asked: time blocks differ in how much they tell of a cause."""
 LIGHT_LEVELS = Levels(least_gain=0.15, least_fall=0.02)
+FRAME_LEVELS = Levels(least_gain=0.5, least_fall=0.02)
+"""Of a value for each frame, on the picture's other sides: the greater part, for a shadow that comes over a part of the
+picture dims the rest a little too."""
 MIXING_LEVELS = Levels(1.5e-3, 0.15, least_change=MappingProxyType({"response_curve": 0.05, "black_level": 0.02}))
 """Changes of the logarithm of gamma, and of the black level."""
 BLUR_LEVELS = Levels(least_change=MappingProxyType({"exposure_time": 0.08, "defocus": 0.5}))

@@ -38,6 +38,8 @@ class Hidden:
     """Of time (n,), reading (n, 3) and specific force (n, 3): what is logged instead of the reading."""
     light: Callable[[Array, Array], Array] | None = None
     """Of x and y as parts of the width and height: factor on the light."""
+    shadow: Callable[[float, Array, Array], Array] | None = None
+    """Of a stamp, and of x and y: another factor, of what passes before the lens or across the light."""
     blur_px: Callable[[float], float] | None = None
     """Of a stamp: standard deviation of a Gaussian on the light."""
     corner_blur_px: float = 0.0
@@ -84,13 +86,15 @@ def defocused(profile: CameraProfile, hidden: Hidden, light: Any, stamp_s: float
     return (1 - above) * whole[below, rows, columns] + above * whole[below + 1, rows, columns]
 
 
-def shaded(hidden: Hidden, light: Any) -> Any:
+def shaded(hidden: Hidden, light: Any, stamp_s: float) -> Any:
     """Light (h, w, 3) as it falls on the sensor."""
-    if hidden.light is None:
-        return light
+    passing = hidden.shadow and partial(hidden.shadow, stamp_s)
     height, width = light.shape[:2]
-    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
-    return light * hidden.light(x, y)[..., None].astype(np.float32)
+    for factor in (hidden.light, passing):
+        if factor is not None:
+            x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+            light = light * factor(x, y)[..., None].astype(np.float32)
+    return light
 
 
 def focal_scale(profile: CameraProfile, hidden: Hidden, time_s: Any, radius_px: Any) -> Any:

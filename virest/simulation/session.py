@@ -244,7 +244,8 @@ def render_picture(session: Session, slot: int, phone: PhonePictures | None = No
         session.true_exposure_s(capture),
     )
     light = defocused(session.true, session.hidden, light, session.stamp_s(capture))
-    light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=True))
+    light = sensor_light(light, session.true, _gain(session, slot), defocus=True)
+    light = shaded(session.hidden, light, session.stamp_s(capture))
     rng = np.random.default_rng([session.settings.seed, 3, capture])
     levels = noisy_levels(_grey(session, light), session.settings.noise_levels, rng)
     return round_levels(levels if phone is None else 255.0 * phone.develop(levels / 255.0))
@@ -258,7 +259,8 @@ def render_truth(session: Session, slot: int, *, middle: bool = False) -> Pictur
     capture = int(session.shows[slot])
     time_s = session.middle_s(capture) if middle else session.first_row_start_s(capture)
     light = instant(session.scene, session.motion, session.view, time_s)
-    light = shaded(session.hidden, sensor_light(light, session.true, _gain(session, slot), defocus=False))
+    light = sensor_light(light, session.true, _gain(session, slot), defocus=False)
+    light = shaded(session.hidden, light, session.stamp_s(capture))
     return eight_bit(tone_curve(_grey(session, light), session.settings.isp.tone), 0.0, None)
 
 

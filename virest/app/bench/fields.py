@@ -57,6 +57,8 @@ class Strangeness:
     """Per field: kinds and covariates that are right."""
     lasting: bool = True
     """Whether another capture of the phone has it too."""
+    nameless: bool = False
+    """Whether neither a cause nor a form describes it: then nothing named is right."""
 
 
 def _either(*pairs: tuple[str, str]) -> frozenset[tuple[str, str]]:
@@ -163,6 +165,19 @@ def _shading(rng: np.random.Generator, size: float) -> Strangeness:
     return Strangeness(Hidden(light=light), expected=(_either(("gain", "x, y")),), lasting=False)
 
 
+def _passing(rng: np.random.Generator, size: float) -> Strangeness:
+    """A soft shadow that comes over one side for a while, or a band of it that moves through; no form describes it."""
+    part, turn, kind = 0.1 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
+    way, at_s, lasting_s = (np.cos(turn), np.sin(turn)), rng.uniform(1.0, 2.0), rng.uniform(0.5, 0.9)
+
+    def shadow(stamp_s: float, x: Array, y: Array) -> Array:
+        along, since = 2 * ((x - 0.5) * way[0] + (y - 0.5) * way[1]), (stamp_s - at_s) / lasting_s
+        side = np.exp(-(since**2)) / (1 + np.exp(-along / 0.15))
+        return np.asarray(1 - part * (np.exp(-(((along - since) / 0.4) ** 2)) if kind else side))
+
+    return Strangeness(Hidden(shadow=shadow), nameless=True, lasting=False)
+
+
 def _hunting(rng: np.random.Generator, size: float) -> Strangeness:
     """A focus that hunts to and fro, without a log."""
     part, hz, phase = 0.003 * size * rng.uniform(0.8, 1.25), rng.uniform(1.0, 1.8), rng.uniform(0, 2 * np.pi)
@@ -252,6 +267,7 @@ EFFECTS: dict[str, Draw] = {
     "soft_moments": _soft_moments,
     "two": _two,
     "one_named": _one_named,
+    "passing": _passing,
 }
 NULL, NAMED_ONLY = "nothing", "named_only"
 CASES = {**EFFECTS, NULL: _nothing, NAMED_ONLY: _named_only}
@@ -354,6 +370,8 @@ def is_right(strange: Strangeness, named: list[str], found: Diagnosis) -> bool:
     if len(fields) != len(strange.expected) or any(set(fields).isdisjoint(pairs) for pairs in strange.expected):
         return False
     known = [{cause.name, *(rival.name for rival in cause.rivals)} for cause in found.causes]
+    if strange.nameless:
+        return not known
     if not named and not fields:
         return found.verdict == CONSISTENT
     return all(names & set(named) for names in known) and len(known) <= len(named)

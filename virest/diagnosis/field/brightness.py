@@ -7,6 +7,7 @@ all move alike, an even slope is a gain of each frame, and stays nought.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.linalg import null_space
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.diagnosis.field.screening import MAX_P, MIN_T, Design, score_forms
+from virest.diagnosis.field.screening import ALIKE_PART, MAX_P, MIN_T, Design, score_forms
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
 from virest.inference.chance import t_ratio
@@ -75,8 +76,11 @@ class LightField:
 SLOPE, BAND, MAP = "growing to one side", "changing with the row alone", "a smooth map"
 
 
-def light_field(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
-    """The map that the patches ask for beside the profile's light; None where they ask for none."""
+def light_field(observations: PhotometricObservations, profile: CameraProfile, gains: bool = True) -> LightField | None:
+    """The map that the patches ask for beside the profile's light; None where they ask for none.
+
+    gains: whether each frame may be brighter than the others as well.
+    """
     seen = _thinned(observations)
     block = np.unique(seen.frame // FRAMES_IN_BLOCK, return_inverse=True)[1]
     if len(seen) < 500 or block.max() + 1 < LEAST_BLOCKS:
@@ -88,7 +92,7 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile) -
     left = at.residual / seen.noise
     scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
     weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2) / scale**2
-    tangent = _tangent(seen, profile, at) / seen.noise[:, None]
+    tangent = _tangent(seen, profile, at, gains) / seen.noise[:, None]
     asked = [Design("gain", design[order, None], over_time=False)]
     (scored, *_) = score_forms(left[order, None], weight[order], tangent[order, None], asked, block[order]) or (None,)
     if scored is None or scored.parts_gain is None or scored.p_value > MAX_P:
@@ -123,6 +127,15 @@ def _fitted(
     return LightField(field, p_value, _held_out(columns, design.shape[1], left, weight, block, seen))
 
 
+def instead_of_cause(
+    observations: PhotometricObservations, profile: CameraProfile
+) -> tuple[str, Callable[[CameraProfile], CameraProfile], LightField | None]:
+    """The cause that a map does without, the profile without it, and the map; None for the map where none does."""
+    if (found := instead_of_gain(observations, profile)) is not None:
+        return "gain_drift", without_gain, found
+    return "flicker", without_flicker, instead_of_flicker(observations, profile)
+
+
 def instead_of_flicker(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
     """The map that explains the patches at least as well as the profile's flicker, where that stands still.
 
@@ -138,9 +151,32 @@ def instead_of_flicker(observations: PhotometricObservations, profile: CameraPro
     return replace(found, rivals=(f"flicker at {profile.extensions.flicker_frequency_hz:.4g} Hz",))
 
 
+def instead_of_gain(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
+    """The map, the same in all frames, that explains what the profile's gain of each frame does; None where none does.
+
+    Where all patches move alike, a slope of the light is a gain that follows where the camera looks: a few numbers,
+    the same at all times, that take away nearly as much as one for each frame does are the likelier reason.
+    """
+    if not profile.extensions.gain:
+        return None
+    found = light_field(observations, without_gain(profile), gains=False)
+    if found is None:
+        return None
+    before = found.held_out.before**2
+    by_gain = before - _left_by(_thinned(observations), profile) ** 2
+    if before - found.held_out.after**2 < ALIKE_PART * by_gain:
+        return None
+    return replace(found, rivals=("gain_drift",))
+
+
 def without_flicker(profile: CameraProfile) -> CameraProfile:
     """The profile under light that does not pulse."""
     return replace(profile, extensions=replace(profile.extensions, flicker_amplitude=0.0))
+
+
+def without_gain(profile: CameraProfile) -> CameraProfile:
+    """The profile with all frames alike."""
+    return replace(profile, extensions=replace(profile.extensions, gain=()))
 
 
 def _stands_still(seen: PhotometricObservations, profile: CameraProfile) -> bool:
@@ -198,9 +234,9 @@ def _weights(field: Field, seen: PhotometricObservations) -> Array:
     return np.asarray(across[:, :, None] * down[:, None, :]).reshape(len(seen), -1)
 
 
-def _tangent(seen: PhotometricObservations, profile: CameraProfile, at: Prediction) -> Array:
+def _tangent(seen: PhotometricObservations, profile: CameraProfile, at: Prediction, gains: bool = True) -> Array:
     """What vignetting, a gain for each frame and the curve can do (n, m), grey levels."""
-    frames = (seen.frame[:, None] == seen.frames[None, :]).astype(float)
+    frames = (seen.frame[:, None] == seen.frames[None, : len(seen.frames) * gains]).astype(float)
     factors = -at.respond(np.concatenate([(seen.radius**2)[:, None], frames], axis=1))
     curve = profile.response or ResponseCurve("srgb")
     changed = (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -77,7 +77,8 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
         asked = _asked_for(evidence, capture, state.model, fitted)
-        steps = (_step(evidence, found, state, one, fitted) for one in asked)
+        judged = _Judged(evidence, state.model, fitted)
+        steps = (_step(judged, found, state, one) for one in asked)
         if (step := next((step for step in steps if step is not None), None)) is None:
             break
         chosen, entered, after = step
@@ -117,6 +118,10 @@ class _Description:
     accepted: tuple[Accepted, ...]
     forms: tuple[FieldForm, ...]
 
+    def is_dense(self, period_s: float) -> bool:
+        """Whether the knots of a form lie as close as blocks of frames that follow each other by this."""
+        return any(form.is_dense(2 * PAIRS_IN_BLOCK * period_s) for form in self.forms)
+
     def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _Description:
         """The same without some causes, their values back where the profile had them.
 
@@ -142,11 +147,27 @@ class _Description:
         return _Description(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
 
 
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """A model on held-out blocks and on held-out points, each worked out once, where it is asked for."""
+
+    evidence: Evidence
+    model: Model
+    fitted: TrackFit
+    _known: dict[bool, HeldOut] = field(default_factory=dict, repr=False)
+
+    def held_out(self, by_point: bool) -> HeldOut:
+        """On points, or on blocks."""
+        if by_point not in self._known:
+            self._known[by_point] = _held_out(self.evidence, self.model, self.fitted, by_point)
+        return self._known[by_point]
+
+
 def _step(
-    evidence: Evidence, found: GeometricVerdict, state: _Description, asked: _Asked, fitted: TrackFit
+    judged: _Judged, found: GeometricVerdict, state: _Description, asked: _Asked
 ) -> tuple[_Asked, _Entered, _Description] | None:
     """A form that was asked for, in the model, and all that stays beside it; None where it gains nothing."""
-    entered = _entered(evidence, state.model, asked, fitted)
+    evidence, entered = judged.evidence, _entered(judged, asked)
     if entered is None:
         return None
     more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
@@ -226,6 +247,8 @@ class _Search:
     that an instant that is a frame off would be ruled out by the points that tell it best."""
     asked: int
     """How many forms are asked for in all."""
+    _effects: dict[int, tuple[FieldForm, Array]] = field(default_factory=dict, repr=False)
+    """By the identity of their form, which is kept so that no other takes its number."""
 
     def best(self, tangent: Array, forms: Sequence[FieldForm]) -> Selection | None:
         """The form that residuals ask for beside a tangent space (n, 2, m), if any."""
@@ -260,7 +283,12 @@ class _Search:
         return sorted(best.values(), key=lambda entry: -float(entry.gain.sum()))
 
     def effect(self, form: FieldForm) -> Array:
-        """Whitened change (n, 2, k) of the points per number of a form."""
+        """Whitened change (n, 2, k) of the points per number of a form; worked out once."""
+        if id(form) not in self._effects:
+            self._effects[id(form)] = form, self._effect(form)
+        return self._effects[id(form)][1]
+
+    def _effect(self, form: FieldForm) -> Array:
         seen = self.seen
         effect = seen.effect((form.term,))
         if form.step_s is not None and self.blind_s:
@@ -282,11 +310,11 @@ class _Entered:
     after: HeldOut
 
 
-def _entered(evidence: Evidence, model: Model, asked: _Asked, fitted: TrackFit) -> _Entered | None:
+def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
     """The model with a form in it, with as many knots as pay; None where held-out blocks do not gain."""
-    form = asked.form
+    evidence, model, fitted, form = judged.evidence, judged.model, judged.fitted, asked.form
     extended = replace(model, terms=(*model.terms, form.term))
-    before, after = (_held_out(evidence, m, fitted, form.local) for m in (model, extended))
+    before, after = judged.held_out(form.local), _held_out(evidence, extended, fitted, form.local)
     gain = before.block_loss - after.block_loss
     log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
     holds = t_ratio(gain) > (MIN_LOCAL_T if form.over_time and not form.local else MIN_T)
@@ -306,7 +334,8 @@ def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackF
     Where twice the knots gain nothing over time or rows, four times as many may: of what goes to and fro between two.
     """
     by_point = entered.form.over_time
-    last = _held_out(evidence, entered.model, fitted, by_point) if by_point else entered.after
+    judged_so = by_point == entered.form.local
+    last = entered.after if judged_so else _held_out(evidence, entered.model, fitted, by_point)
     names = frozenset(term.name for term in model.terms)
     finer, failed = entered.form.finer(model.profile, names), False
     while finer is not None:
@@ -341,7 +370,7 @@ def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool
     fold = (np.arange(len(table)) if by_point else block) % 2
     left = np.zeros(len(table))
     for number in (0, 1):
-        part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number))
+        part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number), covariances=False)
         left[fold != number] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[fold != number]
     return HeldOut(np.asarray(loss(left, 1.0)), None if by_point else block, capped_rms(left))
 
@@ -355,36 +384,44 @@ def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Desc
         model = state.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, JUDGE_POINTS))
         state = replace(state, model=replace(model, profile=fitted.profile, scene=fitted.scene))
-        if (form := _idle_form(evidence, state, fitted)) is not None:
+        judged = _Judged(evidence, state.model, fitted)
+        if (form := _idle_form(judged, state)) is not None:
             log.debug("stood in for another form: %s", form.name)
             kept = tuple(known for known in state.forms if known is not form)
             state = replace(state, model=_without_form(state.model, form), forms=kept)
             continue
-        leaving = _stand_ins(evidence, found, state, fitted)
+        leaving = _stand_ins(judged, found, state)
         if not leaving:
             return state
         log.debug("stood in for a field: %s", [entry.name for entry in leaving])
         state = state.without(found, leaving)
 
 
-def _idle_form(evidence: Evidence, state: _Description, fitted: TrackFit) -> FieldForm | None:
+def _needs_more(judged: _Judged, by_point: bool, less: Model) -> bool:
+    """Whether held-out blocks, or points, are better off with what a smaller model lacks, a cause or a form."""
+    before, after = _held_out(judged.evidence, less, judged.fitted, by_point), judged.held_out(by_point)
+    gain = before.block_loss - after.block_loss
+    part = float(gain.mean() / before.block_loss.mean())
+    return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
+
+
+def _idle_form(judged: _Judged, state: _Description) -> FieldForm | None:
     """A form that the newest leaves nothing to say to, if any."""
+    by_point = state.is_dense(judged.evidence.period_s)
     less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
-    return next((form for form, model in less if not _useful(evidence, model, state, fitted)), None)
+    return next((form for form, model in less if not _needs_more(judged, by_point, model)), None)
 
 
-def _stand_ins(
-    evidence: Evidence, found: GeometricVerdict, state: _Description, fitted: TrackFit
-) -> tuple[Accepted, ...]:
+def _stand_ins(judged: _Judged, found: GeometricVerdict, state: _Description) -> tuple[Accepted, ...]:
     """The cause, or the two, that a model can do without; nothing where it needs all."""
     fitting = [entry for entry in state.accepted if entry.effect is not None and entry.effect.term is not None]
     depth = [(entry,) for entry in state.accepted if entry.name == DEPTH]
     weakest: list[tuple[Accepted, ...]] = []
     if fitting:
-        doubts = {entry.name: _doubt(evidence, found, fitted, entry) for entry in fitting}
+        doubts = {entry.name: _doubt(judged.evidence, found, judged.fitted, entry) for entry in fitting}
         weakest = [(max(fitting, key=lambda entry: doubts[entry.name]),)]
     for leaving in (*depth, *weakest, *combinations(fitting, 2)):
-        if not _useful(evidence, state.without(found, leaving).model, state, fitted):
+        if not _needs_more(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
             return leaving
     return ()
 
@@ -392,13 +429,3 @@ def _stand_ins(
 def _doubt(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:
     assert entry.effect is not None
     return p_of(fitted, entry.effect, fitted.profile, found.nominal.profile, evidence.typical_px)
-
-
-def _useful(evidence: Evidence, less: Model, more: _Description, fitted: TrackFit) -> bool:
-    """Whether held-out blocks, or points where knots lie as close as blocks, are better off with a cause or a form."""
-    step_s = 2 * PAIRS_IN_BLOCK * evidence.period_s
-    by_point = any(form.is_dense(step_s) for form in more.forms)
-    before, after = (_held_out(evidence, m, fitted, by_point) for m in (less, more.model))
-    gain = before.block_loss - after.block_loss
-    part = float(gain.mean() / before.block_loss.mean())
-    return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
