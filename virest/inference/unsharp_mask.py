@@ -42,7 +42,8 @@ FALSE_ALARM = 5e-3
 BARE_ALL, BARE_SHARPEST = (0.001, 0.003), (0.0056, 0.0056)
 """Overshoot of movies that nobody sharpened, as part of the step: mean, and how far it varies, of all edges and of the
 sharpest, over 65 simulated captures of five scenes at 320 x 240 and 640 x 480, gentle and fast, coded finely and
-coarsely, in focus and not; what the number of edges makes it scatter by is not in it.
+coarsely, in focus and not; what the number of edges makes it scatter by is not in it.  ``python -m virest.app.bench
+--only edges`` measures it on others.
 
 The most are 0.009, a board's at 320 x 240, and 0.025.  The profile that the mask is fitted to may be wrong by as much
 as the sharpest edges vary: neighbours within a pixel share the error."""
@@ -86,22 +87,41 @@ class UnsharpMask:
     """Standard deviation of the Gaussian."""
 
 
+@dataclass(frozen=True, slots=True)
+class Overshoot:
+    """How far edges stand above the plateaus beside them, as part of the step, and what would do it."""
+
+    of_all: float
+    """In the median of all edges."""
+    of_sharpest: float
+    p_value: float
+    """Probability of the more significant of the two where nobody sharpened, for two that were asked."""
+    mask: UnsharpMask
+    """What fits the sharpest."""
+
+
 def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | None:
     """The mask that some frames' edges show; None: none of significance, or too few edges tell.
 
     pictures: grey (h, w), and the motion over the frame.
     """
+    found = overshoot(pictures)
+    return found.mask if found is not None and found.p_value < FALSE_ALARM and found.mask.amount > 0 else None
+
+
+def overshoot(pictures: Iterable[tuple[Picture, RowMotion]]) -> Overshoot | None:
+    """What some frames' edges do beside their plateaus; None where too few tell.  Arguments as of :func:`seen_mask`."""
     found = [np.zeros((0, len(GRID_PX))), *(_profiles(picture, motion) for picture, motion in pictures)]
     profiles = np.concatenate(found)
     if len(profiles) < LEAST_EDGES:
         return None
     width = _inner_width(profiles)
     sharp = profiles[width <= np.quantile(width, SHARPEST, method="lower")]
-    asked = (_significance(profiles, *BARE_ALL), _significance(sharp, *BARE_SHARPEST))
-    if len(asked) * normal_tail(max(asked)) > FALSE_ALARM:
-        return None
+    asked = ((profiles, *BARE_ALL), (sharp, *BARE_SHARPEST))
+    p_value = min(1.0, len(asked) * normal_tail(max(_significance(*one) for one in asked)))
     _, amount, log_radius, *_ = _fitted(np.median(sharp, axis=0))
-    return UnsharpMask(float(amount), float(np.exp(log_radius))) if amount > 0 else None
+    mask = UnsharpMask(float(amount), float(np.exp(log_radius)))
+    return Overshoot(_crest(profiles)[1] - 1, _crest(sharp)[1] - 1, p_value, mask)
 
 
 def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:
@@ -177,13 +197,19 @@ def _inner_width(profiles: Array) -> Array:
     return np.where(after > 0, width, np.inf)
 
 
+def _crest(profiles: Array) -> tuple[int, float]:
+    """Where on GRID_PX their median is highest beyond the edge, and how high."""
+    median = np.median(profiles, axis=0)
+    at = int(np.argmax(np.where(GRID_PX > 0, median, 0.0)))
+    return at, float(median[at])
+
+
 def _significance(profiles: Array, bare: float, bare_std: float) -> float:
     """How far they stand above their plateaus, less what bare movies do, in deviations."""
-    mean = np.median(profiles, axis=0)
-    at = int(np.argmax(np.where(GRID_PX > 0, mean, 0.0)))
-    typical = robust_std(profiles[:, at] - mean[at])
+    at, crest = _crest(profiles)
+    typical = robust_std(profiles[:, at] - crest)
     noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / ALIKE)
-    return float((mean[at] - 1 - bare) / np.hypot(noise, bare_std))
+    return float((crest - 1 - bare) / np.hypot(noise, bare_std))
 
 
 def _fitted(mean: Array) -> Array:

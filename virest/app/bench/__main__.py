@@ -30,6 +30,7 @@ from virest.app.bench.compare import NOISE, compare_text, read_report
 from virest.app.bench.cost import cost_section
 from virest.app.bench.curves import curves_section
 from virest.app.bench.diagnosis import diagnosis_section
+from virest.app.bench.edges import edges_section
 from virest.app.bench.fields import fields_section
 from virest.app.bench.fits import fits_section
 from virest.app.bench.growth import growth_section
@@ -50,6 +51,7 @@ SECTIONS: dict[str, Section] = {
     "quality": quality_section,
     "honesty": honesty_section,
     "fits": fits_section,
+    "edges": edges_section,
     "shutter": shutter_section,
     "speed": speed_section,
     "growth": growth_section,

@@ -1,0 +1,101 @@
+"""How far edges overshoot that nobody sharpened, and what is seen of a phone's sharpening: :mod:`unsharp_mask`.
+
+$ python -m virest.app.bench --only edges --quick
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from virest.app.bench.tables import table
+from virest.app.bench.workload import Scale, Workload, simulated
+from virest.app.diagnose import open_source
+from virest.inference.unsharp_mask import FALSE_ALARM, MOST_FRAMES, Overshoot, overshoot
+from virest.motion.integration import integrate_gyro
+from virest.motion.optics import moving_lens
+from virest.restoration.capture import moved_over_frame
+from virest.restoration.neighbours.survey import path_length_px
+from virest.simulation.phone_isp import PhoneIsp
+
+Row = dict[str, Any]
+SCENES = ("leaves", "text", "board", "bright", "photographs")
+SIZES = ((320, 240), (640, 480))
+MOTIONS = ((0.4, 6.0), (0.6, 8.0), (1.2, 12.0))
+"""Turn rate in rad/s and exposure in ms."""
+MASKS = ((0.0, 1.0), (0.4, 1.0), (0.7, 1.0), (1.0, 1.5))
+"""Amount and radius; the first is none."""
+FRAMES, FIRST_SEED = 6, 7000
+
+
+def edges_section(work: Path, scale: Scale) -> tuple[Row, str]:
+    """Measure captures of all scenes, sizes and motions, each with every mask."""
+    rows = [_row(work, workload, *mask) for workload, mask in _captures(scale)]
+    groups = [[row for row in rows if row["mask"] == list(mask)] for mask in MASKS]
+    return {"captures": rows}, _text(groups)
+
+
+def _captures(scale: Scale) -> Iterator[tuple[Workload, tuple[float, float]]]:
+    every = [(scene, size, motion) for scene in SCENES for size in SIZES for motion in MOTIONS]
+    for number, (scene, (width, height), (rate, exposure_ms)) in enumerate(every[:: 4 if scale.quick else 1]):
+        for mask in MASKS:
+            isp = PhoneIsp(sharpen=mask[0], sharpen_radius_px=mask[1], bits_per_px=(0.25, 0.6)[number % 2])
+            options = {"scene": scene, "width": width, "height": height, "frames": FRAMES, "exposure_ms": exposure_ms}
+            options |= {"rate_rad_s": rate, "seed": FIRST_SEED + number, "isp": isp, "truth_frames": False}
+            yield Workload(f"edges-{scene}-{width}-{rate:g}-{mask[0]:g}", "edges", (0.0, np.inf), options), mask
+
+
+def _row(work: Path, workload: Workload, amount: float, radius_px: float) -> Row:
+    found = _overshoot(simulated(work, workload.name, **workload.options))
+    row: Row = {"capture": workload.name, "mask": [amount, radius_px], "p_value": None}
+    if found is None:
+        return row
+    overshoots = {"of_all": found.of_all, "of_sharpest": found.of_sharpest, "p_value": found.p_value}
+    return row | overshoots | {"fitted": [found.mask.amount, found.mask.radius_px]}
+
+
+def _overshoot(capture: Path) -> Overshoot | None:
+    """Of the least blurred frames, as planning looks at them."""
+    source = open_source(capture)
+    trajectory = integrate_gyro(source.capture.imu, source.profile)
+    lens = moving_lens(trajectory, source.profile)
+    motions = [
+        moved_over_frame(trajectory, lens, frame, "exposure-start", None, source.profile)
+        for frame in source.capture.frames
+    ]
+    calmest = sorted(range(len(motions)), key=lambda n: path_length_px(motions[n]))[:MOST_FRAMES]
+    grey = source.gray(sorted(calmest))
+    return overshoot([(picture, motions[n]) for n, picture in grey if picture is not None])
+
+
+def _text(groups: list[list[Row]]) -> str:
+    header = ["mask", "captures", "all edges", "sharpest", "most", f"seen (p < {FALSE_ALARM:g})", "amount", "radius px"]
+    lines = []
+    for rows in groups:
+        told = [row for row in rows if row["p_value"] is not None]
+        seen = [row for row in told if row["p_value"] < FALSE_ALARM]
+        every, sharpest = (np.array([row[key] for row in told]) for key in ("of_all", "of_sharpest"))
+        fitted = np.array([row["fitted"] for row in (told if rows[0]["mask"][0] else seen)]).reshape(-1, 2)
+        lines.append(
+            [
+                f"{rows[0]['mask'][0]:g}, {rows[0]['mask'][1]:g} px" if rows[0]["mask"][0] else "none",
+                str(len(told)),
+                _spread(every, 4),
+                _spread(sharpest, 4),
+                f"{sharpest.max():.3f}",
+                f"{len(seen)} of {len(told)}",
+                _spread(fitted[:, 0], 2),
+                _spread(fitted[:, 1], 2),
+            ]
+        )
+    return (
+        "EDGES: overshoot beside flat plateaus, as part of the step, mean ± its deviation from capture to capture;\n"
+        "what of a phone's sharpening is seen, and fitted to the sharpest edges\n" + table(header, lines)
+    )
+
+
+def _spread(values: Any, digits: int) -> str:
+    return f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}" if len(values) else "-"
