@@ -30,6 +30,8 @@ FULL_RANGE = 2
 PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
 FIXED_POINT = 64
 """Steps of a grey level in the 16-bit sums: luma and chroma together stay below 2^15."""
+CUBIC_MIDDLE = np.array([[-3, 19, 19, -3]], np.float32) / 32
+"""Weights half way between two samples of OpenCV's cubic interpolation, as cv2.resize has them for the rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +118,7 @@ def _upsample(chroma: NDArray[Any], shape: tuple[int, ...], *, centred: bool) ->
         return chroma
     factor_x, factor_y = -(-width // chroma.shape[1]), -(-height // chroma.shape[0])
     if factor_x == 2 and not centred:
-        right = cv2.copyMakeBorder(chroma[:, 1:], 0, 0, 0, 1, cv2.BORDER_REPLICATE)
-        between = cv2.addWeighted(chroma, 0.5, right, 0.5, 0.0)
+        between = cv2.filter2D(chroma, -1, CUBIC_MIDDLE, anchor=(1, 0), borderType=cv2.BORDER_REPLICATE)
         chroma, factor_x = cv2.merge([chroma, between]).reshape(len(chroma), -1), 1
     size = (chroma.shape[1] * factor_x, chroma.shape[0] * factor_y)
     return np.ascontiguousarray(cv2.resize(chroma, size, interpolation=cv2.INTER_CUBIC)[:height, :width])

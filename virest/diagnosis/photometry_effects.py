@@ -99,9 +99,7 @@ class ResponseGamma(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set response.extra_gamma."""
-        return replace(
-            profile, response=replace(profile.response or ResponseCurve("srgb"), extra_gamma=float(values[0]))
-        )
+        return _bent(profile, extra_gamma=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,9 +112,7 @@ class BlackLevel(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set response.black_level."""
-        return replace(
-            profile, response=replace(profile.response or ResponseCurve("srgb"), black_level=float(values[0]))
-        )
+        return _bent(profile, black_level=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,15 +89,20 @@ class UnsharpMask:
 
 @dataclass(frozen=True, slots=True)
 class Overshoot:
-    """How far edges stand above the plateaus beside them, as part of the step, and what would do it."""
+    """How far edges stand above the plateaus beside them, as part of the step."""
 
     of_all: float
     """In the median of all edges."""
     of_sharpest: float
     p_value: float
     """Probability of the more significant of the two where nobody sharpened, for two that were asked."""
-    mask: UnsharpMask
-    """What fits the sharpest."""
+    sharpest: Array
+    """(m,) median profile of the sharpest on GRID_PX."""
+
+    def mask(self) -> UnsharpMask:
+        """What fits the sharpest; its amount is 0 or less where nothing overshoots."""
+        _, amount, log_radius, *_ = _fitted(self.sharpest)
+        return UnsharpMask(float(amount), float(np.exp(log_radius)))
 
 
 def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | None:
@@ -106,7 +111,10 @@ def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | No
     pictures: grey (h, w), and the motion over the frame.
     """
     found = overshoot(pictures)
-    return found.mask if found is not None and found.p_value < FALSE_ALARM and found.mask.amount > 0 else None
+    if found is None or found.p_value > FALSE_ALARM:
+        return None
+    mask = found.mask()
+    return mask if mask.amount > 0 else None
 
 
 def overshoot(pictures: Iterable[tuple[Picture, RowMotion]]) -> Overshoot | None:
@@ -119,9 +127,7 @@ def overshoot(pictures: Iterable[tuple[Picture, RowMotion]]) -> Overshoot | None
     sharp = profiles[width <= np.quantile(width, SHARPEST, method="lower")]
     asked = ((profiles, *BARE_ALL), (sharp, *BARE_SHARPEST))
     p_value = min(1.0, len(asked) * normal_tail(max(_significance(*one) for one in asked)))
-    _, amount, log_radius, *_ = _fitted(np.median(sharp, axis=0))
-    mask = UnsharpMask(float(amount), float(np.exp(log_radius)))
-    return Overshoot(_crest(profiles)[1] - 1, _crest(sharp)[1] - 1, p_value, mask)
+    return Overshoot(_crest(profiles)[1] - 1, _crest(sharp)[1] - 1, p_value, np.median(sharp, axis=0))
 
 
 def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:

@@ -5,14 +5,14 @@ $ python -m virest.app.bench --only edges --quick
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from virest.app.bench.tables import table
-from virest.app.bench.workload import Scale, Workload, simulated
+from virest.app.bench.workload import Scale, simulated
 from virest.app.diagnose import open_source
 from virest.inference.unsharp_mask import FALSE_ALARM, MOST_FRAMES, Overshoot, overshoot
 from virest.motion.integration import integrate_gyro
@@ -33,28 +33,32 @@ FRAMES, FIRST_SEED = 6, 7000
 
 def edges_section(work: Path, scale: Scale) -> tuple[Row, str]:
     """Measure captures of all scenes, sizes and motions, each with every mask."""
-    rows = [_row(work, workload, *mask) for workload, mask in _captures(scale)]
-    groups = [[row for row in rows if row["mask"] == list(mask)] for mask in MASKS]
-    return {"captures": rows}, _text(groups)
+    every = list(product(SCENES, SIZES, MOTIONS))[:: 4 if scale.quick else 1]
+    groups = [[_row(work, number, *one, mask) for number, one in enumerate(every)] for mask in MASKS]
+    return {"captures": [row for rows in groups for row in rows]}, _text(groups)
 
 
-def _captures(scale: Scale) -> Iterator[tuple[Workload, tuple[float, float]]]:
-    every = [(scene, size, motion) for scene in SCENES for size in SIZES for motion in MOTIONS]
-    for number, (scene, (width, height), (rate, exposure_ms)) in enumerate(every[:: 4 if scale.quick else 1]):
-        for mask in MASKS:
-            isp = PhoneIsp(sharpen=mask[0], sharpen_radius_px=mask[1], bits_per_px=(0.25, 0.6)[number % 2])
-            options = {"scene": scene, "width": width, "height": height, "frames": FRAMES, "exposure_ms": exposure_ms}
-            options |= {"rate_rad_s": rate, "seed": FIRST_SEED + number, "isp": isp, "truth_frames": False}
-            yield Workload(f"edges-{scene}-{width}-{rate:g}-{mask[0]:g}", "edges", (0.0, np.inf), options), mask
-
-
-def _row(work: Path, workload: Workload, amount: float, radius_px: float) -> Row:
-    found = _overshoot(simulated(work, workload.name, **workload.options))
-    row: Row = {"capture": workload.name, "mask": [amount, radius_px], "p_value": None}
+def _row(
+    work: Path,
+    number: int,
+    scene: str,
+    size: tuple[int, int],
+    motion: tuple[float, float],
+    mask: tuple[float, float],
+) -> Row:
+    isp = PhoneIsp(sharpen=mask[0], sharpen_radius_px=mask[1], bits_per_px=(0.25, 0.6)[number % 2])
+    name = f"edges-{number}-{mask[0]:g}"
+    capture = simulated(
+        work, name, scene=scene, width=size[0], height=size[1], frames=FRAMES, rate_rad_s=motion[0],
+        exposure_ms=motion[1], seed=FIRST_SEED + number, isp=isp, truth_frames=False,
+    )  # fmt: skip
+    found = _overshoot(capture)
+    row: Row = {"capture": name, "scene": scene, "size": list(size), "mask": list(mask), "p_value": None}
     if found is None:
         return row
+    fitted = found.mask()
     overshoots = {"of_all": found.of_all, "of_sharpest": found.of_sharpest, "p_value": found.p_value}
-    return row | overshoots | {"fitted": [found.mask.amount, found.mask.radius_px]}
+    return row | overshoots | {"fitted": [fitted.amount, fitted.radius_px]}
 
 
 def _overshoot(capture: Path) -> Overshoot | None:

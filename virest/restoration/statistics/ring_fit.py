@@ -114,8 +114,8 @@ def _settled(
         if passed[_FINEST].mean() > _RECORDED:
             noise = np.minimum(noise, _at_most(frequency, observed))
     else:
-        finest = max(min(float(observed[_FINEST].mean()), 2 * white_levels**2), ROUNDING_POWER)
-        noise = finest * (frequency[-2] / np.maximum(frequency, _LEVEL_BELOW)) ** _CODER_SLOPE
+        finest = min(float(observed[_FINEST].mean()), 2 * white_levels**2)
+        noise = _falling_noise(frequency, finest, _CODER_SLOPE)
     through = np.maximum(observed - noise, 0.05 * observed) / np.maximum(passed, 0.05)
     signal = np.where(determined, signal, through)
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
@@ -136,8 +136,12 @@ def _at_most(frequency: Array, observed: Array) -> Array:
     noise: fits of 40 to 440 grey levels squared were seen where less than 10 was true.  Of noise the finest rings hold
     their part, all of what they show at most, and towards low frequencies it grows like f⁻² at most.
     """
-    finest = max(float(observed[_FINEST].mean()), ROUNDING_POWER)
-    return np.asarray(finest * (frequency[-2] / np.maximum(frequency, _LEVEL_BELOW)) ** _STEEPEST_NOISE)
+    return _falling_noise(frequency, float(observed[_FINEST].mean()), _STEEPEST_NOISE)
+
+
+def _falling_noise(frequency: Array, finest: float, slope: float) -> Array:
+    """Noise (RINGS,) by that of the finest rings, growing towards low frequencies as a coder's does."""
+    return np.asarray(max(finest, ROUNDING_POWER) * (frequency[-2] / np.maximum(frequency, _LEVEL_BELOW)) ** slope)
 
 
 def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.bool_], observed: Array) -> Array:
