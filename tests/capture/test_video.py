@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from fractions import Fraction
 from pathlib import Path
@@ -52,6 +53,22 @@ def test_steps_of_the_quantiser_are_those_that_the_movie_was_coded_with(tmp_path
     assert steps == pytest.approx(dict.fromkeys(range(4), 0.625 * 2 ** (qp / 6)))
     for number, picture in read_frames(path, index, 0, 3):
         np.testing.assert_array_equal(picture, told[number])
+
+
+def test_no_frame_stays_in_memory_until_python_looks_for_circles(tmp_path):
+    """Asking for the quantiser's steps leaves nothing behind: a frame's memory is free once the next one comes."""
+    path = tmp_path / "movie.mp4"
+    write_movie(path, moving_pictures(12), STEPS[:12])
+    index = probe_movie(path)
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in read_frames(path, index, 0, 11, {}):
+            pass
+        alive = [kept for kept in gc.get_objects() if isinstance(kept, av.VideoFrame)]
+    finally:
+        gc.enable()
+    assert not alive
 
 
 def test_b_frames_come_in_presentation_order(tmp_path):

@@ -6,6 +6,7 @@ import struct
 from typing import Any
 
 import numpy as np
+from av.sidedata.sidedata import SideDataContainer
 
 STEP_AT_QP_0, QP_OF_TWICE = 0.625, 6.0
 """Of H.264 (ITU-T H.264, 8.5.9): its quantiser's step in grey levels, and how much more QP doubles it."""
@@ -16,9 +17,11 @@ H264_PARAMETERS, QP_PLACE = 1, 4
 def coding_step(frame: Any) -> float | None:
     """The step of the coder's quantiser, grey levels: mean over the blocks of a decoded frame; None: not told.
 
-    FFmpeg's decoder tells it for H.264 (``AVVideoEncParams``: a head, then blocks with what their QP is more).
+    FFmpeg's decoder tells it for H.264 (``AVVideoEncParams``: a head, then blocks with what their QP is more).  Not asked
+    by ``frame.side_data``: the frame keeps what that returns, which keeps the frame, and such a circle of a whole
+    picture stays in memory until Python happens to look for circles.
     """
-    for told in frame.side_data:
+    for told in SideDataContainer(frame):
         if told.type.name != "VIDEO_ENC_PARAMS":
             continue
         data = bytes(told)
