@@ -17,9 +17,9 @@ H264_PARAMETERS, QP_PLACE = 1, 4
 def coding_step(frame: Any) -> float | None:
     """The step of the coder's quantiser, grey levels: mean over the blocks of a decoded frame; None: not told.
 
-    FFmpeg's decoder tells it for H.264 (``AVVideoEncParams``: a head, then blocks with what their QP is more).  Not read
-    from ``frame.side_data``: the frame keeps what that returns, which keeps the frame, and such a circle of a whole
-    picture stays in memory until Python happens to look for circles.
+    FFmpeg's decoder tells it for H.264 (``AVVideoEncParams``: a head, then blocks with what their QP is more).  Not
+    read from ``frame.side_data``: the frame keeps what that returns, which keeps the frame, and a circle of a whole picture
+    stays in memory until Python happens to look for circles.
     """
     for told in SideDataContainer(frame):  # type: ignore[call-arg]  # which its stub leaves out
         if told.type.name != "VIDEO_ENC_PARAMS":
