@@ -18,8 +18,8 @@ def coding_step(frame: Any) -> float | None:
     """The step of the coder's quantiser, grey levels: mean over the blocks of a decoded frame; None: not told.
 
     FFmpeg's decoder tells it for H.264 (``AVVideoEncParams``: a head, then blocks with what their QP is more).  Not
-    read from ``frame.side_data``: the frame keeps what that returns, which keeps the frame, and a circle of a whole picture
-    stays in memory until Python happens to look for circles.
+    read from ``frame.side_data``: the frame keeps what that returns, which keeps the frame, and a circle of a whole
+    picture stays in memory until Python happens to look for circles.
     """
     for told in SideDataContainer(frame):  # type: ignore[call-arg]  # which its stub leaves out
         if told.type.name != "VIDEO_ENC_PARAMS":
