@@ -19,7 +19,7 @@ from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.local_blur import LENS_SIGMA_PX, BlurObservations
 from virest.diagnosis.local_blur_edges import EdgeWidths
 from virest.diagnosis.local_blur_spectra import join_ratios
-from virest.errors import SettingsError
+from virest.image_formation.kernels import kernel_field
 from virest.image_formation.row_motion import row_motion
 from virest.motion.integration import integrate_gyro
 
@@ -67,8 +67,8 @@ def test_edges_of_one_width_have_no_field(seed: int) -> None:
         assert blur_field(observations, CAMERA, integrate_gyro(STILL, CAMERA), capture) is None
 
 
-def test_corners_that_are_soft_are_a_field_over_the_radius_that_no_profile_takes() -> None:
-    """It is described; the forward model has one defocus for the whole picture."""
+def test_corners_that_are_soft_are_a_field_over_the_radius_that_kernels_follow() -> None:
+    """Each tile has its own; with the field in the profile there is nothing left to find."""
     observations, capture = seen(1.5 * (RADIUS / 350) ** 2)
     found = blur_field(observations, CAMERA, integrate_gyro(STILL, CAMERA), capture)
     assert found is not None
@@ -76,10 +76,15 @@ def test_corners_that_are_soft_are_a_field_over_the_radius_that_no_profile_takes
     assert (finding.kind, finding.covariates) == ("blur", ("radius",))
     assert finding.size == pytest.approx(1.5 * (finding.fields[0].knots[0][-1] / 350) ** 2, rel=0.15)
     assert finding.held_out.after < 0.8 * finding.held_out.before
-    assert "process does not follow it" in finding.sentence
-    assert profile == CAMERA
-    with pytest.raises(SettingsError, match="blur over the radius"):
-        CAMERA.with_fields(finding.fields)
+    trajectory = integrate_gyro(STILL, CAMERA)
+    places = np.array([[320.0, 240.0], [320.0, 20.0], [600.0, 450.0]])
+    field = kernel_field(row_motion(trajectory, profile, 0.1, 0.004), places)
+    radius = np.linalg.norm(places - (320, 240), axis=-1)
+    assert field.defocus_sigma_px == pytest.approx(1.5 * (radius / 350) ** 2, abs=0.35)
+    offsets = np.arange(-field.radius_px, field.radius_px + 1)
+    spread = np.sqrt(field.arrays().sum(axis=1) @ offsets**2)
+    assert spread[1:] == pytest.approx(field.defocus_sigma_px[1:], abs=0.05)
+    assert blur_field(observations, profile, trajectory, capture) is None
 
 
 def test_a_focus_that_moves_is_a_field_that_each_frame_follows() -> None:

@@ -336,6 +336,7 @@ def _for_frames(
         gain=tuple(ext.gain[frame.index] for frame in frames) if ext.gain else (),
         flicker_amplitude=ext.flicker_amplitude if whole else 0.0,
         defocus_sigma_px=ext.defocus_sigma_px if whole else 0.0,
+        field=tuple(field for field in ext.field if whole or field.kind != "blur"),
     )
     return replace(profile, extensions=extensions)
 

@@ -120,8 +120,6 @@ class CameraProfile:
             raise SettingsError(
                 "extensions.field: one delay over the row and one displacement at most", hint="add their values up"
             )
-        if any((f.kind, f.covariates) == ("blur", ("radius",)) for f in fields):
-            raise SettingsError("extensions.field: blur over the radius is not followed", hint="leave the entry out")
         uneven, displaced = (next(iter(held[kind]), None) for kind in ("delay", "displacement"))
         lens = self.intrinsics
         if lens is None and displaced is not None:

@@ -37,6 +37,7 @@ from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
 from virest.diagnosis.refit_photometry import settle_light
 from virest.diagnosis.residual_tests import points_left, remaining_structure, residuals
+from virest.diagnosis.selection import BLUR_LEVELS
 from virest.diagnosis.tracking_stage import (
     MIN_PAIRS,
     TrackedPoints,
@@ -271,6 +272,8 @@ class DiagnosisSession:
             trajectory = integrate_gyro(self.capture.imu, extended)
             if (soft := blur_field(self.blur.edges, extended, trajectory, self.capture)) is not None:
                 fields, extended = [*fields, soft[0]], soft[1]
+                if not BLUR_LEVELS.matters("defocus", extended.extensions.defocus_sigma_px):  # no even one is left
+                    findings = [finding for finding in findings if finding.name != "defocus"]
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]

@@ -40,6 +40,7 @@ from virest.diagnosis.local_blur_spectra import (
     observe_pair,
     ring_of_bin,
 )
+from virest.image_formation.light import defocus_px
 from virest.inference.edges import EdgeSettings
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
@@ -260,7 +261,7 @@ def residuals(
     its paths make, where that is known already.
     """
     predicted = predicted or predicted_blur(observations, profile, trajectory)
-    widths = fitted_width(predicted.motion_px, profile.extensions.defocus_sigma_px, lens_sigma_px)
+    widths = fitted_width(predicted.motion_px, defocus_px(profile, observations.edges.points_px), lens_sigma_px)
     off = _ratio_residuals(observations, predicted.log_ratios, damping)
     return np.concatenate([observations.edges.width_px - widths, off])
 

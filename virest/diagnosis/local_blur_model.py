@@ -29,7 +29,7 @@ _INSTANTS = 5
 _RATIOS = np.linspace(0.0, 6.0, 25)
 
 
-def fitted_width(motion_px: Array, defocus_px: float, lens_px: float) -> Array:
+def fitted_width(motion_px: Array, defocus_px: Array | float, lens_px: float) -> Array:
     """Width that the fit of an edge reports for a straight path and a Gaussian after one another.
 
     motion_px: standard deviation of the path across the edge.  A path alone is a ramp, not a Gaussian, so the fitted

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from virest.image_formation.light import flicker
+from virest.image_formation.light import defocus_px, flicker
 from virest.image_formation.row_clock import ROW_END, ROW_START
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
@@ -44,13 +44,14 @@ class KernelField:
     """Part of the exposure that the sharp picture shows."""
     light: Array | None = None
     """(n, m) relative brightness of the light at those instants; None: even."""
-    defocus_sigma_px: float = 0.0
-    """Standard deviation of a Gaussian that comes on top of the paths."""
+    defocus_sigma_px: Array | float = 0.0
+    """Standard deviation of a Gaussian that comes on top of the paths: (n,), or of all."""
 
     @property
     def radius_px(self) -> int:
         """Half size of an array that holds every kernel with its splatting margin."""
-        return int(np.ceil(np.abs(self.paths_px).max(initial=0.0) + 3.5 * self.defocus_sigma_px)) + 2
+        reach_px = np.abs(self.paths_px).max(initial=0.0) + 3.5 * np.max(self.defocus_sigma_px, initial=0.0)
+        return int(np.ceil(reach_px)) + 2
 
     @property
     def length_px(self) -> Array:
@@ -65,12 +66,13 @@ class KernelField:
         """
         taps = _linear_taps if positive else _cubic_taps
         kernels = splat_paths(self.paths_px, radius_px or self.radius_px, taps, self.light)
-        return _defocused(kernels, self.defocus_sigma_px) if self.defocus_sigma_px else kernels
+        return _defocused(kernels, self.defocus_sigma_px) if np.any(self.defocus_sigma_px) else kernels
 
     def chosen(self, numbers: NDArray[np.intp]) -> KernelField:
         """The field of some of the tiles."""
         light = None if self.light is None else self.light[numbers]
-        return replace(self, centres_px=self.centres_px[numbers], paths_px=self.paths_px[numbers], light=light)
+        sigma_px = np.broadcast_to(self.defocus_sigma_px, len(self.paths_px))[numbers]
+        return KernelField(self.centres_px[numbers], self.paths_px[numbers], self.anchor, light, sigma_px)
 
     def scaled(self, scale: float) -> KernelField:
         """The same blur in a picture that is ``scale`` times as large; the centres stay."""
@@ -138,7 +140,7 @@ def field_along(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: f
     length = np.linalg.norm(np.diff(nodes_px, axis=1), axis=-1).sum(axis=1).max(initial=0.0)
     samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_PX * 1.3 * length)))
     paths_px = _between(nodes_px.shape[1], samples) @ nodes_px
-    light, sigma_px = _light(motion, centres_px, samples), motion.profile.extensions.defocus_sigma_px
+    light, sigma_px = _light(motion, centres_px, samples), defocus_px(motion.profile, centres_px)
     return KernelField(centres_px, paths_px, anchor, light, sigma_px)
 
 
@@ -195,9 +197,12 @@ def splat_paths(paths_px: Array, radius_px: int, taps: Any, light: Array | None 
     return kernels.reshape(count, size, size).astype(np.float32)
 
 
-def _defocused(kernels: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
-    """Kernels (n, k, k) with a Gaussian on top; light outside the arrays is none."""
-    blurred = [cv2.GaussianBlur(k, (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT) for k in kernels]
+def _defocused(kernels: NDArray[np.float32], sigma_px: Array | float) -> NDArray[np.float32]:
+    """Kernels (n, k, k) with a Gaussian on top, of (n,) or one size; light outside the arrays is none."""
+    blurred = [
+        cv2.GaussianBlur(kernel, (0, 0), float(sigma), borderType=cv2.BORDER_CONSTANT) if sigma else kernel
+        for kernel, sigma in zip(kernels, np.broadcast_to(sigma_px, len(kernels)), strict=True)
+    ]
     sums = [k.sum() for k in blurred]
     return np.stack([k / s for k, s in zip(blurred, sums, strict=True)])
 

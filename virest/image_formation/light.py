@@ -113,6 +113,30 @@ def _left(loss: float, radius_squared: Any) -> Any:
     return np.maximum(1.0 - loss * radius_squared, LEAST_LIGHT)
 
 
-def equivalent_length_px(profile: CameraProfile, length_px: Any) -> Any:
-    """Length (...) of an even path that spreads light as much as a path of ``length_px`` and the defocus together."""
-    return np.hypot(length_px, np.sqrt(12.0) * profile.extensions.defocus_sigma_px)
+def defocus_px(profile: CameraProfile, points_px: Array) -> Array:
+    """Standard deviation (...) of the Gaussian that the lens lays over the light at pixels (..., 2) of one frame.
+
+    The variances of an even defocus and of fields over the distance from the principal point add up.
+    """
+    variance = np.full(np.shape(points_px)[:-1], profile.extensions.defocus_sigma_px**2)
+    for field in _softness(profile):
+        lens = profile.intrinsics
+        middle = (profile.width - 1) / 2, (profile.height - 1) / 2
+        across, down = middle if lens is None else (lens.cx_px, lens.cy_px)
+        variance = variance + field.at(np.hypot(points_px[..., 0] - across, points_px[..., 1] - down))[..., 0] ** 2
+    return np.sqrt(variance)
+
+
+def most_defocus_px(profile: CameraProfile) -> float:
+    """The same where it is largest."""
+    largest = [max(value for (value,) in field.values) for field in _softness(profile)]
+    return float(np.hypot.reduce([profile.extensions.defocus_sigma_px, *largest]))
+
+
+def equivalent_length_px(length_px: Any, defocus_px: Any) -> Any:
+    """Length (...) of an even path that spreads light as much as a path of ``length_px`` and a defocus together."""
+    return np.hypot(length_px, np.sqrt(12.0) * defocus_px)
+
+
+def _softness(profile: CameraProfile) -> list[Field]:
+    return [f for f in profile.extensions.field if (f.kind, f.covariates) == ("blur", ("radius",))]

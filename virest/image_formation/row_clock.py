@@ -35,7 +35,7 @@ def row_time_s(
 
 def of_frame(profile: CameraProfile, stamp_s: float, logged_exposure_s: float) -> CameraProfile:
     """The profile with the readout and the defocus of one frame, where these differ from frame to frame."""
-    blurs = [field for field in profile.extensions.field if field.kind == "blur"]
+    blurs = [f for f in profile.extensions.field if f.kind == "blur" and f.covariates != ("radius",)]
     if blurs:
         even = profile.extensions.defocus_sigma_px
         sigma_px = float(np.hypot.reduce([even, *(float(field.at_time(stamp_s)[0]) for field in blurs)]))

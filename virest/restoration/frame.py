@@ -17,7 +17,7 @@ from virest.capture.folder import Frame
 from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernel_spread import KernelSpread, kernel_spread
 from virest.image_formation.kernels import KernelField, blur_chords, smooth_field
-from virest.image_formation.light import FrameLight, equivalent_length_px, frame_light
+from virest.image_formation.light import FrameLight, defocus_px, equivalent_length_px, frame_light, most_defocus_px
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
@@ -124,7 +124,7 @@ def restore_frame(
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     found = degradation_parameters(motion, trajectory)
-    longest_px = float(equivalent_length_px(motion.profile, found.blur.longest_px))
+    longest_px = float(equivalent_length_px(found.blur.longest_px, most_defocus_px(motion.profile)))
     method, why_not = deblur_method(motion, settings, longest_px)
     if seen is not None and method != "none" and deblurring_loses(motion, seen):
         method, why_not = "none", (OTHER_BLUR,)
@@ -381,7 +381,7 @@ def _details(
         neighbours=tuple(JoinedNeighbour(one.number, one.weight) for one in joined.places),
         neighbours_gain_db=10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
         share=measured.share,
-        defocus_sigma_px=blur.motion.profile.extensions.defocus_sigma_px,
+        defocus_sigma_px=most_defocus_px(blur.motion.profile),
     )
 
 
@@ -446,8 +446,9 @@ def blurred_part(motion: RowMotion, min_blur_px: float, tile_px: int) -> NDArray
     """
     width, height = motion.profile.width, motion.profile.height
     x, y = (np.linspace(0, length - 1, max(2, length // PART_STEP_PX)) for length in (width, height))
-    chords = blur_chords(motion, np.stack(np.meshgrid(x, y), -1))
-    length_px = equivalent_length_px(motion.profile, np.linalg.norm(chords, axis=-1))
+    points_px = np.stack(np.meshgrid(x, y), -1)
+    chords = blur_chords(motion, points_px)
+    length_px = equivalent_length_px(np.linalg.norm(chords, axis=-1), defocus_px(motion.profile, points_px))
     change = np.linalg.norm([np.gradient(chords, x, axis=1), np.gradient(chords, y, axis=0)], axis=(0, -1))
     least_px = np.maximum(min_blur_px, tile_px / 2 * change)
     part = np.clip(length_px / least_px - 1.0, 0.0, 1.0).astype(np.float32)

@@ -12,7 +12,7 @@ from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import Image, tile_grid
 from virest.image_formation.kernel_spread import kernel_spread
 from virest.image_formation.kernels import blur_chords, smooth_field
-from virest.image_formation.light import equivalent_length_px
+from virest.image_formation.light import equivalent_length_px, most_defocus_px
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import blurred_picture
 from virest.restoration.frame import blurred_part, deblur_method, too_little_to_gain, trusted_share
@@ -38,7 +38,7 @@ def tried(
     height, width = luma.shape
     centres_px = tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px
     longest_px = float(np.linalg.norm(blur_chords(motion, centres_px), axis=-1).max())
-    longest_px = float(equivalent_length_px(motion.profile, longest_px))
+    longest_px = float(equivalent_length_px(longest_px, most_defocus_px(motion.profile)))
     if deblur_method(motion, settings, longest_px)[0] == "none":
         return None
     curve, field = motion.profile.response or ResponseCurve("srgb"), smooth_field(motion, ANCHOR)

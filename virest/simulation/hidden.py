@@ -68,17 +68,22 @@ def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array, first_r
 
 def defocused(profile: CameraProfile, hidden: Hidden, light: Any, stamp_s: float) -> Any:
     """Light (h, w, 3) out of focus at some times, or towards the corners."""
-    sizes = [float(f.at_time(stamp_s)[0]) for f in profile.extensions.field if f.kind == "blur"]
+    blurs = [f for f in profile.extensions.field if f.kind == "blur"]
+    sizes = [float(f.at_time(stamp_s)[0]) for f in blurs if f.covariates != ("radius",)]
     sizes += [] if hidden.blur_px is None else [float(hidden.blur_px(stamp_s))]
     if (sigma := float(np.hypot.reduce([0.0, *sizes]))) > LEAST_BLUR_PX:
         light = cv2.GaussianBlur(light, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
-    if not hidden.corner_blur_px:
-        return light
     height, width = light.shape[:2]
     x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
-    part = 0.5 * (x**2 * width**2 + y**2 * height**2) / (0.5 * (width**2 + height**2))
-    levels = [light, *(cv2.GaussianBlur(light, (0, 0), hidden.corner_blur_px * k / STEPS) for k in range(1, STEPS + 1))]
-    place = np.clip(STEPS * part, 0, STEPS)
+    size_px = hidden.corner_blur_px * (x**2 * width**2 + y**2 * height**2) / (width**2 + height**2)
+    for field in blurs:
+        if field.covariates == ("radius",):
+            pixels = np.meshgrid(np.arange(width), np.arange(height))
+            size_px = np.hypot(size_px, field.at(seen_radius_px(profile, *pixels))[..., 0])
+    if not (largest := float(size_px.max())):
+        return light
+    levels = [light, *(cv2.GaussianBlur(light, (0, 0), largest * k / STEPS) for k in range(1, STEPS + 1))]
+    place = STEPS * size_px / largest
     below = np.minimum(place.astype(int), STEPS - 1)
     above = (place - below)[..., None].astype(np.float32)
     whole = np.stack(levels)

@@ -2,14 +2,17 @@
 
 Variances of blurs that follow each other add up, so what the widths of isolated edges leave over is regressed on an
 added variance along the distance from the principal point, time, and the logged focus distance, beside an even defocus,
-a longer path, and what contrast and brightness do to a measured width.  What lies in the scene is not the lens's: over
-the radius the pictures' cells err together and whole quarters are left out; over time each cell has its own width.
+a longer path, and what contrast and brightness do to a measured width.  Over the radius r, third-order aberrations make
+spots in proportion to r (coma) and to r² (field curvature, astigmatism; Welford, Aberrations of Optical Systems, 1986,
+chapter 7), so the variance is a r² + b r⁴; over time and focus it is a straight line from knot to knot.  What lies in
+the scene is not the lens's: over the radius the pictures' cells err together and whole quarters are left out; over time
+each cell has its own width.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +27,9 @@ from virest.diagnosis.field.words import SAMPLES, curve_shape
 from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
 from virest.diagnosis.local_blur import LENS_SIGMA_PX, LENS_STD_PX, BlurObservations, predicted_blur
 from virest.diagnosis.local_blur_model import fitted_width
+from virest.image_formation.light import defocus_px
 from virest.inference.chance import t_ratio
-from virest.inference.robust import CAUCHY
+from virest.inference.robust import CAUCHY, robust_std
 from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -34,19 +38,18 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 CELLS_ROUND, CELLS_OUT, CELLS = 12, 3, 5
 """Cells that err together: sectors and rings about the middle; and squares each way, whose widths are compared."""
-RADIUS_KNOTS, FOCUS_KNOTS, TIME_STEP_S, LEAST_TIMES, MOST_TIMES = 4, 4, 0.2, 5, 24
+RADIUS_KNOTS, FOCUS_KNOTS, TIME_STEP_S, LEAST_TIMES, MOST_TIMES = 9, 4, 0.2, 5, 24
 MIN_SIZE_PX = float(np.sqrt((LENS_SIGMA_PX + 3 * LENS_STD_PX) ** 2 - LENS_SIGMA_PX**2))
 """Standard deviation (0.83 px) of the added Gaussian: edges are wider by three deviations of what coding makes of them.
 On 41 simulated captures without such a blur the largest was 0.50 px."""
-LEAST_EDGES, LEAST_CHANGE = 300, 0.05
+LEAST_CHANGE, LEAST_SCALE_PX, CLEARLY = 0.05, 1e-6, 2.0
 RIDGE, MIN_GAIN = 1e-3, 0.02
 CAP, BOUND, LEAST_WIDTH_PX, _STEPS = 10.0, 3.0, 0.2, 12
 """Deviations at which what is left is capped, and at which one edge counts no more; no edge is sharper than that."""
-FOLLOWED = ("time", "focus")
-"""Along which `process` can follow a blur: one width a frame."""
+ABERRATIONS = (4,), (2,), (2, 4)
+"""Powers of the radius that the variance of field curvature and astigmatism, of coma, and of all has."""
 SENTENCES = {
-    "radius": "pictures are softer by up to {size} px away from the principal point, {shape} of the distance; process "
-    "does not follow it",
+    "radius": "pictures are softer by up to {size} px away from the principal point, {shape} of the distance",
     "time": "pictures are softer by up to {size} px at some times, {shape} of time: the focus moves",
     "focus": "pictures are softer by up to {size} px at some logged focus distances, {shape}: the focus misses",
 }
@@ -66,8 +69,10 @@ NEXT = {
 class _Form:
     covariate: str
     knots: Array
+    table: Array
+    """(knots, m) added variance there per number that is fitted."""
     weights: Array
-    """(n, knots) of each edge."""
+    """(n, m) the same at each edge."""
     block: Index
     """(n,) what errs together, rising in the order that parts are cut in."""
     nuisance: Array
@@ -86,12 +91,12 @@ class _Edges:
     common: Array
     """(n, m) added variance per unit of what every form allows for."""
     scale_px: float
-    """Robust standard deviation of what is left."""
+    """Robust standard deviation of what that leaves."""
 
     def fitted(self, form: _Form, rows: Index | None = None, free: bool = True) -> tuple[Array, Array, Array]:
-        """Added variance (knots,), px², about its mean, its covariance, and what is left of all edges (n,), px.
+        """The form's numbers (m,), px², their covariance, and what is left of all edges (n,), px.
 
-        Gauss-Newton with Cauchy weights, on some rows.  free: False keeps the form at nought.
+        Gauss-Newton on some rows, with Cauchy weights by the spread of what is left.  free: False keeps the form at 0.
         """
         rows = np.arange(len(self.width_px)) if rows is None else rows
         own = form.weights - form.weights.mean(axis=0)
@@ -102,7 +107,8 @@ class _Edges:
         for _ in range(_STEPS):
             width = self._widths(columns @ numbers)
             left = self.width_px - width
-            weight = 1 / (1 + (left[rows] / (CAUCHY * self.scale_px)) ** 2) / self.scale_px**2
+            scale_px = max(min(self.scale_px, robust_std(left[rows])), LEAST_SCALE_PX)
+            weight = 1 / (1 + (left[rows] / (CAUCHY * scale_px)) ** 2) / scale_px**2
             slope = columns[rows] * (0.5 / width[rows])[:, None]
             normal = (slope * weight[:, None]).T @ slope
             inverse = np.asarray(np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9))), float)
@@ -116,13 +122,24 @@ class _Edges:
     def _widths(self, added: Array) -> Array:
         return np.sqrt(np.maximum(self.even_px**2 + added, LEAST_WIDTH_PX**2))
 
-    def held_out(self, form: _Form, free: bool) -> float:
-        """Capped rms of widths in blocks that a fit to the others did not see, px."""
+    def missed(self, form: _Form, free: bool = True) -> Array:
+        """Capped squares (n,) of what a fit to other blocks leaves of each width, px²."""
         left = np.zeros(len(self.width_px))
         for fold in (0, 1):
             inside = np.flatnonzero(form.block % 2 == fold)
             left[form.block % 2 != fold] = self.fitted(form, inside, free)[2][form.block % 2 != fold]
-        return float(np.sqrt(np.mean(np.minimum(np.abs(left), CAP * self.scale_px) ** 2)))
+        return np.asarray(np.minimum(np.abs(left), CAP * self.scale_px) ** 2)
+
+    def simplest(self, forms: Sequence[_Form]) -> _Form:
+        """The first of forms that the best one does not clearly beat on blocks that neither saw."""
+        missed = [self.missed(form) for form in forms]
+        best = min(missed, key=lambda one: float(one.mean()))
+        block = np.unique(forms[0].block, return_inverse=True)[1]
+        for form, one in zip(forms, missed, strict=True):
+            more = np.bincount(block, one - best)
+            if more.sum() <= CLEARLY * np.sqrt(np.sum((more - more.mean()) ** 2)):
+                return form
+        return forms[-1]
 
 
 def blur_field(
@@ -130,30 +147,37 @@ def blur_field(
 ) -> tuple[FieldFinding, CameraProfile] | None:
     """The field of blur that edges ask for, and the profile with it; None where they ask for none."""
     widths = seen.edges
-    if len(widths) < LEAST_EDGES or not seen.edges_determined or profile.intrinsics is None:
+    if not seen.edges_determined or profile.intrinsics is None:
         return None
     motion_px = predicted_blur(seen, profile, trajectory).motion_px
-    even_px = fitted_width(motion_px, profile.extensions.defocus_sigma_px, LENS_SIGMA_PX)
+    even_px = fitted_width(motion_px, defocus_px(profile, widths.points_px), LENS_SIGMA_PX)
     left = widths.width_px - even_px
-    scale = max(1.4826 * float(np.median(np.abs(left - np.median(left)))), 1e-6)
+    scale = max(robust_std(left - np.median(left)), LEAST_SCALE_PX)
     common = np.stack([np.ones_like(left), motion_px**2, 1 / widths.step_levels, widths.brightness], axis=-1)
     edges = _Edges(widths.width_px, even_px, common, scale)
-    forms = list(_forms(seen, profile, capture))
+    outwards = _outwards(seen, profile)
+    forms = [*outwards, *_forms(seen, profile, capture)]
     found = [(scored, form) for form in forms if (scored := _asked(edges, form, len(forms))) is not None]
     if not found:
         return None
     scored, form = max(found, key=lambda pair: float(pair[0].gain.sum()))
-    variance, covariance, _ = edges.fitted(form)
-    sigma = np.sqrt(variance - variance.min())
-    held = HeldOutGain(BLUR, edges.held_out(form, free=False), edges.held_out(form, free=True), None)
+    form = edges.simplest(outwards) if form.covariate == "radius" else form
+    numbers, covariance, _ = edges.fitted(form)
+    sharpest = form.table[np.argmin(form.table @ numbers)]
+    above = form.table - sharpest
+    sigma, covariance = np.sqrt(np.maximum(above @ numbers, 0.0)), above @ covariance @ above.T
+    lowest = float((sharpest - form.weights.mean(axis=0)) @ numbers)
+    before, after = (float(np.sqrt(edges.missed(form, free).mean())) for free in (False, True))
+    held = HeldOutGain(BLUR, before, after, None)
     if sigma.max() < MIN_SIZE_PX or held.after > (1 - MIN_GAIN) * held.before:
         return None
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / (2 * np.maximum(sigma, MIN_SIZE_PX))
     stamp = capture.stamp_0_ns if form.covariate == "time" else None
     rows = [tuple((float(value),) for value in column) for column in (sigma, std)]
     field = Field("blur", (form.covariate,), (tuple(form.knots.tolist()),), rows[0], rows[1], stamp, form.logged)
-    rivals = tuple(f"blur over {other.covariate}" for one, other in found if _alike(scored, one) and other is not form)
-    return _said(field, held, scored.p_value, rivals), _with(profile, field, float(variance.min()))
+    others = {other.covariate for one, other in found if _alike(scored, one)} - {form.covariate}
+    rivals = tuple(f"blur over {name}" for name in sorted(others))
+    return _said(field, held, scored.p_value, rivals), _with(profile, field, lowest)
 
 
 def _asked(edges: _Edges, form: _Form, forms: int) -> Scored | None:
@@ -191,7 +215,8 @@ def _alike(best: Scored, other: Scored) -> bool:
     return float(other.gain.sum()) > 0.9 * float(best.gain.sum())
 
 
-def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> Iterator[_Form]:
+def _outwards(seen: BlurObservations, profile: CameraProfile) -> list[_Form]:
+    """Blur over the distance from the principal point, as each kind of aberration makes it, and as all do."""
     edges, lens = seen.edges, profile.intrinsics
     assert lens is not None
     arm = edges.points_px - np.array([lens.cx_px, lens.cy_px])
@@ -200,7 +225,16 @@ def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> 
     sector = ((np.arctan2(arm[:, 1], arm[:, 0]) / (2 * np.pi) + 0.5) * CELLS_ROUND).astype(np.intp) % CELLS_ROUND
     ring = np.minimum((radius / knots[-1] * CELLS_OUT).astype(np.intp), CELLS_OUT - 1)
     none = np.zeros((len(edges), 0))
-    yield _Form("radius", knots, cardinal_weights(tuple(knots), radius, 1), sector * CELLS_OUT + ring, none)
+    out, block = radius[:, None] / knots[-1], sector * CELLS_OUT + ring
+    return [
+        _Form("radius", knots, (knots[:, None] / knots[-1]) ** powers, out**powers, block, none)
+        for powers in ABERRATIONS
+    ]
+
+
+def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> Iterator[_Form]:
+    """Blur over time and over the logged focus distance."""
+    edges = seen.edges
     frame = np.unique(edges.frame, return_inverse=True)[1]
     size = np.array([profile.width, profile.height])
     cell = (np.clip(edges.points_px / size, 0, 0.999) * CELLS).astype(np.intp) @ np.array([CELLS, 1])
@@ -208,20 +242,19 @@ def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> 
     first, last = float(edges.stamp_s.min()), float(edges.stamp_s.max())
     count = int(np.clip(round((last - first) / TIME_STEP_S) + 1, LEAST_TIMES, MOST_TIMES))
     knots = np.linspace(first, last, count)
-    yield _Form("time", knots, cardinal_weights(tuple(knots), edges.stamp_s, 1), frame, own)
+    yield _Form("time", knots, np.eye(count), cardinal_weights(tuple(knots), edges.stamp_s, 1), frame, own)
     log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
     values = np.array([value for _, value in log], float)
     if len(log) > 0.5 * len(capture.frames) and np.ptp(values) > LEAST_CHANGE:
         times = np.array([time_s for time_s, _ in log])
         knots = np.linspace(values.min(), values.max(), FOCUS_KNOTS)
         weights = cardinal_weights(tuple(knots), np.interp(edges.stamp_s, times, values), 1)
-        yield _Form("focus", knots, weights, frame, own, (tuple(times.tolist()), tuple(values.tolist())))
+        logged = tuple(times.tolist()), tuple(values.tolist())
+        yield _Form("focus", knots, np.eye(FOCUS_KNOTS), weights, frame, own, logged)
 
 
 def _with(profile: CameraProfile, field: Field, lowest: float) -> CameraProfile:
-    """The profile with a field that can be followed; the even defocus is that of the sharpest frames then."""
-    if field.covariates[0] not in FOLLOWED:
-        return profile
+    """The profile with the field; the even defocus is that of the sharpest frames or places then."""
     even = float(np.sqrt(max(profile.extensions.defocus_sigma_px**2 + lowest, 0.0)))
     even = even if profile.extensions.defocus_sigma_px else 0.0
     return replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=even)).with_fields(

@@ -52,7 +52,7 @@ def picture_statistics(
     measures the noise and the defocused picture, and that is focused afterwards.  Paths too long for a tile are
     measured on a picture that is smaller; the finer frequencies take the finest one's.
     """
-    sigma_px, times = field.defocus_sigma_px, 1
+    sigma_px, times = np.asarray(field.defocus_sigma_px, float), 1
     field = replace(field, defocus_sigma_px=0.0)
     while field.scaled(1 / times).radius_px > LARGEST_RADIUS and min(picture.shape[:2]) >= 2 * times * SIDE:
         times *= 2
@@ -68,17 +68,17 @@ def picture_statistics(
     return luma, chroma
 
 
-def focused(defocused: PictureStatistics, sigma_px: float) -> PictureStatistics:
-    """Spectra of the picture before a Gaussian came over it.
+def focused(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64]) -> PictureStatistics:
+    """Spectra of the picture before a Gaussian came over it, of one size or of (n,) at the places that were measured.
 
     The Gaussian leaves next to nothing of high frequencies, and what is recorded there divided by next to nothing is no
     picture: no scene's power falls slower than f⁻².  So S is held to that law ring by ring, and what was recorded
     beyond it counts as noise; where less than the noise is left, S falls as f⁻³.
     """
-    if not sigma_px or not defocused.measured:
+    if not np.any(sigma_px) or not defocused.measured:
         return defocused
     frequency = defocused.frequency
-    left = np.exp(-((2 * np.pi * sigma_px * frequency) ** 2))
+    left = np.exp(-((2 * np.pi * np.reshape(sigma_px, (-1, 1)) * frequency) ** 2)).mean(axis=0)
     through = defocused.passed * defocused.signal
     rise, signal = frequency**_LEAST_FALL, defocused.signal / left
     signal[1:] = np.minimum.accumulate((signal * rise)[1:]) / rise[1:]
