@@ -19,7 +19,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from virest.app.process import ProcessOptions, process_captures
 from virest.app.segments import cut_imu
 from virest.app.simulate import simulate_command
+from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture, Frame
 from virest.capture.video import probe_movie, read_frames
@@ -27,6 +29,9 @@ from virest.image_formation.row_motion import FrameTranslation, frame_times_s
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS
+from virest.simulation.hidden import Hidden
+from virest.simulation.recording import RecordingOptions, write_recording
+from virest.simulation.session import SessionSettings, nominal_camera, plan_session
 
 Simulated = Callable[..., Capture]
 SETTINGS = PRESETS["fast"]
@@ -101,6 +106,27 @@ def test_a_profile_that_knows_the_effect_restores_better(
     gain = gains_db(simulated(effects=[effect], **options), slice(1, 10, 3))
     assert gain.mean() > least_db
     assert gain.min() > -0.2
+
+
+def test_corners_that_are_soft_are_restored_as_soft_as_they_are(tmp_path: Path) -> None:
+    """Each tile has the blur of its place: better than none for all, and than the mean for all."""
+    sigma_px, corner_px = 2.4, float(np.hypot(320, 240) / 2)
+    nominal = nominal_camera(320, 240, focal_px=260.0, readout_time_s=0.02, response=ResponseCurve("srgb"))
+    settings = SessionSettings("leaves", 10, 30.0, exposure_s=(0.01,), rate_rad_s=1.2, noise_levels=1.0, seed=3)
+    session = plan_session(nominal, nominal, settings, hidden=Hidden(corner_blur_px=sigma_px))
+    write_recording(session, tmp_path / "soft", options=RecordingOptions(bits_per_px=1.5))
+    capture = read_capture(tmp_path / "soft")
+    radius = np.linspace(0, corner_px, 9)
+    values = tuple((sigma_px * (r / corner_px) ** 2,) for r in radius.tolist())
+    known = nominal.with_fields([Field("blur", ("radius",), (tuple(radius.tolist()),), values)])
+    even = replace(nominal, extensions=replace(nominal.extensions, defocus_sigma_px=0.45 * sigma_px))
+    without, right, mean = (
+        np.array([psnr_db(capture, f) for f in restored(capture, RestorationPlan(p, SETTINGS), slice(1, 7))])
+        for p in (nominal, known, even)
+    )
+    assert (right - without).mean() > 1.0
+    assert (right - mean).mean() > 1.0
+    assert min(right - without) > 0
 
 
 def test_a_gain_is_common_to_the_frame_and_stays(simulated: Simulated) -> None:

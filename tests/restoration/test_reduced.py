@@ -65,20 +65,20 @@ def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator)
 
 
 def test_tiles_are_as_large_as_their_kernels_hold() -> None:
-    """Paths that grow twice as fast over the picture, or half the noise, halve the side; even paths know no bound."""
+    """Paths or a defocus that grow twice as fast over the picture, or half the noise, halve the side; even ones never."""
 
-    def side(growth: float, noise_levels: float) -> float:
+    def sides(growth: float, noise_levels: float) -> NDArray[np.float64]:
         def field(centres_px: NDArray[np.float64]) -> KernelField:
             along = (10 + growth * centres_px[:, 0, None]) * np.linspace(-0.5, 0.5, 31)
-            return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5)
+            return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5, None, 1 + growth * centres_px[:, 1])
 
         blurred = _blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
         statistics = replace(blurred.statistics, noise_levels=noise_levels)
-        return tile_layout._kernel_holds_px(replace(blurred, field=field, statistics=statistics))
+        return np.array(tile_layout._kernel_holds_px(replace(blurred, field=field, statistics=statistics)))
 
-    assert side(0.02, 1.0) == pytest.approx(side(0.01, 1.0) / 2, rel=1e-6)
-    assert side(0.01, 0.5) == pytest.approx(side(0.01, 1.0) / 2, rel=1e-6)
-    assert side(0.0, 1.0) > 1e4
+    assert sides(0.02, 1.0) == pytest.approx(sides(0.01, 1.0) / 2, rel=1e-6)
+    assert sides(0.01, 0.5) == pytest.approx(sides(0.01, 1.0) / 2, rel=1e-6)
+    assert sides(0.0, 1.0).min() > 1e4
 
 
 def test_a_path_longer_than_its_tiles_still_fits_them() -> None:

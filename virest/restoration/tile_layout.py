@@ -27,9 +27,10 @@ pictures that are reduced.
 """
 COARSE_OVERLAP, FINE_OVERLAP, WIDE_OVERLAP = 6, 4, 3
 """Tiles overlap by this part of their side: those of colour, those of luma, and those of luma in few iterations."""
-MOST_WRONG, LEAST_TILE, FIELD_SAMPLES = 0.7, 0.7, (6, 5)
+MOST_WRONG, LEAST_TILE, LEAST_TILE_PX, FIELD_SAMPLES = 0.7, 0.7, 48.0, (6, 5)
 """Error in noises that a tile's kernel may make of edges half a step away; part of the preset's side to which tiles
-shrink for it; rows and columns of places at which the kernels' change is looked at."""
+shrink for their paths, and side to which they do for an uneven defocus; rows and columns of places at which the
+kernels' change is looked at."""
 OVERLAP_GIVE = 0.1
 """Wide overlaps may be narrower by this part, where fewer tiles then reach to the picture's edge."""
 BORDER_NOISE_TO_SIGNAL = 0.003
@@ -47,16 +48,20 @@ def luma_tiles(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture."""
-    if around is FULL_MARGIN:
-        return tile_deconvolution(blurred, settings.tile_px, FINE_OVERLAP, around=around)
-    side = int(np.clip(_kernel_holds_px(blurred), LEAST_TILE * settings.tile_px, settings.tile_px))
-    return tile_deconvolution(blurred, side, WIDE_OVERLAP, around=around)
+    path_holds_px, defocus_holds_px = _kernel_holds_px(blurred)
+    side_px = float(settings.tile_px)
+    if around is not FULL_MARGIN:
+        side_px = float(np.clip(path_holds_px, LEAST_TILE * side_px, side_px))
+    side_px = min(side_px, max(defocus_holds_px, LEAST_TILE_PX))
+    overlap_parts = FINE_OVERLAP if around is FULL_MARGIN else WIDE_OVERLAP
+    return tile_deconvolution(blurred, int(side_px), overlap_parts, around=around)
 
 
-def _kernel_holds_px(blurred: BlurredPicture) -> float:
-    """Side of a tile at whose middle's kernel half a step away, a third of its side, moves edges by a noise's worth.
+def _kernel_holds_px(blurred: BlurredPicture) -> tuple[float, float]:
+    """Side of a tile at whose middle's kernel half a step away, a third of its side, changes edges by a noise's worth.
 
-    Paths change over the picture as the camera rolls and as the rows go by; under noise that matters less.
+    Of the paths, which change over the picture as the camera rolls and as the rows go by, and of the defocus, which a
+    lens makes softer towards the corners; under noise both matter less.
     """
     height, width = blurred.light[0].shape
     y, x = (
@@ -66,8 +71,11 @@ def _kernel_holds_px(blurred: BlurredPicture) -> float:
     paths_px = field.paths_px[:, ::4].reshape(len(y), len(x), -1, 2)
     changes = [np.diff(paths_px, axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
     per_px = np.sqrt(0.5 * sum(np.mean(np.linalg.norm(c, axis=-1).mean(-1)) ** 2 for c in changes))
+    sigma_px = np.broadcast_to(field.defocus_sigma_px, len(field.paths_px)).reshape(len(y), len(x))
+    softer = np.mean(np.hypot(*np.gradient(sigma_px, y, x)))
     wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
-    return float(3 * wrong_px / max(per_px, 1e-6))
+    path_holds_px, defocus_holds_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer))
+    return path_holds_px, defocus_holds_px
 
 
 def tile_deconvolution(
