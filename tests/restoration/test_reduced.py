@@ -65,7 +65,7 @@ def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator)
 
 
 def test_tiles_are_as_large_as_their_kernels_hold() -> None:
-    """Paths or a defocus that grow twice as fast over the picture, or half the noise, halve the side; even ones never."""
+    """Paths or a defocus that grow twice as fast, or half the noise, halve the side; even ones never do."""
 
     def sides(growth: float, noise_levels: float) -> NDArray[np.float64]:
         def field(centres_px: NDArray[np.float64]) -> KernelField:
