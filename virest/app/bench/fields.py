@@ -1,4 +1,4 @@
-"""Hide an effect that no catalogue names, diagnose, and try what was found on another capture of the same phone.
+"""Hide an effect that no catalogue names, diagnose, and try what was found: in pictures, and on another capture.
 
 The diagnosis reads the capture's folder only.  Sizes of both signs, weak and strong, come from the case's seed.
 """
@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.bench.tables import table
-from virest.app.bench.workload import Scale
+from virest.app.bench.workload import Scale, run_process, truth_frame
 from virest.app.diagnose import Source, open_source
 from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import write_profile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.findings import CONSISTENT, Diagnosis
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.ladder import diagnose_capture
+from virest.evaluation.fidelity import psnr_db
 from virest.inference.observed_tracks import observe_tracks
 from virest.inference.tracking import track_pairs
 from virest.simulation.effects import EffectContext, hide_effects
@@ -42,6 +44,8 @@ NULLS = {"quick": 4, "usual": 16, "full": 50}
 SCENES = ("leaves", "text", "board", "bright", "photographs")
 SOLVED = 0.8
 """Part of the excess residual that a right field takes away."""
+PRESET, LOOKED_AT, HARM_DB = "balanced", "8:96:16", 0.1
+"""How pictures are restored with what was found and without it, which of them, and what counts as a loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,7 +312,8 @@ def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tu
     named = [effect.name for effect in applied]
     if not (folder / "movie.mp4").exists():
         session = plan_session(nominal, off_centre(true, strange.tangential), settings, hidden=strange.hidden)
-        options = RecordingOptions(bits_per_px=float(rng.uniform(0.12, 0.4)), truth_frames=False)
+        bits_per_px = float(rng.uniform(0.12, 0.4))
+        options = RecordingOptions(bits_per_px=bits_per_px, truth_frames=name in EFFECTS and not other)
         write_recording(session, folder, applied=applied, options=options)
     return strange, named
 
@@ -334,6 +339,24 @@ def points_off_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[f
     return [end.final_rms_px for end in ends], ends[-1].noise_px
 
 
+def picture_gains_db(folder: Path, found: CameraProfile) -> list[float]:
+    """PSNR of restored frames with a profile that was found, less that with the capture's own."""
+    write_profile(found, folder / "found.yaml")
+    with_found = ("--config", str(folder / "found.yaml"))
+    runs = [
+        run_process(folder, folder / name, "--preset", PRESET, "--frames", LOOKED_AT, *config)
+        for name, config in (("nominal", ()), ("extended", with_found))
+    ]
+    gains = []
+    for pair in zip(*(run.lines for run in runs), strict=True):
+        both = [[line["valid_px"][k] for line in pair] for k in range(4)]
+        valid_px = (max(both[0]), max(both[1]), min(both[2]), min(both[3]))
+        truth = truth_frame(folder, pair[0]["frame"])
+        before, after = (psnr_db(run.picture(line), truth, valid_px) for run, line in zip(runs, pair, strict=True))
+        gains.append(after - before)
+    return gains
+
+
 # ── one case ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -345,6 +368,7 @@ def judge_case(work: Path, name: str, seed: int) -> Row:
     begun = time.process_time()
     found = diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
     seconds = time.process_time() - begun
+    gains_db = picture_gains_db(folder, found.extended_profile) if strange.expected and found.fields else []
     gone = None
     if strange.lasting and strange.expected:
         folder = work / f"{name}_{seed}_other"
@@ -359,7 +383,7 @@ def judge_case(work: Path, name: str, seed: int) -> Row:
         "right": is_right(strange, named, found),
         "rms_px": found.nominal.geometry_rms_px, "noise_px": found.nominal.geometry_noise_px,
         "gain": [field.held_out.gain for field in found.fields],
-        "gone_elsewhere": gone, "cpu_s": round(seconds, 1),
+        "gone_elsewhere": gone, "pictures_db": gains_db, "cpu_s": round(seconds, 1),
         "sentences": [field.sentence for field in found.fields],
     }  # fmt: skip
 
@@ -390,15 +414,20 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         "right": sum(row["right"] for row in hidden),
         "solved_elsewhere": sum(gone >= SOLVED for gone in elsewhere),
         "of_elsewhere": len(elsewhere),
+        "pictures_better": sum(np.mean(row["pictures_db"]) > HARM_DB for row in rows if row["pictures_db"]),
+        "pictures_worse": sum(min(row["pictures_db"]) < -HARM_DB for row in rows if row["pictures_db"]),
+        "of_pictures": sum(bool(row["pictures_db"]) for row in rows),
         "false_alarms": sum(bool(row["fields"]) for row in rows if row["hidden"] not in EFFECTS),
         "nulls": len(rows) - len(hidden),
     }
-    header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "rms / noise px", "CPU s"]
+    header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "pictures dB",
+              "rms / noise px", "CPU s"]  # fmt: skip
     text = table(header, [shown(row) for row in rows])
     text += (
         f"\n{summary['right']} of {summary['captures']} right; {summary['solved_elsewhere']} of "
-        f"{summary['of_elsewhere']} solved on another capture; {summary['false_alarms']} false alarms in "
-        f"{summary['nulls']} captures without an unknown effect"
+        f"{summary['of_elsewhere']} solved on another capture; pictures better in {summary['pictures_better']} of "
+        f"{summary['of_pictures']}, a frame worse in {summary['pictures_worse']}; {summary['false_alarms']} false "
+        f"alarms in {summary['nulls']} captures without an unknown effect"
     )
     return {"summary": summary, "rows": rows}, f"Effects that no catalogue names, {FRAMES} frames\n{text}"
 
@@ -408,8 +437,10 @@ def shown(row: Row) -> list[str]:
     fields = "; ".join(f"{kind} over {over}: {shape}" for kind, over, shape in row["fields"])
     gains = " ".join("-" if gain is None else f"{gain:.2f}" for gain in row["gain"])
     elsewhere = "" if row["gone_elsewhere"] is None else f"{row['gone_elsewhere']:.2f}"
+    db = row["pictures_db"]
+    pictures = f"{np.mean(db):+.2f} ({min(db):+.2f})" if db else ""
     return [
         row["hidden"] + ("" if row["right"] else " WRONG"), str(row["seed"]), row["size"], row["verdict"],
-        ", ".join(row["causes"]), fields, gains, elsewhere,
+        ", ".join(row["causes"]), fields, gains, elsewhere, pictures,
         f"{row['rms_px']:.3f} / {row['noise_px']:.3f}", f"{row['cpu_s']:.0f}",
     ]  # fmt: skip
