@@ -76,6 +76,9 @@ def test_corners_that_are_soft_are_a_field_over_the_radius_that_kernels_follow()
     assert (finding.kind, finding.covariates) == ("blur", ("radius",))
     assert finding.size == pytest.approx(1.5 * (finding.fields[0].knots[0][-1] / 350) ** 2, rel=0.15)
     assert finding.held_out.after < 0.8 * finding.held_out.before
+    (known,) = finding.fields
+    off_px = np.array(known.values)[:, 0] - 1.5 * (np.array(known.knots[0]) / 350) ** 2
+    assert np.all(np.abs(off_px[1:]) < 2 * np.array(known.std)[1:, 0])
     trajectory = integrate_gyro(STILL, CAMERA)
     places = np.array([[320.0, 240.0], [320.0, 20.0], [600.0, 450.0]])
     field = kernel_field(row_motion(trajectory, profile, 0.1, 0.004), places)

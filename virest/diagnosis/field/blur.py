@@ -171,7 +171,8 @@ def blur_field(
     held = HeldOutGain(BLUR, before, after, None)
     if sigma.max() < MIN_SIZE_PX or held.after > (1 - MIN_GAIN) * held.before:
         return None
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / (2 * np.maximum(sigma, MIN_SIZE_PX))
+    coded = 2 * np.hypot(LENS_SIGMA_PX, sigma) * LENS_STD_PX * (sigma > 0)  # px², of what coding makes of a width
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0) + coded**2) / (2 * np.maximum(sigma, MIN_SIZE_PX))
     stamp = capture.stamp_0_ns if form.covariate == "time" else None
     rows = [tuple((float(value),) for value in column) for column in (sigma, std)]
     field = Field("blur", (form.covariate,), (tuple(form.knots.tolist()),), rows[0], rows[1], stamp, form.logged)
