@@ -121,3 +121,13 @@ def test_a_mask_is_undone(rng, channels, amount, radius_px):
     assert np.abs(shown - colour)[inner].max() > 10
     assert np.abs(undone - colour)[inner].max() < 4
     assert np.sqrt(np.mean((undone - colour)[inner] ** 2)) < 0.6
+
+
+def test_clipped_light_stays_clipped(rng):
+    """A lamp that was too bright to be measured is not made a measurement; what lies beside it loses its overshoot."""
+    colour = np.repeat(strokes(rng, bright=170.0, dark=90.0)[..., None], 3, -1)
+    colour[60:90, 70:95] = 900.0
+    shown = np.clip(np.rint(masked(colour, 0.8, 1.0)), 0, 255).astype(np.uint8)
+    undone = without_mask(shown, UnsharpMask(0.8, 1.0))
+    assert np.all(undone[shown == 255] == 255)
+    assert np.any(undone != shown)

@@ -134,7 +134,8 @@ def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:
     """A picture (h, w) or (h, w, 3) as it was before the mask, y = (1 + amount) x − amount G ∗ x on its luma.
 
     x ← (y + amount G ∗ x) / (1 + amount) falls to the solution by amount / (1 + amount) a step at least (Banach).  Its
-    gain lies between 1 / (1 + amount) and 1: no noise is amplified.
+    gain lies between 1 / (1 + amount) and 1: no noise is amplified.  What may be clipped stays as it is: taken down it
+    would pass for light that was measured, and a lamp's streak for a dim line.
     """
     luma = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     sharp = luma.astype(np.float32)
@@ -145,7 +146,9 @@ def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:
     change = cv2.subtract(soft, sharp)
     if picture.ndim == 3:
         change = cv2.merge([change] * 3)
-    return np.asarray(cv2.add(picture, change, dtype=cv2.CV_8U), np.uint8)
+    undone = np.asarray(cv2.add(picture, change, dtype=cv2.CV_8U), np.uint8)
+    np.copyto(undone, picture, where=picture > UNCLIPPED_LEVELS[1])
+    return undone
 
 
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
