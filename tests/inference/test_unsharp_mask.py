@@ -6,7 +6,7 @@ import pytest
 from laws import TurningCamera, phone
 from scipy.special import ndtr
 
-from virest.inference.unsharp_mask import UnsharpMask, seen_mask, without_mask
+from virest.inference.unsharp_mask import Overshoot, UnsharpMask, _beside_line, seen_mask, without_mask
 from virest.simulation.phone_pictures import sharpen
 
 SIZE = 280
@@ -131,3 +131,15 @@ def test_clipped_light_stays_clipped(rng):
     undone = without_mask(shown, UnsharpMask(0.8, 1.0))
     assert np.all(undone[shown == 255] == 255)
     assert np.any(undone != shown)
+
+
+def test_a_doubtful_overshoot_is_undone_in_part():
+    """Between none and what is sure lies what is to be expected, the more the further the sharpest edges overshoot."""
+    shares = []
+    for amount, p_value in ((0.3, 0.2), (0.5, 0.1), (0.6, 0.05), (0.8, 1e-4)):
+        profile = _beside_line(np.array([0.8, amount, np.log(1.1), 6.0, 1.0, 0.0]))
+        found = Overshoot(0.0, float(profile.max() - 1), p_value, 0.01, profile)
+        shares.append(found.expected_mask().amount / found.mask().amount)
+    assert shares[0] == 0.0
+    assert 0.3 < shares[1] < shares[2] < shares[3]
+    assert shares[3] == 1.0
