@@ -11,10 +11,10 @@ plateau,
 a step is a wide line.  Where the edge is wider than the mask, amount and radius show as amount · radius² alone; what
 phones use then decides.
 
-A mask M that may be there leaves M K x of a picture x.  Of all that is known of M the filter of least expected error
-divides by (E M² + N / S |K|²) / E M: a spread of M makes it weaker by 1 + Var M / (E M)² alone, which is 1.04 for a mask
-of 0.3 ± 0.25, at all frequencies that come through alike.  So what is to be expected of the amount is undone, and its
-spread is left out.
+A mask M that may be there leaves M K x of a picture x.  Of all that is known of M, the filter of least expected error
+is 1 / K over (E M² + N / (S |K|²)) / E M: a spread of M makes it weaker by 1 + Var M / (E M)² alone, which is 1.04 for
+a mask of 0.3 ± 0.25, at all frequencies that come through alike.  So what is to be expected of the amount is undone,
+and its spread is left out.
 """
 
 from __future__ import annotations
