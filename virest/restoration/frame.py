@@ -319,9 +319,11 @@ def _blur_statistics(
     height, width = picture.shape[:2]
     curve = blur.motion.profile.response or ResponseCurve("srgb")
     centres_px = most_blurred(blur.motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
-    tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
+    few = settings.iterations <= FEW_ITERATIONS
+    # under a doubtful path its error counts as noise, unless neighbours make up for it
+    step = None if few and blur.covariance_px2.any() else blur.coding_step
     field = smooth_field(blur.motion, blur.anchor)
-    luma, chroma = picture_statistics(picture, field(centres_px), curve, tiles, blur.coding_step)
+    luma, chroma = picture_statistics(picture, field(centres_px), curve, FEW_TILES if few else MANY_TILES, step)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
     luma_model = luma.doubted_by(spread)
     share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)
