@@ -6,7 +6,7 @@ import pytest
 from laws import TurningCamera, phone
 from scipy.special import ndtr
 
-from virest.inference.unsharp_mask import UnsharpMask, seen_mask, without_mask
+from virest.inference.unsharp_mask import Overshoot, UnsharpMask, _beside_line, seen_mask, without_mask
 from virest.simulation.phone_pictures import sharpen
 
 SIZE = 280
@@ -121,3 +121,25 @@ def test_a_mask_is_undone(rng, channels, amount, radius_px):
     assert np.abs(shown - colour)[inner].max() > 10
     assert np.abs(undone - colour)[inner].max() < 4
     assert np.sqrt(np.mean((undone - colour)[inner] ** 2)) < 0.6
+
+
+def test_clipped_light_stays_clipped(rng):
+    """A lamp that was too bright to be measured is not made a measurement; what lies beside it loses its overshoot."""
+    colour = np.repeat(strokes(rng, bright=170.0, dark=90.0)[..., None], 3, -1)
+    colour[60:90, 70:95] = 900.0
+    shown = np.clip(np.rint(masked(colour, 0.8, 1.0)), 0, 255).astype(np.uint8)
+    undone = without_mask(shown, UnsharpMask(0.8, 1.0))
+    assert np.all(undone[shown == 255] == 255)
+    assert np.any(undone != shown)
+
+
+def test_a_doubtful_overshoot_is_undone_in_part():
+    """Between none and what is sure lies what is to be expected, the more the further the sharpest edges overshoot."""
+    shares = []
+    for amount, p_value in ((0.3, 0.2), (0.5, 0.1), (0.6, 0.05), (0.8, 1e-4)):
+        profile = _beside_line(np.array([0.8, amount, np.log(1.1), 6.0, 1.0, 0.0]))
+        found = Overshoot(0.0, float(profile.max() - 1), p_value, 0.01, profile)
+        shares.append(found.expected_mask().amount / found.mask().amount)
+    assert shares[0] == 0.0
+    assert 0.3 < shares[1] < shares[2] < shares[3]
+    assert shares[3] == 1.0

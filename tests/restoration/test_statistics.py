@@ -52,6 +52,23 @@ def test_the_curve_of_blurred_edges_is_no_noise(noise_levels: float) -> None:
     assert taken_for_light > 1.3 * measured
 
 
+@pytest.mark.parametrize("length_px", [3.5, 5.0, 15.0])
+def test_a_coders_noise_is_bounded_by_its_step(length_px: float) -> None:
+    """What upright bars have more of across than along passes for noise under a short path; the step tells."""
+    field, step = _field(length_px, np.pi / 2), 12.0
+    bars = np.random.default_rng(3).normal(0, 25, WIDTH)
+    sharp = 127 + 60 * (texture(HEIGHT, WIDTH, seed=5) - 0.5) + cv2.GaussianBlur(bars[None], (0, 0), 0.7)
+    blurred = cv2.filter2D(sharp, -1, field.arrays()[0].astype(float))
+    picture = np.clip(np.rint(_coded(blurred, step)), 0, 255).astype(np.uint8)
+    known, unknown = (
+        measure_picture(np.repeat(picture[..., None], 3, -1), field, STRAIGHT, coding_step=given)[0]
+        for given in (step, None)
+    )
+    true_power = np.mean((picture - blurred) ** 2)
+    assert known.noise_levels < 2 * np.sqrt(true_power)
+    assert np.all(known.noise <= unknown.noise * 1.001)
+
+
 @pytest.mark.parametrize("noise_levels", [1.5, 4.0, 8.0])
 @pytest.mark.parametrize("angle_rad", [0.4, 1.9])
 def test_white_noise_is_measured(noise_levels: float, angle_rad: float) -> None:

@@ -113,13 +113,14 @@ class Capture:
 
         composed = _settings(preset, settings)
         if composed not in self._plans:
+            steps: dict[int, float] = {}
 
             def gray(numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-                for number, picture in read_gray(self.record.movie, self._movie(), numbers):
+                for number, picture in read_gray(self.record.movie, self._movie(), numbers, steps):
                     if picture is not None:
                         yield number, picture
 
-            self._plans[composed] = plan_restoration(self.record, self.profile, composed, gray)
+            self._plans[composed] = plan_restoration(self.record, self.profile, composed, gray, steps)
         return self._plans[composed]
 
     def _movie(self) -> MovieIndex:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,9 @@ class TrueCapture:
 
     def plan(self, settings: RestorationSettings, **profile: Any) -> RestorationPlan:
         """What ``virest process`` would plan, with some of the profile's values changed."""
-        return plan_restoration(self.capture, replace(self.profile, **profile), settings, self.luma)
+        steps: dict[int, float] = {}
+        read = partial(self.luma, steps=steps)
+        return plan_restoration(self.capture, replace(self.profile, **profile), settings, read, steps)
 
     def restored(self, plan: RestorationPlan) -> Iterator[RestoredFrame]:
         """What ``virest process`` makes of the judged frames."""
@@ -81,9 +84,9 @@ class TrueCapture:
         """The orientations that the plan's profile makes of the inertial log."""
         return integrate_gyro(self.capture.imu, plan.profile)
 
-    def luma(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        """Luma of some frames, those that can be decoded."""
-        for number, picture in read_gray(self.capture.movie, self.index, numbers):
+    def luma(self, numbers: Sequence[int], steps: dict[int, float] | None = None) -> Iterator[tuple[int, Picture]]:
+        """Luma of some frames, those that can be decoded; steps: takes those of the coder's quantiser."""
+        for number, picture in read_gray(self.capture.movie, self.index, numbers, steps):
             if picture is not None:
                 yield number, picture
 

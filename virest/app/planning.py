@@ -264,13 +264,14 @@ def _input_files(capture: Capture, config: Path | None) -> Iterator[Path]:
 
 def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> RestorationPlan:
     """Have what is unknown estimated; say what was found."""
+    steps: dict[int, float] = {}
 
     def read_decodable(numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        for number, picture in read_gray(job.capture.movie, index, numbers):
+        for number, picture in read_gray(job.capture.movie, index, numbers, steps):
             if picture is not None:
                 yield number, picture
 
-    plan = plan_restoration(job.capture, job.profile, settings, read_decodable)
+    plan = plan_restoration(job.capture, job.profile, settings, read_decodable, steps)
     for name, estimate in plan.profile.estimates.items():
         told = name == "time_offset_s" and any(note.code is NoteCode.TIME_OFFSET for note in plan.said)
         if name not in job.profile.estimates and not told:

@@ -181,9 +181,14 @@ def read_frames(
     yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb, steps)
 
 
-def read_gray(path: Path, index: MovieIndex, frames: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-    """Stream the luma of ``frames`` (rising order) as (frame index, (h, w) or None), 0 black and 255 white."""
-    yield from _read(path, index, frames, to_gray)
+def read_gray(
+    path: Path, index: MovieIndex, frames: Iterable[int], steps: dict[int, float] | None = None
+) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Stream the luma of ``frames`` (rising order) as (frame index, (h, w) or None), 0 black and 255 white.
+
+    steps: as of :func:`read_frames`.
+    """
+    yield from _read(path, index, frames, to_gray, steps)
 
 
 @dataclass(frozen=True, slots=True)

@@ -175,7 +175,17 @@ def restore_frames(
             )
         unmasked = None if here.recorded is None else here.picture
         yield restore_frame(
-            frame, picture, motion, trajectory, plan.settings, seen, refined, plan.confirmed, pictures, unmasked
+            frame,
+            picture,
+            motion,
+            trajectory,
+            plan.settings,
+            seen,
+            refined,
+            plan.confirmed,
+            pictures,
+            unmasked,
+            here.coding_step,
         )
 
 

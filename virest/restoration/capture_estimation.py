@@ -67,19 +67,26 @@ def plan_restoration(
     profile: CameraProfile,
     settings: RestorationSettings,
     read_gray: GrayReader,
+    steps: Mapping[int, float] | None = None,
 ) -> RestorationPlan:
     """Fill what the profile leaves open from a few dozen frames, and ask whether pictures and gyroscope agree at all.
 
     read_gray: gives (index, luma) of the frames asked for, in order.  The cost does not grow with the movie.
+    steps: of the coder's quantiser, by number, known when a frame was read; missing: not known.
     """
+    steps = {} if steps is None else steps
     lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
     if lag is None:
-        return _planned(capture, profile, settings, read_gray)
-    return with_lag(_planned(at_lag(capture, profile, lag), profile, settings, read_gray), lag)
+        return _planned(capture, profile, settings, read_gray, steps)
+    return with_lag(_planned(at_lag(capture, profile, lag), profile, settings, read_gray, steps), lag)
 
 
 def _planned(
-    capture: Capture, profile: CameraProfile, settings: RestorationSettings, read_gray: GrayReader
+    capture: Capture,
+    profile: CameraProfile,
+    settings: RestorationSettings,
+    read_gray: GrayReader,
+    steps: Mapping[int, float],
 ) -> RestorationPlan:
     plan = RestorationPlan(
         profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
@@ -139,7 +146,7 @@ def _planned(
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
     plan = _with_seen_paths(plan, profile, capture, powers)
-    return with_neighbours_asked(plan, capture, surveyed, lumas)
+    return with_neighbours_asked(plan, capture, surveyed, lumas, steps)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────

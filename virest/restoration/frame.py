@@ -107,6 +107,7 @@ def restore_frame(
     confirmed: ConfirmedGain | None = None,
     neighbours: NeighbourFinder | None = None,
     unmasked: NDArray[np.uint8] | None = None,
+    coding_step: float | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
 
@@ -114,7 +115,7 @@ def restore_frame(
     pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
     is then taken.  confirmed: how much of a promised gain neighbours confirm.  neighbours:
     brings those to the frame that it is restored with.  unmasked: the picture without the phone's sharpening, which is
-    what is deblurred; None: ``picture`` itself.
+    what is deblurred; None: ``picture`` itself.  coding_step: of the coder's quantiser, grey levels; None: not known.
     """
     clock = _Clock()
     if refined is not None:
@@ -136,7 +137,7 @@ def restore_frame(
     deblurring: Deblurring | None = None
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, light)
+        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, light, coding_step)
         restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
@@ -254,6 +255,8 @@ class _KnownBlur:
     """(2, 2) of the path."""
     light: FrameLight | None
     """Flicker and vignetting; None: neither."""
+    coding_step: float | None
+    """Of the coder's quantiser, grey levels; None: not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,9 +319,11 @@ def _blur_statistics(
     height, width = picture.shape[:2]
     curve = blur.motion.profile.response or ResponseCurve("srgb")
     centres_px = most_blurred(blur.motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
-    tiles = FEW_TILES if settings.iterations <= FEW_ITERATIONS else MANY_TILES
+    few = settings.iterations <= FEW_ITERATIONS
+    # under a doubtful path its error counts as noise, unless neighbours make up for it
+    step = None if few and blur.covariance_px2.any() else blur.coding_step
     field = smooth_field(blur.motion, blur.anchor)
-    luma, chroma = picture_statistics(picture, field(centres_px), curve, tiles)
+    luma, chroma = picture_statistics(picture, field(centres_px), curve, FEW_TILES if few else MANY_TILES, step)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
     luma_model = luma.doubted_by(spread)
     share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)

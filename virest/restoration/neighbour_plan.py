@@ -28,8 +28,12 @@ def with_neighbours_asked(
     capture: Capture,
     runs: Sequence[Sequence[int]],
     lumas: Mapping[int, NDArray[np.uint8]],
+    steps: Mapping[int, float],
 ) -> RestorationPlan:
-    """What neighbouring frames show that the predicted turns lack, and how much of a promised gain they confirm."""
+    """What neighbouring frames show that the predicted turns lack, and how much of a promised gain they confirm.
+
+    lumas: of the frames of the runs.  steps: of the coder's quantiser, by number; missing: not known.
+    """
     profile = plan.profile
     if not lumas or profile.intrinsics is None:
         return plan
@@ -40,7 +44,8 @@ def with_neighbours_asked(
     for number, luma in lumas.items():
         motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
         outside = outside_reason(motion.start_s, motion.end_s, capture.imu.time_s, capture.imu_gaps_s)
-        sights[number] = Sight(frames[number], luma, motion, outside[1] if outside else "")
+        why = outside[1] if outside else ""
+        sights[number] = Sight(frames[number], luma, motion, why, coding_step=steps.get(number))
     plan, sights = _unmasked(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing = survey_turns(runs, sights, neighbours, trajectory)
@@ -54,10 +59,8 @@ def with_neighbours_asked(
         return plan
     quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
 
-    def quickly(
-        luma: NDArray[np.uint8], motion: RowMotion, refined: RefinedMotion | None
-    ) -> tuple[Image, Image] | None:
-        return tried(luma, motion, quick, refined)
+    def quickly(here: Sight, motion: RowMotion, refined: RefinedMotion | None) -> tuple[Image, Image] | None:
+        return tried(here.picture, motion, quick, refined, here.coding_step)
 
     return replace(plan, confirmed=survey_gain(runs, sights, neighbours.knowing(missing), trajectory, lens, quickly))
 
@@ -71,8 +74,8 @@ def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[Resto
     if mask is None:
         return plan, dict(sights)
     said = (
-        f"edges overshoot: the phone sharpened its pictures, by an unsharp mask of {mask.amount:.2g} with a radius of "
-        f"{mask.radius_px:.2g} px; it is undone before the blur"
+        f"edges overshoot: the phone sharpened its pictures, by an unsharp mask to be expected of {mask.amount:.2g} "
+        f"with a radius of {mask.radius_px:.2g} px; it is undone before the blur"
     )
     plan = replace(plan, mask=mask, notes=(*plan.notes, said))
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}

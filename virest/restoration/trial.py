@@ -29,7 +29,11 @@ ANCHOR = 0.5
 
 
 def tried(
-    luma: NDArray[np.uint8], motion: RowMotion, settings: RestorationSettings, refined: RefinedMotion | None
+    luma: NDArray[np.uint8],
+    motion: RowMotion,
+    settings: RestorationSettings,
+    refined: RefinedMotion | None,
+    coding_step: float | None,
 ) -> tuple[Image, Image] | None:
     """Restore a luma (height, width); None where it is left alone.
 
@@ -42,7 +46,7 @@ def tried(
     if deblur_method(motion, settings, longest_px)[0] == "none":
         return None
     curve, field = motion.profile.response or ResponseCurve("srgb"), smooth_field(motion, ANCHOR)
-    statistics = picture_statistics(luma, field(most_blurred(motion, centres_px)), curve, FEW_TILES)
+    statistics = picture_statistics(luma, field(most_blurred(motion, centres_px)), curve, FEW_TILES, coding_step)
     covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
     spread = kernel_spread(field, width, height, covariance_px2)
     model = statistics[0].doubted_by(spread)

@@ -58,7 +58,8 @@ def _row(
         return row
     fitted = found.mask()
     overshoots = {"of_all": found.of_all, "of_sharpest": found.of_sharpest, "p_value": found.p_value}
-    return row | overshoots | {"fitted": [fitted.amount, fitted.radius_px]}
+    expected = found.expected_mask().amount
+    return row | overshoots | {"fitted": [fitted.amount, fitted.radius_px], "expected": expected}
 
 
 def _overshoot(capture: Path) -> Overshoot | None:
@@ -76,7 +77,17 @@ def _overshoot(capture: Path) -> Overshoot | None:
 
 
 def _text(groups: list[list[Row]]) -> str:
-    header = ["mask", "captures", "all edges", "sharpest", "most", f"seen (p < {FALSE_ALARM:g})", "amount", "radius px"]
+    header = [
+        "mask",
+        "captures",
+        "all edges",
+        "sharpest",
+        "most",
+        f"seen (p < {FALSE_ALARM:g})",
+        "amount",
+        "radius px",
+        "undone",
+    ]
     lines = []
     for rows in groups:
         told = [row for row in rows if row["p_value"] is not None]
@@ -93,11 +104,13 @@ def _text(groups: list[list[Row]]) -> str:
                 f"{len(seen)} of {len(told)}",
                 _spread(fitted[:, 0], 2),
                 _spread(fitted[:, 1], 2),
+                _spread([row["expected"] for row in told], 2),
             ]
         )
     return (
         "EDGES: overshoot beside flat plateaus, as part of the step, mean ± its deviation from capture to capture;\n"
-        "what of a phone's sharpening is seen, and fitted to the sharpest edges\n" + table(header, lines)
+        "what of a phone's sharpening is seen, fitted to the sharpest edges, and undone of all captures' amount\n"
+        + table(header, lines)
     )
 
 

@@ -172,11 +172,13 @@ def _planning_cpu_s(folder: Path) -> float:
     profile, _ = resolve_profile(capture, None)
     index = probe_movie(capture.movie)
 
+    steps: dict[int, float] = {}
+
     def read(numbers: Any) -> Iterator[tuple[int, Any]]:
-        return ((n, picture) for n, picture in read_gray(capture.movie, index, numbers) if picture is not None)
+        return ((n, picture) for n, picture in read_gray(capture.movie, index, numbers, steps) if picture is not None)
 
     began = time.process_time()
-    plan_restoration(capture, profile, SETTINGS["fast"], read)
+    plan_restoration(capture, profile, SETTINGS["fast"], read, steps)
     return time.process_time() - began
 
 

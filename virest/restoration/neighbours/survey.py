@@ -77,11 +77,11 @@ def survey_gain(
     neighbours: FrameNeighbours,
     trajectory: Trajectory,
     lens: MovingLens,
-    tried: Callable[[Picture, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
+    tried: Callable[[Sight, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
 ) -> ConfirmedGain | None:
     """What deblurring gains by the neighbours' account.
 
-    tried: a frame's luma in light, as recorded and as restored, at the middle of its exposures and reduced; None: it is
+    tried: luma of a frame's light, as recorded and as restored, at the middle of its exposures and reduced; None: it is
     left alone.  One blurred frame of each run is restored, and one more where runs are few.  Each is compared with both
     its neighbours; if neither can judge it, the next frame takes its place.
     """
@@ -95,7 +95,7 @@ def survey_gain(
         assert here.motion is not None
         refined = neighbours.refined((before,), here, (after,))
         motion = here.motion if refined is None else refined.motion
-        pictures = tried(here.picture, motion, refined)
+        pictures = tried(here, motion, refined)
         if pictures is None:
             continue
         before_this = len(found)

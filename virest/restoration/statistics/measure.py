@@ -34,12 +34,14 @@ def measure_picture(
     curve: ResponseCurve,
     clipped: NDArray[np.uint8] | None = None,
     most_tiles: int = MANY_TILES,
+    coding_step: float | None = None,
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
     picture: (height, width, 3) RGB, or a luma (height, width), which then stands for the chroma too.  clipped: (height,
-    width), 1 where light was too much to be measured; it and what a path reaches from it are left out.  Returns the
-    statistics of luma and of chroma, both colour differences together.
+    width), 1 where light was too much to be measured; it and what a path reaches from it are left out.  coding_step: of
+    the coder's quantiser of the luma, grey levels; None: not known.  Returns the statistics of luma and of chroma, both
+    colour differences together.
     """
     corners = _corners(field, picture.shape[:2])
     if not corners or field.radius_px >= SIDE // 2:
@@ -64,10 +66,10 @@ def measure_picture(
     )
     luma, *red_blue = _planes(_some_rows(picture))
     cells, white_levels, grey = RingCells(passed), white_noise(luma), observed(0, 1)
-    spectra, colour = [(light, cells, white_levels), (grey, cells, white_levels)], grey
+    spectra, colour = [(light, cells, white_levels, coding_step), (grey, cells, white_levels, coding_step)], grey
     if red_blue:
         colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
-        spectra.append((colour, RingCells(passed[::2]), white_noise(red_blue[0])))
+        spectra.append((colour, RingCells(passed[::2]), white_noise(red_blue[0]), None))
     of_light, of_luma, *of_chroma = fit_rings(*spectra)
     of_luma = replace(
         of_luma,

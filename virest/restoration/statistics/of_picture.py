@@ -44,13 +44,18 @@ def most_blurred(motion: RowMotion, centres_px: NDArray[np.float64]) -> NDArray[
 
 
 def picture_statistics(
-    picture: NDArray[np.uint8], field: KernelField, curve: ResponseCurve, most_tiles: int
+    picture: NDArray[np.uint8],
+    field: KernelField,
+    curve: ResponseCurve,
+    most_tiles: int,
+    coding_step: float | None = None,
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Statistics of luma and chroma of a picture (height, width, 3) or of a luma alone, (height, width).
 
     Noise shows where the paths cancel; a Gaussian, the same all round, hides it.  So the paths alone are fitted, which
     measures the noise and the defocused picture, and that is focused afterwards.  Paths too long for a tile are
-    measured on a picture that is smaller; the finer frequencies take the finest one's.
+    measured on a picture that is smaller; the finer frequencies take the finest one's.  coding_step: as of
+    :func:`measure_picture`.
     """
     sigma_px, times = np.asarray(field.defocus_sigma_px, float), 1
     field = replace(field, defocus_sigma_px=0.0)
@@ -60,7 +65,8 @@ def picture_statistics(
         height, width = picture.shape[:2]
         picture = cv2.resize(picture, (width // times, height // times), interpolation=cv2.INTER_AREA)
         field = replace(field.scaled(1 / times), centres_px=(field.centres_px + 0.5) / times - 0.5)
-    found = measure_picture(picture, field, curve, clipped_anywhere(picture, curve), most_tiles)
+        coding_step = None if coding_step is None else coding_step / times
+    found = measure_picture(picture, field, curve, clipped_anywhere(picture, curve), most_tiles, coding_step)
     luma, chroma = (
         focused(one.scaled(times) if times > 1 and one.measured else one, sigma_px).with_error_share(CURVE_SLOPE_STD**2)
         for one in found

@@ -22,6 +22,10 @@ _CODER_SLOPE = 1.5
 there: recorded less true pictures at 0.25 bits a pixel fall about as f⁻¹·⁵ from 0.08 to 0.5 cycles per pixel (five
 frames, read by eye).  It hardly matters: ``python -m virest.app.bench --only fits`` finds 1.9 ± 2.2, and between 0.5
 and 2.5 the mean gain on 14 captures changes by 0.01 dB."""
+_DEAD_ZONE = 5 / 6
+"""Part of its step below which an H.264 coder leaves a coefficient out, and of a further step at which it rounds up."""
+_CODER_SHARE = (_DEAD_ZONE**3 + (1 - _DEAD_ZONE) ** 3) / 3
+"""Error that leaves, as part of the step's square: of a remainder that is anywhere between two steps."""
 _FINEST = slice(-3, None)
 """Rings of the finest detail."""
 _RECORDED = 0.1
@@ -56,14 +60,17 @@ class RingCells:
         return sums[: RINGS * _CELLS].reshape(RINGS, _CELLS)
 
 
-def fit_rings(*spectra: tuple[NDArray[np.float32], RingCells, float]) -> list[PictureStatistics]:
+def fit_rings(
+    *spectra: tuple[NDArray[np.float32], RingCells, float, float | None],
+) -> list[PictureStatistics]:
     """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|².
 
-    spectra: |G|², its cells, and the white noise of the picture that it is of; all are fitted at once.
+    spectra: |G|², its cells, the white noise of the picture that it is of, and the step of its coder's quantiser, None
+    where that is not known; all are fitted at once.
     """
     count, k, g = (
         np.stack(parts)
-        for parts in zip(*((cells.count, cells.passed, cells.means(seen)) for seen, cells, _ in spectra), strict=True)
+        for parts in zip(*((cells.count, cells.passed, cells.means(seen)) for seen, cells, *_ in spectra), strict=True)
     )
     in_ring = np.maximum(count.sum(-1), 1)
     mean_k, mean_g = (count * k).sum(-1) / in_ring, (count * g).sum(-1) / in_ring
@@ -79,8 +86,8 @@ def fit_rings(*spectra: tuple[NDArray[np.float32], RingCells, float]) -> list[Pi
     spread = np.sqrt(np.maximum((count * k * k).sum(-1) / in_ring - mean_k**2, 0))
     determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
     found = []
-    for i, (_, _, white_levels) in enumerate(spectra):
-        settled = _settled(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels)
+    for i, (_, _, white_levels, step) in enumerate(spectra):
+        settled = _settled(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels, step)
         misfit = _misfit(count[i], g[i], settled.noise[:, None] + settled.signal[:, None] * k[i])
         found.append(replace(settled, misfit=misfit))
     return found
@@ -100,6 +107,7 @@ def _settled(
     observed: Array,
     determined: NDArray[np.bool_],
     white_levels: float,
+    step: float | None,
 ) -> PictureStatistics:
     """Rings that cannot tell S from N borrow the noise of those that can; S never rises with frequency.
 
@@ -113,6 +121,8 @@ def _settled(
         noise *= _growth_downwards(frequency, noise, determined, observed)
         if passed[_FINEST].mean() > _RECORDED:
             noise = np.minimum(noise, _at_most(frequency, observed))
+        if step is not None:
+            noise = np.minimum(noise, observed[_FINEST].mean() + _coder_noise(observed, step))
     else:
         finest = min(float(observed[_FINEST].mean()), 2 * white_levels**2)
         noise = _falling_noise(frequency, finest, _CODER_SLOPE)
@@ -137,6 +147,17 @@ def _at_most(frequency: Array, observed: Array) -> Array:
     their part, all of what they show at most, and towards low frequencies it grows like f⁻² at most.
     """
     return _falling_noise(frequency, float(observed[_FINEST].mean()), _STEEPEST_NOISE)
+
+
+def _coder_noise(observed: Array, step: float) -> Array:
+    """Noise (RINGS,) that a coder leaves in a picture, by the step of its quantiser.
+
+    Of what stands far above the step an error of the step's own, and what lies far below it is left out: reverse
+    water-filling (Cover & Thomas 2006, section 10.3.3), smooth between the two, for rings hold weak and strong places.
+    """
+    level = max(_CODER_SHARE * step**2, ROUNDING_POWER)
+    falling = np.maximum(np.maximum.accumulate(observed[::-1])[::-1], ROUNDING_POWER)
+    return np.asarray(level * falling / (level + falling))
 
 
 def _falling_noise(frequency: Array, finest: float, slope: float) -> Array:
