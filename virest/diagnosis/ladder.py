@@ -246,9 +246,11 @@ class DiagnosisSession:
 
     def judge_edges(self, gray: Reader) -> None:
         """What the phone did to its edges; no blur overshoots, so the paths need not be right."""
+        assert self.blur is not None
         assert self.curve is not None
         shown, extended = replace(self.capture, frames=self._all_frames()), self.curve.profile
-        self.edges = judge_sharpening(shown, extended, integrate_gyro(self.capture.imu, extended), gray)
+        trajectory = integrate_gyro(self.capture.imu, extended)
+        self.edges = judge_sharpening(shown, extended, trajectory, gray, self.each, self.blur.steps)
 
     def told(self) -> Diagnosis:
         """The verdict, with everything that led to it."""
