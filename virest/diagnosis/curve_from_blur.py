@@ -60,6 +60,8 @@ DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 AGREEMENT = 0.07
 """How well what an encoder leaves may agree with a change of the curve: their correlation, of movies with 0.1 to 0.4
 bits a pixel whose curve is the profile's."""
+READ_PARTS = 4
+"""In which the frames may be read side by side."""
 _MIN_TILE_PIXELS = 400
 _EVERY = 2
 """Pixels are compared this far apart along both sides: neighbours of a blurred picture say the same."""
@@ -162,7 +164,9 @@ def observe_mixing(
     camera = turning_camera(trajectory, profile) if profile.intrinsics is not None else None
     pairs = _choose_pairs(frames, camera, settings) if camera is not None else []
     wanted = sorted({k for pair in pairs for k in pair})
-    pictures = {index: rgb for index, rgb in read_rgb(wanted) if rgb is not None}
+    runs = [part.tolist() for part in np.array_split(np.array(wanted, np.intp), READ_PARTS)]
+    read = each(_read_part, [(read_rgb, run) for run in runs if run])
+    pictures = {index: rgb for part in read for index, rgb in part}
     by_index = {frame.index: frame for frame in frames}
     darkest = _darkest(list(pictures.values()))
     steps = _steps(darkest)
@@ -182,6 +186,10 @@ def observe_mixing(
         {name: table[:, 5 * i + 3 : 5 * i + 6] for i, name in enumerate(names)},
         {name: table[:, 5 * i + 6] for i, name in enumerate(names)},
     )
+
+
+def _read_part(read_rgb: ReadRgb, wanted: list[int]) -> list[tuple[int, Rgb]]:
+    return [(index, rgb) for index, rgb in read_rgb(wanted) if rgb is not None]
 
 
 def _steps(darkest: float) -> dict[str, Array]:
