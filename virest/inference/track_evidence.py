@@ -110,7 +110,6 @@ class TrackEvidence:
 
     def _term_slopes(self, state: State, at: Prediction) -> Array:
         """(n, 2, k) change of the predicted points per unit of each term's values."""
-
         turning = TurningSlopes(self.imu, state.known, self.table, at) if state.scene is None else None
 
         def moved_by(profile: CameraProfile) -> Array:
