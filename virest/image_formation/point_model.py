@@ -332,9 +332,10 @@ class Moved:
 
 def _paths(known: IntegratedMotion, table: TrackTable, scene: InertialMotion, poses: Poses) -> tuple[Paths, Paths]:
     assert known.displacement is not None
-    origin_s = np.asarray(known.profile.imu_time_s(table.origin_s))[table.window]
+    origin_s, window = np.asarray(known.profile.imu_time_s(table.origin_s)), table.window
     first, second = (
-        Paths(time_s - origin_s, *known.displacement.at(time_s, origin_s)) for time_s in (poses.first_s, poses.second_s)
+        Paths(time_s - origin_s[window], *known.displacement.at(time_s, origin_s, window))
+        for time_s in (poses.first_s, poses.second_s)
     )
     return first, second
 
