@@ -277,3 +277,7 @@ def test_a_readout_that_is_half_as_long_is_found(tmp_path: Path, monkeypatch) ->
     assert gain["disagreement_after_px"] < 0.4 * gain["disagreement_before_px"]
     assert all((tmp_path / "out/trip" / path).is_file() for path in cause["figures"])
     assert read_profile(tmp_path / "out/trip/extended.yaml").shutter.readout_time_s == pytest.approx(found["estimate"])
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
+    assert run(tmp_path / "trip", "--out", tmp_path / "alone", "-q") == 0
+    both = [(tmp_path / name / "trip" / "diagnosis.json").read_bytes() for name in ("out", "alone")]
+    assert both[0] == both[1], "one process tells what two tell"

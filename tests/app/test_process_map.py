@@ -10,7 +10,7 @@ import time
 import pytest
 
 from virest.app.process_map import _SharedOut, process_map
-from virest.inference.parallel import one_by_one
+from virest.inference.parallel import begun, one_by_one
 
 
 def die_elsewhere(parent: int, value: float) -> float:
@@ -30,6 +30,25 @@ def test_results_come_in_the_order_of_the_calls_and_a_worker_s_death_costs_none(
         assert set(each(os.getpid, [(), ()])) != {os.getpid()}
         assert each(die_elsewhere, [(os.getpid(), 1.5), (os.getpid(), -4.0)]) == [3.0, -8.0]
         assert each(os.getpid, [(), ()]) == [os.getpid()] * 2
+
+
+def test_a_call_is_begun_beside_and_a_worker_s_death_does_not_cost_it() -> None:
+    """Its result is there when asked for; if its worker dies, or has died, it is made here."""
+    with process_map(2) as each:
+        elsewhere, doomed = begun(each, os.getpid), begun(each, die_elsewhere, os.getpid(), 1.5)
+        assert elsewhere() != os.getpid()
+        assert doomed() == 3.0
+        assert begun(each, os.getpid)() == os.getpid()
+
+
+def test_without_processes_nothing_is_begun_before_its_result_is_wanted() -> None:
+    """A call that nobody asks after costs nothing."""
+    made = []
+    with process_map(1) as each:
+        first, _ = begun(each, made.append, 1), begun(each, made.append, 2)
+        assert made == []
+        first()
+    assert made == [1]
 
 
 def test_one_job_is_done_here() -> None:

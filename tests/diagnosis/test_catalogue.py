@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 from virest.diagnosis.catalogue import CATALOGUE
 from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
@@ -26,3 +28,8 @@ def test_every_named_cause_has_somebody_who_looks_for_it() -> None:
     blur = {effect().name for effect in (ExposureTime, Defocus)}
     for quantity, seekers in ((GEOMETRY, points), (PHOTOMETRY, light), (BLUR, blur), (EDGES, {"sharpening"})):
         assert {name for name, cause in CATALOGUE.items() if cause.seen_in == quantity} == seekers
+
+
+def test_a_cause_is_the_same_in_another_process() -> None:
+    """Its functions stay where they are; its name goes."""
+    assert all(pickle.loads(pickle.dumps(effect)) is effect for effect in GEOMETRIC_EFFECTS)

@@ -1,5 +1,6 @@
 """Local blur: widths of edges and ratios of spectra find exposure time and defocus, and keep quiet otherwise."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,15 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.capture.video import GrayReader, probe_movie, read_gray
 from virest.diagnosis import local_blur
-from virest.diagnosis.local_blur import BlurObservations, frames_to_read, look_for_blur, observe_blur, residuals
+from virest.diagnosis.edge_overshoot import judge_sharpening
+from virest.diagnosis.local_blur import (
+    BlurObservations,
+    frames_to_read,
+    look_for_blur,
+    look_for_steps,
+    observe_blur,
+    residuals,
+)
 from virest.diagnosis.local_blur_edges import fit_steps, measure_widths, observe_picture
 from virest.diagnosis.local_blur_fit import Defocus, ExposureTime, fit, held_out
 from virest.diagnosis.local_blur_model import fitted_width, node_tensors
@@ -97,6 +106,26 @@ def test_parts_of_a_capture_show_what_all_of_it_shows(
     np.testing.assert_array_equal(parts.ratios.log_ratio, whole.ratios.log_ratio)
     assert parts.candidates == whole.candidates
     assert len(whole.ratios) > 0
+
+
+def test_steps_that_blur_came_by_are_those_of_the_pictures(
+    nominal: Observed, nominal_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sharpening is judged by them: frames that two parts share count once, and no picture is read a second time."""
+    monkeypatch.setattr(local_blur, "frames_to_read", lambda capture: [3, 5, 7, 8, 9, 12])
+    capture, (_, profile, trajectory) = read_capture(nominal_folder, look_at_pictures=False), nominal
+    gray = GrayReader(capture.movie, probe_movie(capture.movie))
+    seen, own = look_for_blur(gray, capture, profile, trajectory).steps, look_for_steps(gray, capture)
+    assert seen is not None
+    assert len(np.unique(own.stamp_s)) == 6
+    for name in ("profile", "points_px", "normal", "stamp_s", "exposure_s"):
+        np.testing.assert_array_equal(getattr(seen, name), getattr(own, name))
+
+    def unread(_frames: object) -> Iterator[tuple[int, None]]:
+        raise AssertionError
+
+    by_blur = judge_sharpening(capture, profile, trajectory, unread, steps=seen)
+    assert by_blur.findings == judge_sharpening(capture, profile, trajectory, gray).findings
 
 
 def test_the_width_of_a_blurred_step_is_found(rng: np.random.Generator) -> None:

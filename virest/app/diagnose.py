@@ -22,16 +22,17 @@ from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
-from virest.capture.video import GrayReader, probe_movie, read_frames
+from virest.capture.video import GrayReader, MovieIndex, probe_movie, read_frames
 from virest.diagnosis.findings import CONSISTENT, Diagnosis, FieldFinding, Finding, Rung
 from virest.diagnosis.restoration_gain import (
     RestorationGain,
     chosen_pairs,
     measure_restoration_gain,
     pairs_to_keep_back,
+    restore_pairs,
 )
 from virest.errors import OutputError, VirestError
-from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.parallel import ParallelMap, begun, one_by_one
 from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
 from virest.restoration.capture import RestorationPlan
@@ -81,6 +82,19 @@ class DiagnosisOutcome:
 
 
 @dataclass(frozen=True, slots=True)
+class RgbReader:
+    """Pictures of the frames asked for: what a process needs to read a movie by itself."""
+
+    movie: Path
+    index: MovieIndex
+
+    def __call__(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
+        """Stream (movie index, RGB (h, w, 3) or None), rising."""
+        for first, last in _runs(numbers):
+            yield from read_frames(self.movie, self.index, first, last)
+
+
+@dataclass(frozen=True, slots=True)
 class Source:
     """A capture that was read, and how to have its pictures."""
 
@@ -124,11 +138,14 @@ def find_diagnosis(path: Path, config: Path | None = None) -> Json:
 def _found_and_judged(source: Source, say: Progress, each: ParallelMap) -> tuple[Diagnosis, RestorationGain]:
     """What is wrong, and what mending it does to pictures that no fit has seen."""
     firsts = pairs_to_keep_back(source.capture, source.profile)
+    as_given = begun(each, restore_pairs, source.capture, source.profile, firsts, source.pictures, source.gray)
     found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, _of_pairs(firsts))
     say("restoring", LADDER_PART)
     profiles = found.nominal_profile, found.extended_profile
-    gain = measure_restoration_gain(source.capture, *profiles, source.pictures, source.gray, each=each, firsts=firsts)
-    return found, gain
+    before = as_given() if firsts and found.nominal_profile == source.profile else None
+    return found, measure_restoration_gain(
+        source.capture, *profiles, source.pictures, source.gray, each=each, firsts=firsts, before=before
+    )
 
 
 def _of_pairs(firsts: Collection[int]) -> list[int]:
@@ -175,12 +192,7 @@ def open_source(path: Path, config: Path | None = None) -> Source:
     profile, origin = resolve_profile(capture, config)
     log.info("%s: camera profile from %s", capture.name, origin)
     index = probe_movie(capture.movie)
-
-    def pictures(numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
-        for first, last in _runs(numbers):
-            yield from read_frames(capture.movie, index, first, last)
-
-    return Source(capture, profile, pictures, GrayReader(capture.movie, index))
+    return Source(capture, profile, RgbReader(capture.movie, index), GrayReader(capture.movie, index))
 
 
 def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from virest.app.worker_processes import process_pool, submit_uninterrupted
@@ -51,10 +52,35 @@ class _SharedOut:
             futures = [self._submit(function, parts) for parts in calls]
             return [_told(future, place, done) for place, future in enumerate(futures)]
         except BrokenExecutor:
-            log.warning("a worker process died; its work is done again in this one")
-            self.close()
-            self.jobs, self._pool = 1, None
+            self._give_up()
             return one_by_one(function, calls, done)
+
+    def begin(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        """As `Background` says."""
+        here = partial(function, *arguments)
+        if self.jobs == 1:
+            return here
+        try:
+            future = self._submit(function, arguments)
+        except BrokenExecutor:
+            self._give_up()
+            return here
+
+        def result() -> Any:
+            try:
+                return future.result()
+            except (BrokenExecutor, CancelledError):
+                self._give_up()
+                return here()
+
+        return result
+
+    def _give_up(self) -> None:
+        """From here on this process does the work of the others, one of which has died."""
+        if self.jobs > 1:
+            log.warning("a worker process died; its work is done again in this one")
+        self.close()
+        self.jobs, self._pool = 1, None
 
     def _submit(self, function: Callable[..., Any], parts: tuple[Any, ...]) -> Future[Any]:
         if self._pool is None:

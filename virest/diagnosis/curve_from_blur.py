@@ -60,10 +60,14 @@ DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 AGREEMENT = 0.07
 """How well what an encoder leaves may agree with a change of the curve: their correlation, of movies with 0.1 to 0.4
 bits a pixel whose curve is the profile's."""
+READ_PARTS = 4
+"""In which the frames may be read side by side."""
 _MIN_TILE_PIXELS = 400
 _EVERY = 2
 """Pixels are compared this far apart along both sides: neighbours of a blurred picture say the same."""
 _NODE_PX = 16
+_AT_AN_END = ((np.arange(256) > 247) | (np.arange(256) < 4)).astype(np.uint8)
+"""Of a colour's 256 levels, those that may be clipped."""
 _MAX_CHROMA_RANGE = 40
 """Levels of Cr or Cb within a blur's reach."""
 
@@ -162,7 +166,9 @@ def observe_mixing(
     camera = turning_camera(trajectory, profile) if profile.intrinsics is not None else None
     pairs = _choose_pairs(frames, camera, settings) if camera is not None else []
     wanted = sorted({k for pair in pairs for k in pair})
-    pictures = {index: rgb for index, rgb in read_rgb(wanted) if rgb is not None}
+    runs = [part.tolist() for part in np.array_split(np.array(wanted, np.intp), READ_PARTS)]
+    read = each(_read_part, [(read_rgb, run) for run in runs if run])
+    pictures = {index: rgb for part in read for index, rgb in part}
     by_index = {frame.index: frame for frame in frames}
     darkest = _darkest(list(pictures.values()))
     steps = _steps(darkest)
@@ -182,6 +188,10 @@ def observe_mixing(
         {name: table[:, 5 * i + 3 : 5 * i + 6] for i, name in enumerate(names)},
         {name: table[:, 5 * i + 6] for i, name in enumerate(names)},
     )
+
+
+def _read_part(read_rgb: ReadRgb, wanted: list[int]) -> list[tuple[int, Rgb]]:
+    return [(index, rgb) for index, rgb in read_rgb(wanted) if rgb is not None]
 
 
 def _steps(darkest: float) -> dict[str, Array]:
@@ -307,27 +317,26 @@ def _compare(
     def light(seen: ResponseCurve) -> list[tuple[Plane, list[Plane]]]:
         """Either picture's light where the blurred one has it, with the other's kernels."""
         table = seen.linear_table()
-        moved = cv2.remap(table[sharp[1]], place, None, cv2.INTER_CUBIC)
-        return [(np.asarray(moved, np.float32), kernels[1]), (table[blurred[1]], kernels[0])]
+        moved = cv2.remap(cv2.LUT(sharp[1], table), place, None, cv2.INTER_CUBIC)
+        return [(np.asarray(moved, np.float32), kernels[1]), (np.asarray(cv2.LUT(blurred[1], table)), kernels[0])]
 
-    def levels(changed: ResponseCurve) -> Array:
-        """Difference of luma (n,) in the compared pixels of all tiles that tell."""
+    def levels(changed: ResponseCurve, both: list[tuple[Plane, list[Plane]]]) -> Array:
+        """Difference of luma (n,) in the compared pixels of all tiles that tell, of both pictures' light."""
         first, second = (
             np.concatenate([_filtered(one, by[k], tiles[k])[at] for k, at in zip(told, pixels, strict=True)])
-            for one, by in light(changed)
+            for one, by in both
         )
         return np.asarray((255 * (changed.encode(second) - changed.encode(first))) @ LUMA, float)
 
-    from_sharp = light(curve)[0]
+    as_given = light(curve)
+    from_sharp = as_given[0]
     whole = np.empty_like(from_sharp[0])
     for kernel, tile in zip(from_sharp[1], tiles, strict=True):
         whole[tile] = _filtered(from_sharp[0], kernel, tile)
-    nominal, nuisance = levels(curve), _nuisances((255 * curve.encode(whole)) @ LUMA)
-    gammas = [
-        levels(replace(curve, extra_gamma=curve.extra_gamma * float(np.exp(s))))
-        for s in steps["response_curve"][[0, 2]]
-    ]
-    blacks = [levels(replace(curve, black_level=curve.black_level + float(s))) for s in steps["black_level"][1:]]
+    nominal, nuisance = levels(curve, as_given), _nuisances((255 * curve.encode(whole)) @ LUMA)
+    bent = [replace(curve, extra_gamma=curve.extra_gamma * float(np.exp(s))) for s in steps["response_curve"][[0, 2]]]
+    lifted = [replace(curve, black_level=curve.black_level + float(s)) for s in steps["black_level"][1:]]
+    gammas, blacks = ([levels(one, light(one)) for one in changed] for changed in (bent, lifted))
     stacks = [np.stack(stack, axis=-1) for stack in ((gammas[0], nominal, gammas[1]), (nominal, *blacks))]
     free = np.concatenate(
         [np.stack([plane[tiles[k]][at] for plane in nuisance], axis=-1) for k, at in zip(told, pixels, strict=True)]
@@ -407,14 +416,17 @@ def _usable(sharp: Rgb, blurred: Rgb, place: Plane) -> Mask:
     """Pixels whose surroundings are inside both pictures, clipped in no colour of either, and about of one hue."""
     height, width = blurred.shape[:2]
     edge = 8
-    inside = ((place > edge) & (place < (width - 1 - edge, height - 1 - edge))).all(axis=-1)
+    x, y = place[..., 0], place[..., 1]
+    inside = (x > edge) & (x < width - 1 - edge) & (y > edge) & (y < height - 1 - edge)
 
     def unfit(rgb: Rgb) -> Gray:
         around = np.ones((21, 21), np.uint8)
-        clipped = cv2.dilate(((rgb > 247) | (rgb < 4)).any(axis=-1).astype(np.uint8), around)
-        chroma = cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb)[..., 1:]
-        varied = (cv2.dilate(chroma, around) - cv2.erode(chroma, around)).max(axis=-1) > _MAX_CHROMA_RANGE
-        return clipped | varied.astype(np.uint8)
+        ends = [cv2.LUT(plane, _AT_AN_END) for plane in cv2.split(rgb)]
+        unfit = cv2.dilate(ends[0] | ends[1] | ends[2], around)
+        for chroma in cv2.split(cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb))[1:]:
+            varied = cv2.dilate(chroma, around) - cv2.erode(chroma, around)
+            unfit |= (varied > _MAX_CHROMA_RANGE).astype(np.uint8)
+        return np.asarray(unfit, np.uint8)
 
     seen = cv2.remap(unfit(sharp), place, None, cv2.INTER_NEAREST)
     return np.asarray(inside & (unfit(blurred) == 0) & (seen == 0))

@@ -18,7 +18,7 @@ frames counts once.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,38 +27,28 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from virest.camera.profile import CameraProfile
-from virest.capture.records import Capture, Frame
+from virest.capture.records import Capture
 from virest.diagnosis.findings import EDGES, Finding, HeldOutGain, ParameterChange, Rung
-from virest.diagnosis.local_blur import STILL_PX, frames_to_read, time_blocks
+from virest.diagnosis.isolated_steps import GRID_PX, IsolatedSteps, crossing
+from virest.diagnosis.local_blur import STILL_PX, look_for_steps, time_blocks
 from virest.diagnosis.local_blur_model import across, path_tensors
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader
 from virest.diagnosis.selection import EDGE_LEVELS
 from virest.image_formation.point_model import turned
 from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import student_tail
-from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
+from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
 
-REACH_PX, STEP_PX = 9.0, 0.5
-PLATEAU_PX = 5.0
-"""Beyond this a profile must be flat; an unsharp mask of 2 px has faded by then."""
-MAX_PLATEAU_RMS = 0.04
-"""Of the plateaus about their levels, as part of the step."""
-MIN_STEP_LEVELS = 30.0
-UNCLIPPED_LEVELS = (6.0, 249.0)
-MAX_OFF_PX = 1.0
-"""Between a crest of the slope and the middle of its step."""
 SHARPEST = 0.4
 """Part of the edges, the sharpest, that the mask's values come from: a soft step overshoots less."""
 MIN_USED = 60
 PLACE_PX, PLACE_GROUPS = 20.0, 16
 """Edges whose directions in the world fall into one cell of this side, at the lens's focal length, show one place; and
 how many groups of places the deviation is drawn from, each left out in turn."""
-GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
 RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
 """Of phones' unsharp masks, and how far it varies (in the logarithm): 0.8 to 2 px."""
 AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
@@ -119,11 +109,21 @@ class Sharpening:
         return student_tail(self.z, BARE_CAPTURES - 1)
 
 
-def judge_sharpening(capture: Capture, profile: CameraProfile, trajectory: Trajectory, gray: Reader) -> PictureVerdict:
-    """Name the sharpening, where edges overshoot by more than coding alone makes them."""
+def judge_sharpening(
+    capture: Capture,
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    gray: Reader,
+    each: ParallelMap = one_by_one,
+    steps: IsolatedSteps | None = None,
+) -> PictureVerdict:
+    """Name the sharpening, where edges overshoot by more than coding alone makes them.
+
+    steps: of the frames of :func:`frames_to_read`, where they have been seen already.
+    """
     verdict = PictureVerdict(profile)
-    wanted = frames_to_read(capture)
-    found = fit_sharpening(observe_profiles(gray(wanted), capture.frames, profile, trajectory)) if wanted else None
+    seen = look_for_steps(gray, capture, each) if steps is None else steps
+    found = fit_sharpening(edge_profiles(seen, profile, trajectory)) if len(seen) else None
     if found is None:
         verdict.notes.append("too few sharp, isolated edges: sharpening was not judged")
     elif EDGE_LEVELS.significant(found.p_value):
@@ -138,28 +138,15 @@ def judge_sharpening(capture: Capture, profile: CameraProfile, trajectory: Traje
     return verdict
 
 
-def observe_profiles(
-    pictures: Stream, frames: Sequence[Frame], profile: CameraProfile, trajectory: Trajectory
-) -> EdgeProfiles:
-    """Profiles of a stream of (movie index, grey (h, w)), in grey levels, for sharpening follows the curve."""
-    found, stamps, ways = [np.zeros((0, len(GRID_PX)))], [np.zeros(0)], [np.zeros((0, 3))]
+def edge_profiles(steps: IsolatedSteps, profile: CameraProfile, trajectory: Trajectory) -> EdgeProfiles:
+    """The steps that hardly moved, in grey levels, for sharpening follows the curve."""
     clock, lens = RowClock(profile), profile.intrinsics
     assert lens is not None
-    for index, picture in pictures:
-        frame = frames[index]
-        if picture is None or not frame.exposure_s:
-            continue
-        points, normals = find_edges(picture, EdgeSettings())
-        count = np.ones(len(points))
-        tensors = path_tensors(frame.time_s * count, frame.exposure_s * count, points, profile, trajectory)
-        still = np.sqrt(across(tensors, normals)) < STILL_PX
-        points, normals = points[still], normals[still]
-        profiles, kept = _isolated(parallel_profiles(picture, points, normals, _ALONG_PX))
-        seen_s = clock.seen_s(points[kept], frame.time_s, frame.exposure_s)
-        found.append(profiles)
-        ways.append(turned(trajectory.orientation(seen_s), lens.rays(points[kept])))
-        stamps.append(np.full(len(profiles), frame.time_s))
-    return _measured(np.concatenate(found), np.concatenate(stamps), _places(np.concatenate(ways), lens.fx_px))
+    tensors = path_tensors(steps.stamp_s, steps.exposure_s, steps.points_px, profile, trajectory)
+    steps = steps.chosen(np.sqrt(across(tensors, steps.normal)) < STILL_PX)
+    seen_s = clock.seen_s(steps.points_px, steps.stamp_s, steps.exposure_s)
+    ways = turned(trajectory.orientation(seen_s), lens.rays(steps.points_px))
+    return _measured(steps.profile, steps.stamp_s, _places(ways, lens.fx_px))
 
 
 def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
@@ -206,56 +193,15 @@ def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-_ALONG_PX = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-
-
-def _isolated(levels: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Steps between two flat plateaus, as part of their height, middle at 0: (n, m) on GRID_PX; and which they are."""
-    low, high = UNCLIPPED_LEVELS
-    kept = np.flatnonzero((levels.min(axis=1) > low) & (levels.max(axis=1) < high))
-    levels = levels[kept]
-    dark, bright = _ALONG_PX <= -PLATEAU_PX, _ALONG_PX >= PLATEAU_PX
-    ends = [np.median(levels[:, side], axis=1) for side in (dark, bright)]
-    step = ends[1] - ends[0]
-    part = (levels - ends[0][:, None]) / np.maximum(step, 1e-3)[:, None]
-    rms = [np.sqrt(np.mean((part[:, side] - end) ** 2, axis=1)) for side, end in ((dark, 0.0), (bright, 1.0))]
-    once = (np.diff((part >= 0.5).astype(np.int8), axis=1) != 0).sum(axis=1) == 1
-    flat = (step > MIN_STEP_LEVELS) & (np.maximum(*rms) < MAX_PLATEAU_RMS) & once
-    part, kept = part[flat], kept[flat]
-    middle = _crossing(part, 0.5, _ALONG_PX)
-    centred = np.abs(middle) < MAX_OFF_PX
-    return _moved(part[centred], middle[centred]), kept[centred]
-
-
 def _places(ways: Array, focal_px: float) -> NDArray[np.intp]:
     """Number (n,) of the place in the world that each direction (n, 3) goes to."""
     cell = np.floor(ways / np.linalg.norm(ways, axis=-1, keepdims=True) * focal_px / PLACE_PX)
     return np.unique(cell, axis=0, return_inverse=True)[1].ravel()
 
 
-def _moved(part: Array, middle: Array) -> Array:
-    """Profiles with their middles at 0, on GRID_PX, linear between samples."""
-    at = (GRID_PX + middle[:, None] - _ALONG_PX[0]) / STEP_PX
-    index = np.clip(at.astype(np.intp), 0, len(_ALONG_PX) - 2)
-    share = at - index
-    rows = np.arange(len(part))[:, None]
-    return np.asarray(part[rows, index] * (1 - share) + part[rows, index + 1] * share)
-
-
-def _crossing(part: Array, level: float, along_px: Array) -> Array:
-    """(n,) where profiles first rise to a level, linear between samples."""
-    if not len(part):
-        return np.zeros(0)
-    after = np.maximum(np.argmax(part >= level, axis=1), 1)
-    rows = np.arange(len(part))
-    below, above = part[rows, after - 1], part[rows, after]
-    share = np.clip((level - below) / np.where(above > below, above - below, 1.0), 0.0, 1.0)
-    return np.asarray(along_px[after - 1] + share * (along_px[1] - along_px[0]))
-
-
 def _measured(profiles: Array, stamp_s: Array, place: NDArray[np.intp]) -> EdgeProfiles:
     near = np.abs(GRID_PX) <= 3.0
-    width = _crossing(profiles[:, near], 0.84, GRID_PX[near]) - _crossing(profiles[:, near], 0.16, GRID_PX[near])
+    width = crossing(profiles[:, near], 0.84, GRID_PX[near]) - crossing(profiles[:, near], 0.16, GRID_PX[near])
     return EdgeProfiles(profiles, 0.5 * width, stamp_s, place)
 
 

@@ -6,6 +6,7 @@ A cause with a word for a value (a direction, a stamp's meaning) is tried word b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,10 @@ class GeometricEffect:
     effect: Effect
     term: Term | None
     """None: nothing continuous to fit (a word)."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To another process goes the name: both have the table."""
+        return geometric_effect, (self.name,)
 
     @property
     def name(self) -> str:
@@ -55,3 +60,11 @@ class GeometricEffect:
 GEOMETRIC_EFFECTS = tuple(
     GeometricEffect(effect, TERMS.get(effect.name)) for effect in EFFECTS.values() if effect.in_points
 )
+
+
+def geometric_effect(name: str) -> GeometricEffect:
+    """The cause of this name; KeyError: none is called so."""
+    return _BY_NAME[name]
+
+
+_BY_NAME = {effect.name: effect for effect in GEOMETRIC_EFFECTS}

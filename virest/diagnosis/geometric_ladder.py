@@ -147,8 +147,11 @@ def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdic
 
     Which of the two was reached first may depend on rounding; which is told must not.  Where the blocks do not tell, it
     is the end with fewer causes; of equally many, the one with the lower held-out loss; where that differs by less than
-    EVEN_T standard errors, so that rounding may change the order, the names decide.
+    EVEN_T standard errors, so that rounding may change the order, the names decide.  Of two with the same causes, which
+    differ by where their fits ended, it is the first.
     """
+    if {entry.name for entry in first.accepted} == {entry.name for entry in second.accepted}:
+        return first
     ends = [
         Screened(Candidate("", end.model, (), None), (end.model, end.model), (0.0, 0.0), end.fit.scale, 0.0)
         for end in (first, second)

@@ -53,7 +53,7 @@ from virest.errors import CaptureError
 from virest.image_formation.point_model import predict
 from virest.inference.guide_choice import find_guide, track_guided
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
-from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.parallel import Background, ParallelMap, begun, one_by_one
 from virest.inference.recorder_lag import lag_schedules
 from virest.inference.tracking import track_pairs
 from virest.motion.integration import integrate_gyro
@@ -85,6 +85,7 @@ def diagnose_capture(
     first = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
     story = DiagnosisSession(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each)
     story.kept_back = frozenset(kept_back)
+    story.begin_description()
     say("brightness", 0.5)
     story.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
     say("blur", 0.75)
@@ -156,6 +157,8 @@ class DiagnosisSession:
     each: ParallelMap = one_by_one
     kept_back: frozenset[int] = frozenset()
     """Movie indices of frames that only brightness is to see."""
+    _asks_unlit: Callable[[], bool] | None = None
+    """Whether the points of the first verdict ask for fields, if light does not pulse; None: nobody has looked."""
 
     @property
     def frames(self) -> list[Frame]:
@@ -171,6 +174,20 @@ class DiagnosisSession:
         """Every frame, by movie index; those that cannot be looked at without an exposure."""
         usable = {frame.index: frame for frame in self.frames_to_fit}
         return tuple(usable.get(frame.index, replace(frame, exposure_s=None)) for frame in self.capture.frames)
+
+    def begin_description(self) -> None:
+        """Have another process look for fields meanwhile: of the light, lamps' pulses alone make a difference."""
+        if isinstance(self.each, Background) and not self.first.fields:
+            points = replace(self.points, each=one_by_one)
+            self._asks_unlit = begun(self.each, _asks_for_fields, points, self.first)
+
+    def _described(self, lit: CameraProfile) -> GeometricVerdict:
+        """The verdict of the points with the fields that they ask for under this light."""
+        own = self.geometric.model.profile
+        same = self.geometric is self.first and pulsing(own, lit) == own
+        if same and self._asks_unlit is not None and not self._asks_unlit():
+            return self.geometric
+        return self.points.described(self.geometric, lit)
 
     def judge_light(
         self, pictures: Reader, gray: Reader, given: CameraProfile, progress: Callable[[float], None]
@@ -190,7 +207,7 @@ class DiagnosisSession:
                 self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
             )
             self.geometric = self.points.climbed(progress)
-        self.geometric = self.points.described(self.geometric, self.light.profile)
+        self.geometric = self._described(self.light.profile)
         self.findings = offset_as_timestamp(
             self.geometric, findings_of(self.geometric), self.points.observed.exposure_s
         )
@@ -246,9 +263,11 @@ class DiagnosisSession:
 
     def judge_edges(self, gray: Reader) -> None:
         """What the phone did to its edges; no blur overshoots, so the paths need not be right."""
+        assert self.blur is not None
         assert self.curve is not None
         shown, extended = replace(self.capture, frames=self._all_frames()), self.curve.profile
-        self.edges = judge_sharpening(shown, extended, integrate_gyro(self.capture.imu, extended), gray)
+        trajectory = integrate_gyro(self.capture.imu, extended)
+        self.edges = judge_sharpening(shown, extended, trajectory, gray, self.each, self.blur.steps)
 
     def told(self) -> Diagnosis:
         """The verdict, with everything that led to it."""
@@ -298,6 +317,10 @@ class DiagnosisSession:
             (*self.notes, *self.geometric.notes, *(note for look in looks for note in look.notes)),
             tuple(fields),
         )
+
+
+def _asks_for_fields(points: TrackedPoints, found: GeometricVerdict) -> bool:
+    return bool(points.described(found, found.model.profile).fields)
 
 
 def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> bool:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
+from virest.diagnosis.isolated_steps import IsolatedSteps, isolated_steps, join_steps
 from virest.diagnosis.local_blur_edges import EdgeWidths, join_edges, observe_picture
 from virest.diagnosis.local_blur_model import (
     across,
@@ -41,7 +42,7 @@ from virest.diagnosis.local_blur_spectra import (
     ring_of_bin,
 )
 from virest.image_formation.light import defocus_px
-from virest.inference.edges import EdgeSettings
+from virest.inference.edges import EdgeSettings, find_edges
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 from virest.inference.time_blocks import even_blocks
@@ -92,6 +93,8 @@ class BlurObservations:
     """Those of them that are isolated steps."""
     bits_per_px: float = inf
     """What the encoder spent on a pixel."""
+    steps: IsolatedSteps | None = None
+    """Of the same pictures, in grey levels; None: not looked for."""
 
     def __len__(self) -> int:
         return len(self.edges) + int(self.valid.sum())
@@ -157,20 +160,41 @@ def look_for_blur(
 ) -> BlurObservations:
     """Measure the frames of :func:`frames_to_read` of a capture, part by part; the same as in one stream of them."""
     wanted, curve = frames_to_read(capture), profile.response or ResponseCurve("srgb")
-    parts = np.array_split(np.array(wanted, np.intp), PARTS)
-    early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if len(part) else [] for part in parts]
-    calls = [
-        (gray, [*lead, *part.tolist()], len(lead), capture.frames, curve)
-        for lead, part in zip(early, parts, strict=True)
-    ]
+    parts = _parts(wanted)
+    early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if part else [] for part in parts]
+    calls = [(gray, [*lead, *part], len(lead), capture.frames, curve) for lead, part in zip(early, parts, strict=True)]
     seen = each(_measured_part, calls)
-    edges, pairs = ([one for part in seen for one in part[kind]] for kind in (0, 1))
-    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
+    edges, pairs, steps = ([one for part in seen for one in part[kind]] for kind in range(3))
+    found = _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
+    return replace(found, steps=join_steps(steps))
+
+
+def look_for_steps(
+    gray: Callable[[Sequence[int]], Stream], capture: Capture, each: ParallelMap = one_by_one
+) -> IsolatedSteps:
+    """The isolated steps of the frames of :func:`frames_to_read`, as :func:`look_for_blur` sees them."""
+    parts = _parts(frames_to_read(capture))
+    seen = each(_steps_of_part, [(gray, part, capture.frames) for part in parts])
+    return join_steps([one for part in seen for one in part])
+
+
+def _parts(wanted: Sequence[int]) -> list[list[int]]:
+    return [part.tolist() for part in np.array_split(np.array(wanted, np.intp), PARTS)]
+
+
+def _steps_of_part(
+    gray: Callable[[Sequence[int]], Stream], wanted: list[int], frames: Sequence[Frame]
+) -> list[IsolatedSteps]:
+    return [
+        isolated_steps(picture, frames[index], *find_edges(picture, EdgeSettings()))
+        for index, picture in gray(wanted)
+        if picture is not None and frames[index].exposure_s
+    ]
 
 
 def _measured_part(
     gray: Callable[[Sequence[int]], Stream], wanted: list[int], lead: int, frames: Sequence[Frame], curve: ResponseCurve
-) -> tuple[list[EdgeWidths], list[SpectrumRatios]]:
+) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
     return _measured(gray(wanted), frames, curve, EdgeSettings(), frozenset(wanted[:lead]))
 
 
@@ -187,27 +211,30 @@ def observe_blur(
     the frequencies that motion leaves above the noise.
     """
     curve = profile.response or ResponseCurve("srgb")
-    edges, pairs = _measured(pictures, capture.frames, curve, settings or EdgeSettings(), frozenset())
+    edges, pairs, _ = _measured(pictures, capture.frames, curve, settings or EdgeSettings(), frozenset())
     return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
 
 
 def _measured(
     pictures: Stream, frames: Sequence[Frame], curve: ResponseCurve, settings: EdgeSettings, only_paired: frozenset[int]
-) -> tuple[list[EdgeWidths], list[SpectrumRatios]]:
-    """Edges of all pictures but some, and spectra of all pairs of them."""
+) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
+    """Edges and steps of all pictures but some, and spectra of all pairs of them."""
     edges: list[EdgeWidths] = []
+    steps: list[IsolatedSteps] = []
     pairs: list[SpectrumRatios] = []
     kept: dict[int, SeenFrame] = {}
     for index, picture in pictures:
         if picture is None or not frames[index].exposure_s:
             continue
         if index not in only_paired:
-            edges.append(observe_picture(picture, frames[index], curve, settings))
+            found = find_edges(picture, settings)
+            edges.append(observe_picture(picture, frames[index], curve, settings, found))
+            steps.append(isolated_steps(picture, frames[index], *found))
         kept[index] = SeenFrame(picture, _recent(frames, index))
         if index - PAIR_FRAMES in kept and index not in only_paired:
             pairs.append(observe_pair(kept[index - PAIR_FRAMES], kept[index], curve))
         kept = {k: seen for k, seen in kept.items() if k > index - PAIR_FRAMES}
-    return edges, pairs
+    return edges, pairs, steps
 
 
 def _recent(frames: Sequence[Frame], index: int) -> tuple[Frame, ...]:

@@ -79,9 +79,15 @@ def join_edges(parts: Sequence[EdgeWidths]) -> EdgeWidths:
     return EdgeWidths(**rows, candidates=sum(part.candidates for part in parts))
 
 
-def observe_picture(picture: Picture, frame: Frame, curve: ResponseCurve, settings: EdgeSettings) -> EdgeWidths:
-    """Widths of the isolated edges of one picture."""
-    points, normals = find_edges(picture, settings)
+def observe_picture(
+    picture: Picture,
+    frame: Frame,
+    curve: ResponseCurve,
+    settings: EdgeSettings,
+    found: tuple[Array, Array] | None = None,
+) -> EdgeWidths:
+    """Widths of the isolated edges of one picture; found: its edges, where :func:`find_edges` has given them."""
+    points, normals = find_edges(picture, settings) if found is None else found
     grey = _profiles(picture.astype(np.float32), points, normals)
     light = _profiles(curve.linear_table()[picture], points, normals)
     fit = measure_widths(light, settings.max_misfit)

@@ -27,6 +27,8 @@ _NODES = 4
 _INSTANTS = 5
 """Of an exposure (Gauss-Legendre): exact for paths that bend like a fourth-order polynomial."""
 _RATIOS = np.linspace(0.0, 6.0, 25)
+LEAST_ANGLE = 1e-3
+"""Below it sin q / q is 1 to single precision."""
 
 
 def fitted_width(motion_px: Array, defocus_px: Array | float, lens_px: float) -> Array:
@@ -89,7 +91,8 @@ def across(tensors: Array, direction: Array) -> Array:
 def transfers(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory) -> Array:
     """|K|² of each tile's two frames and of those before them, as the bins see it: (n, 2, MEMORY, b).
 
-    A straight path's |K|² = (sin q / q)² with q² = 3 (2π)² f' Σ f.
+    A straight path's |K|² = (sin q / q)² with q² = 3 (2π)² f' Σ f.  In single precision: right to 1e-6, of what is
+    measured to some 1e-2.
     """
     points = np.broadcast_to(ratios.points_px[:, :, None], (len(ratios), 2, MEMORY, 2))
     tensors = path_tensors(
@@ -97,9 +100,11 @@ def transfers(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajec
     )
     frequency, weights = spectral_weights()
     x, y = frequency.T
-    form = np.maximum(tensors @ np.stack([x * x, 2 * x * y, y * y]), 0.0)
-    seen = np.sinc(2.0 * np.sqrt(3.0 * form)) ** 2 @ weights
-    return np.maximum(seen, 1e-6).reshape(len(ratios), 2, MEMORY, seen.shape[-1])
+    form = np.stack([x * x, 2 * x * y, y * y]) * (12 * np.pi**2)
+    angle = np.sqrt(np.maximum(tensors.astype(np.float32) @ form.astype(np.float32), LEAST_ANGLE**2))
+    amplitude = np.sin(angle) / angle
+    seen = (amplitude * amplitude) @ weights.astype(np.float32)
+    return np.maximum(seen, 1e-6).astype(float).reshape(len(ratios), 2, MEMORY, seen.shape[-1])
 
 
 def predicted_ratios(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory) -> Array:

@@ -25,6 +25,7 @@ from virest.diagnosis.curve_from_blur import (
     observe_mixing,
 )
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.isolated_steps import IsolatedSteps
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import (
     BlackLevel,
@@ -92,6 +93,8 @@ class PictureVerdict:
     blur_rms_px: float | None = None
     edges: local_blur.BlurObservations | None = None
     """Of blur: what was measured."""
+    steps: IsolatedSteps | None = None
+    """Of the pictures that blur was measured in; None: in none."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -381,6 +384,7 @@ def climb_blur(
         verdict.notes.append("no two frames with known exposures to compare: blur not judged")
         return verdict, False
     observations = local_blur.look_for_blur(gray, capture, profile, trajectory, each)
+    verdict.steps = observations.steps
     if len(observations) < local_blur.MIN_EDGES:
         verdict.notes.append("too little texture to measure local blur")
         return verdict, False

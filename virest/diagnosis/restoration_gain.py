@@ -92,7 +92,7 @@ class _Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class _Restoration:
+class PairsRestored:
     """What one profile makes of the frames, and what it says of their poses."""
 
     plan: RestorationPlan
@@ -141,16 +141,20 @@ def measure_restoration_gain(
     settings: RestorationSettings = PRESETS["balanced"],
     each: ParallelMap = one_by_one,
     firsts: Sequence[int] | None = None,
+    before: PairsRestored | None = None,
 ) -> RestorationGain:
     """Restore a few pairs of neighbours with both profiles and compare; pictures: RGB by index, gray: luma.
 
     firsts: the first frame of each pair, kept back from the fits that made the extended profile; None: any.
+    before: what :func:`restore_pairs` makes of them with the nominal profile, where that is done already.
     """
     firsts = chosen_pairs(capture, extended) if firsts is None else firsts
-    numbers = sorted({first + step for first in firsts for step in (0, 1)})
+    numbers = _frames_of(firsts)
     recorded = {index: picture for index, picture in pictures(numbers) if picture is not None}
-    profiles = [nominal] if extended == nominal else [nominal, extended]
-    restored = _restored(capture, profiles, recorded, gray, settings, each)
+    wanted = [] if before is not None else [nominal]
+    wanted += [] if extended == nominal else [extended]
+    restored = _restored(capture, wanted, recorded, gray, settings, each)
+    restored = restored if before is None else [before, *restored]
     before, after = restored[0], restored[-1]
     whole = (0, 0, capture.width, capture.height)
     sharp: dict[str, list[float]] = {"recorded": [], "before": [], "after": []}
@@ -178,6 +182,19 @@ def measure_restoration_gain(
         brightness_disagreement_after=_spread(light["after"]),
         frames=tuple(numbers),
     )
+
+
+def restore_pairs(
+    capture: Capture,
+    profile: CameraProfile,
+    firsts: Sequence[int],
+    pictures: Reader,
+    gray: Reader,
+    settings: RestorationSettings = PRESETS["balanced"],
+) -> PairsRestored:
+    """What one profile makes of pairs of neighbours: all of it in one call, for another process perhaps."""
+    recorded = {index: picture for index, picture in pictures(_frames_of(firsts)) if picture is not None}
+    return _restored(capture, [profile], recorded, gray, settings, one_by_one)[0]
 
 
 def chosen_pairs(capture: Capture, profile: CameraProfile) -> list[int]:
@@ -240,6 +257,11 @@ def shared_gradient(
     return max(product, 0.0) ** 2 / max(own, 1e-9) / int(common.sum())
 
 
+def _frames_of(firsts: Sequence[int]) -> list[int]:
+    """Both frames of each pair, rising."""
+    return sorted({first + step for first in firsts for step in (0, 1)})
+
+
 # ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -250,7 +272,7 @@ def _restored(
     gray: Reader,
     settings: RestorationSettings,
     each: ParallelMap,
-) -> list[_Restoration]:
+) -> list[PairsRestored]:
     """What each profile makes of the recorded frames."""
     planned = [_planned(capture, profile, gray, settings) for profile in profiles]
     asked = [
@@ -270,7 +292,7 @@ def _restored_one(frame: Frame, picture: Picture, imu: ImuSamples, plan: Restora
     return next(iter(restore_frames([(frame, picture)], imu, plan)), None)
 
 
-def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> _Restoration:
+def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> PairsRestored:
     """What a profile says of the frames, nothing restored yet."""
     plan = _plan(capture, profile, gray, settings)
     frames = {frame.index: frame for frame in at_true_times(capture.frames, plan.profile, capture.repeats)}
@@ -278,7 +300,7 @@ def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: R
     trajectory = integrate_gyro(capture.imu, plan.profile) if known else None
     lens = moving_lens(trajectory, plan.profile) if trajectory is not None else None
     guide = find_guide(capture, plan.profile, gray, [frame.index for frame in capture.frames])
-    return _Restoration(plan, frames, {}, trajectory, lens, guide)
+    return PairsRestored(plan, frames, {}, trajectory, lens, guide)
 
 
 def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> RestorationPlan:
@@ -347,7 +369,7 @@ def _slope(picture: NDArray[np.float32], across: int, down: int) -> NDArray[np.f
     return np.asarray(cv2.Sobel(picture, cv2.CV_32F, across, down, ksize=3, scale=1 / 8))
 
 
-def _distances(restoration: _Restoration, pair: _Pair, first: int) -> Array:
+def _distances(restoration: PairsRestored, pair: _Pair, first: int) -> Array:
     if restoration.lens is None or pair.tracks is None:
         return np.empty(0)
     put = restoration.predicted(pair.tracks.points_first_px, first, first + 1)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Protocol, runtime_checkable
 
 
 class ParallelMap(Protocol):
@@ -16,6 +17,25 @@ class ParallelMap(Protocol):
         done: Callable[[int], None] | None = None,
     ) -> list[Any]:
         """done: told the place of each call whose result is there, in order."""
+
+
+@runtime_checkable
+class Background(Protocol):
+    """A :class:`ParallelMap` that can also begin a call and go on."""
+
+    def begin(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        """Begin a call; what is returned waits for its result."""
+        ...
+
+
+def begun(each: ParallelMap, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """Begin a call of a module's function with plain arguments beside what this process does next; ask for its result.
+
+    Where there is no other process it is made when its result is asked for, and never if that is not wanted.
+    """
+    if isinstance(each, Background):
+        return each.begin(function, *arguments)
+    return partial(function, *arguments)
 
 
 def one_by_one(

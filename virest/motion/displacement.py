@@ -36,12 +36,17 @@ class Displacement:
     arm_cam_m: Array
     """(3,) the IMU's origin in camera axes."""
 
-    def at(self, time_s: Array, origin_s: Array) -> tuple[Array, Array, Array]:
-        """Compute P (n, 3), B (n, 3, 3) and the change per delay (n, 3), all from rest at origin_s (n,)."""
+    def at(self, time_s: Array, origin_s: Array, window: NDArray[np.intp] | None = None) -> tuple[Array, Array, Array]:
+        """Compute P (n, 3), B (n, 3, 3) and the change per delay (n, 3), all from rest at origin_s (w,) of each window.
+
+        window: (n,) number of each time's; None: each time has its own.
+        """
+        window = np.arange(len(time_s)) if window is None else window
+        arm = self._arm(time_s) - self._arm(origin_s)[window] if self.arm_cam_m.any() else 0.0
         return (
-            self._from_rest(self.path, time_s, origin_s) + self._arm(time_s) - self._arm(origin_s),
-            self._from_rest(self.per_bias, time_s, origin_s).reshape(-1, 3, 3),
-            self._from_rest(self.per_delay, time_s, origin_s),
+            self._from_rest(self.path, time_s, origin_s, window) + arm,
+            self._from_rest(self.per_bias, time_s, origin_s, window).reshape(-1, 3, 3),
+            self._from_rest(self.per_delay, time_s, origin_s, window),
         )
 
     def acceleration(self, time_s: Array) -> Array:
@@ -49,14 +54,12 @@ class Displacement:
         return np.asarray(self.path(time_s, 2))
 
     @staticmethod
-    def _from_rest(spline: CubicHermiteSpline, time_s: Array, origin_s: Array) -> Array:
-        moved = spline(time_s) - spline(origin_s) - spline(origin_s, 1) * (time_s - origin_s)[:, None]
-        return np.asarray(moved)
+    def _from_rest(spline: CubicHermiteSpline, time_s: Array, origin_s: Array, window: NDArray[np.intp]) -> Array:
+        begun, speed = spline(origin_s)[window], spline(origin_s, 1)[window]
+        return np.asarray(spline(time_s) - begun - speed * (time_s - origin_s[window])[:, None])
 
     def _arm(self, time_s: Array) -> Array:
         """Camera's centre seen from the IMU, world axes: −R_world_cam p_cam_imu."""
-        if not self.arm_cam_m.any():
-            return np.zeros(3)
         return -np.squeeze(self.trajectory.orientation(time_s) @ self.arm_cam_m[:, None], -1)
 
 

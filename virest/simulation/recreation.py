@@ -22,7 +22,7 @@ from virest.errors import CaptureError, SettingsError
 from virest.simulation.auto_exposure import NOMINAL_ISO, Exposures
 from virest.simulation.exposure import View, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion
-from virest.simulation.hidden import NOTHING, Hidden, focal_scale, seen_radius_px
+from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale, seen_radius_px
 from virest.simulation.recorded_motion import recorded_motion
 from virest.simulation.scenes import MAX_CHART_PX, Scene
 from virest.simulation.sensor import sensor_light
@@ -231,6 +231,8 @@ def _pixels(view: View, rays: Array, time_s: float) -> Array:
         pitch, yaw = (np.interp(time_s, view.filter_s, view.filter_rad[:, i]) for i in (0, 1))
         plane = plane + profile.extensions.stabilisation_fraction * np.array([yaw, -pitch])
     pixels = lens.project(np.concatenate([plane, np.ones_like(plane[..., :1])], -1))
+    if not focal_changes(profile, view.hidden):
+        return pixels
     centre, seen = np.array([lens.cx_px, lens.cy_px]), pixels
     for _ in range(_RADIUS_STEPS):
         radius_px = seen_radius_px(profile, seen[..., 0], seen[..., 1])

@@ -1,0 +1,102 @@
+"""Profiles across isolated steps of pictures, in grey levels: what pictures alone tell of what was done to edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.capture.records import Frame
+from virest.inference.edges import parallel_profiles
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+REACH_PX, STEP_PX = 9.0, 0.5
+PLATEAU_PX = 5.0
+"""Beyond this a profile must be flat; an unsharp mask of 2 px has faded by then."""
+MAX_PLATEAU_RMS = 0.04
+"""Of the plateaus about their levels, as part of the step."""
+MIN_STEP_LEVELS = 30.0
+UNCLIPPED_LEVELS = (6.0, 249.0)
+MAX_OFF_PX = 1.0
+"""Between a crest of the slope and the middle of its step."""
+GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
+_ALONG_PX = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
+
+
+@dataclass(frozen=True, slots=True)
+class IsolatedSteps:
+    """Steps between two flat plateaus, one row a step, of pictures one after another."""
+
+    profile: Array
+    """(n, m) on GRID_PX, dark to bright, 0 and 1 at the plateaus, 0.5 at the middle."""
+    points_px: Array
+    """(n, 2) the crest of the slope."""
+    normal: Array
+    """(n, 2) unit normal, from dark to bright."""
+    stamp_s: Array
+    """(n,) the frame's stamp, camera clock."""
+    exposure_s: Array
+    """(n,) as logged."""
+
+    def __len__(self) -> int:
+        return len(self.profile)
+
+    def chosen(self, rows: NDArray[np.bool_]) -> IsolatedSteps:
+        """Some of them."""
+        return IsolatedSteps(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+def join_steps(parts: Sequence[IsolatedSteps]) -> IsolatedSteps:
+    """Those of several pictures."""
+    if not parts:
+        return IsolatedSteps(np.zeros((0, len(GRID_PX))), *(np.zeros((0, 2)) for _ in range(2)), *np.zeros((2, 0)))
+    return IsolatedSteps(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(IsolatedSteps)))
+
+
+def isolated_steps(picture: Picture, frame: Frame, points_px: Array, normals: Array) -> IsolatedSteps:
+    """The isolated ones among a picture's edges (n, 2), (n, 2), as `find_edges` gives them; frame: with an exposure."""
+    profile, kept = _isolated(parallel_profiles(picture, points_px, normals, _ALONG_PX))
+    times = ((time_s or 0.0) * np.ones(len(kept)) for time_s in (frame.time_s, frame.exposure_s))
+    return IsolatedSteps(profile, points_px[kept], normals[kept], *times)
+
+
+def crossing(part: Array, level: float, along_px: Array) -> Array:
+    """(n,) where profiles first rise to a level, linear between samples."""
+    if not len(part):
+        return np.zeros(0)
+    after = np.maximum(np.argmax(part >= level, axis=1), 1)
+    rows = np.arange(len(part))
+    below, above = part[rows, after - 1], part[rows, after]
+    share = np.clip((level - below) / np.where(above > below, above - below, 1.0), 0.0, 1.0)
+    return np.asarray(along_px[after - 1] + share * (along_px[1] - along_px[0]))
+
+
+def _isolated(levels: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Steps between two flat plateaus, as part of their height, middle at 0: (n, m) on GRID_PX; and which they are."""
+    low, high = UNCLIPPED_LEVELS
+    kept = np.flatnonzero((levels.min(axis=1) > low) & (levels.max(axis=1) < high))
+    levels = levels[kept]
+    dark, bright = _ALONG_PX <= -PLATEAU_PX, _ALONG_PX >= PLATEAU_PX
+    ends = [np.median(levels[:, side], axis=1) for side in (dark, bright)]
+    step = ends[1] - ends[0]
+    part = (levels - ends[0][:, None]) / np.maximum(step, 1e-3)[:, None]
+    rms = [np.sqrt(np.mean((part[:, side] - end) ** 2, axis=1)) for side, end in ((dark, 0.0), (bright, 1.0))]
+    once = (np.diff((part >= 0.5).astype(np.int8), axis=1) != 0).sum(axis=1) == 1
+    flat = (step > MIN_STEP_LEVELS) & (np.maximum(*rms) < MAX_PLATEAU_RMS) & once
+    part, kept = part[flat], kept[flat]
+    middle = crossing(part, 0.5, _ALONG_PX)
+    centred = np.abs(middle) < MAX_OFF_PX
+    return _moved(part[centred], middle[centred]), kept[centred]
+
+
+def _moved(part: Array, middle: Array) -> Array:
+    """Profiles with their middles at 0, on GRID_PX, linear between samples."""
+    at = (GRID_PX + middle[:, None] - _ALONG_PX[0]) / STEP_PX
+    index = np.clip(at.astype(np.intp), 0, len(_ALONG_PX) - 2)
+    share = at - index
+    rows = np.arange(len(part))[:, None]
+    return np.asarray(part[rows, index] * (1 - share) + part[rows, index + 1] * share)
