@@ -254,7 +254,7 @@ def predict(
         expected = known.lens.project(rays, poses.second_s)
         if scene is None:
             return Prediction(expected, poses, sights=sights)
-        per_step = lens_slope(known, rays, poses.second_s, expected) @ poses.back
+        per_step = _lens_slope(known, rays, poses.second_s, expected) @ poses.back
         step = scene.direction[scene.group(table.pair)]
         along = np.squeeze(per_step @ step[..., None], -1)
         return Prediction(expected, poses, along, per_step=per_step, sights=sights)
@@ -276,7 +276,7 @@ def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sig
     return Sightings(lens.lens, lens.lens.rays(table.first_px))
 
 
-def lens_slope(known: IntegratedMotion, rays: Array, second_s: Array, expected: Array) -> Array:
+def _lens_slope(known: IntegratedMotion, rays: Array, second_s: Array, expected: Array) -> Array:
     """Change (n, 2, 3) of pixels per unit of each part of rays (n, 3)."""
     steps = (known.lens.project(rays + RAY_STEP * axis, second_s) for axis in np.eye(3))
     return np.stack([(step - expected) / RAY_STEP for step in steps], axis=-1)
@@ -350,7 +350,7 @@ def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Move
         return Prediction(
             expected, poses, (known.lens.project(ahead, second_s) - expected) / RAY_STEP, None, moved
         )  # fmt: skip
-    per_world = lens_slope(known, rays, second_s, expected) @ back
+    per_world = _lens_slope(known, rays, second_s, expected) @ back
     along = np.squeeze(per_world @ moved.step[..., None], -1)
     return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict, with_profile
-from virest.image_formation.point_slopes import TurningSlopes
 from virest.inference.descent import Slopes, System, slices
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.term import Term, slopes_of
@@ -110,11 +109,8 @@ class TrackEvidence:
 
     def _term_slopes(self, state: State, at: Prediction) -> Array:
         """(n, 2, k) change of the predicted points per unit of each term's values."""
-        turning = TurningSlopes(self.imu, state.known, self.table, at) if state.scene is None else None
 
         def moved_by(profile: CameraProfile) -> Array:
-            if turning is not None and (by := turning.moved_by(profile)) is not None:
-                return by
             moved = with_profile(state.known, self.imu, profile)
             return predict(moved, self.table, state.scene, like=at).second_px - at.second_px
 

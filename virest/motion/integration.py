@@ -21,18 +21,12 @@ def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRa
     exactly as far as it goes.  measured: what :func:`measured_rate` says, where that is known already.  A low
     pass of the profile is undone.  Raises ImuError if fewer than two samples are given.
     """
-    polynomials = true_rate(imu, profile, measured)
-    steps = rotation_from_vector(turned_angle(polynomials, np.diff(imu.time_s)).T)
-    return Trajectory(imu.time_s, _running_product(steps), polynomials)
-
-
-def true_rate(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRate | None = None) -> Array:
-    """What :func:`integrate_gyro` integrates: rates in camera axes, pieces (4, 3, n − 1), highest power first."""
     polynomials = _camera_rate(measured or measured_rate(imu), profile)
     if (missing := missing_rate_rad_s(imu, profile)) is not None:
         polynomials[2] += profile.rotation_cam_imu @ (np.diff(missing, axis=0).T / np.diff(imu.time_s))
         polynomials[3] += profile.rotation_cam_imu @ missing[:-1].T
-    return polynomials
+    steps = rotation_from_vector(turned_angle(polynomials, np.diff(imu.time_s)).T)
+    return Trajectory(imu.time_s, _running_product(steps), polynomials)
 
 
 def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:

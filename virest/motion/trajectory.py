@@ -33,19 +33,19 @@ class Trajectory:
 
     def rate_rad_s(self, time_s: Any) -> Array:
         """Camera-frame angular rate (..., 3) at times (...)."""
-        interval, since = self.locate(np.asarray(time_s, float))
+        interval, since = self._locate(np.asarray(time_s, float))
         a, b, c, d = self.rate_polynomials.take(interval, axis=2)
         return _vectors(((a * since + b) * since + c) * since + d)
 
     def angular_acceleration_rad_s2(self, time_s: Any) -> Array:
         """Change of the camera-frame rate (..., 3) at times (...)."""
-        interval, since = self.locate(np.asarray(time_s, float))
+        interval, since = self._locate(np.asarray(time_s, float))
         a, b, c = self.rate_polynomials[:3].take(interval, axis=2)
         return _vectors((3 * a * since + 2 * b) * since + c)
 
     def orientation(self, time_s: Any) -> Array:
         """R_world_cam (..., 3, 3) at times (...)."""
-        interval, since = self.locate(np.asarray(time_s, float))
+        interval, since = self._locate(np.asarray(time_s, float))
         angle = turned_angle(self.rate_polynomials.take(interval, axis=2), since)
         return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*angle))
 
@@ -54,7 +54,7 @@ class Trajectory:
 
         The two turns since the knot are put together as exp(u) exp(v) ≈ exp(u + v + ½ u × v): v is some 1e-4 rad.
         """
-        interval, since = self.locate(middle_s)
+        interval, since = self._locate(middle_s)
         pieces = self.rate_polynomials.take(interval, axis=2)
         angle = turned_angle(pieces, since)
         a, b, c, _ = pieces
@@ -62,7 +62,7 @@ class Trajectory:
         both = angle + bend + 0.5 * _cross(angle, bend)
         return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*both))
 
-    def locate(self, time_s: Array) -> tuple[NDArray[np.intp], Array]:
+    def _locate(self, time_s: Array) -> tuple[NDArray[np.intp], Array]:
         """Interval of each time (...), and the seconds since its knot (...). Outside the knots the ends are held."""
         held = np.clip(time_s, self.time_s[0], self.time_s[-1])
         interval = np.clip(np.searchsorted(self.time_s, held, side="right") - 1, 0, len(self.time_s) - 2)
