@@ -27,6 +27,8 @@ LEAD_FRAMES = 2
 CORNER_BLOCK_PX = 5
 CORNER_SPACING_PX = 7
 """A corner is the strongest of a square of this side."""
+OUTSIDE_PX = 1e6
+"""Outside of any picture, and finite: where a lens's terms grow without bound they put points anywhere."""
 REPEATS = 1.9
 """Two patches that differ by noise alone, of some 100 independent pixels, differ by up to this ratio of their squared
 differences but for one in 1000 (F distribution)."""
@@ -241,7 +243,7 @@ def _guided(
     The first picture is compared as the guide carries it into the second, turned and sheared.  A point found far from
     where it was put does not count where the carried picture shows the same there: texture that repeats.
     """
-    put = between.second_of(start.astype(float)).astype(np.float32)
+    put = np.clip(between.second_of(start.astype(float)), -OUTSIDE_PX, OUTSIDE_PX).astype(np.float32)
     carried, evened = between.carried(first), between.evened(second)
     ahead, good, distance = put.copy(), np.zeros(len(put), bool), np.zeros(len(put), np.float32)
     guided, plain = (carried, evened, put, settings.guided_levels), (first, second, start, settings.pyramid_levels)
