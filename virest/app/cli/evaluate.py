@@ -59,11 +59,11 @@ def shutter(
     $ virest evaluate shutter
     CASE A, rolling shutter: 50 frames of 5 captures, ...
     method                 mean  spread     max  relative %  angles
-    none                 1.6640  1.9542  3.9686      1.8513     200
-    schubert2018         0.3411  0.4458  1.7406      0.3799     200
-    perspective          0.5058  0.6177  1.2698      0.5603     200
+    none                 1.6641  1.9543  3.9687      1.8514     200
+    schubert2018         0.3409  0.4457  1.7406      0.3798     200
+    perspective          0.5059  0.6177  1.2699      0.5605     200
     rowwise-rotation     0.2372  0.3979  1.0131      0.2637     200
-    rowwise              0.0092  0.0115  0.0354      0.0102     200
+    rowwise              0.0092  0.0115  0.0348      0.0102     200
     ...
     $ virest simulate wall --scene board --rate 2 --exposure-ms 1
     $ virest evaluate shutter wall --json | jq .all.methods.rowwise.outer
@@ -109,9 +109,9 @@ def deblur(
     $ virest evaluate deblur
     CASE B, motion blur: 12 frames, ...
     method                          MSE  PSNR dB    SSIM  matches  in place
-    blurred                       606.2    20.30  0.7464      195       170
-    skimage richardson_lucy       358.9    22.58  0.7597      307       277
-    virest balanced                87.9    28.69  0.9200      720       673
+    blurred                       606.2    20.30  0.7464      196       170
+    skimage richardson_lucy       359.0    22.58  0.7595      307       277
+    virest balanced                87.8    28.70  0.9206      728       683
     ...
     $ virest evaluate deblur --over-time
     $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames
