@@ -72,7 +72,8 @@ class KernelField:
         """The field of some of the tiles."""
         light = None if self.light is None else self.light[numbers]
         sigma_px = np.broadcast_to(self.defocus_sigma_px, len(self.paths_px))[numbers]
-        return KernelField(self.centres_px[numbers], self.paths_px[numbers], self.anchor, light, sigma_px)
+        centres_px, paths_px = self.centres_px[numbers], self.paths_px[numbers]
+        return replace(self, centres_px=centres_px, paths_px=paths_px, light=light, defocus_sigma_px=sigma_px)
 
     def scaled(self, scale: float) -> KernelField:
         """The same blur in a picture that is ``scale`` times as large; the centres stay."""

@@ -118,13 +118,10 @@ def defocus_px(profile: CameraProfile, points_px: Array) -> Array:
 
     The variances of an even defocus and of fields over the distance from the principal point add up.
     """
-    variance = np.full(np.shape(points_px)[:-1], profile.extensions.defocus_sigma_px**2)
-    for field in _softness(profile):
-        lens = profile.intrinsics
-        middle = (profile.width - 1) / 2, (profile.height - 1) / 2
-        across, down = middle if lens is None else (lens.cx_px, lens.cy_px)
-        variance = variance + field.at(np.hypot(points_px[..., 0] - across, points_px[..., 1] - down))[..., 0] ** 2
-    return np.sqrt(variance)
+    lens, middle = profile.intrinsics, ((profile.width - 1) / 2, (profile.height - 1) / 2)
+    radius_px = np.linalg.norm(points_px - np.array(middle if lens is None else (lens.cx_px, lens.cy_px)), axis=-1)
+    even = np.full(radius_px.shape, profile.extensions.defocus_sigma_px)
+    return np.asarray(np.hypot.reduce([even, *(field.at(radius_px)[..., 0] for field in _softness(profile))]))
 
 
 def most_defocus_px(profile: CameraProfile) -> float:

@@ -73,13 +73,15 @@ def defocused(profile: CameraProfile, hidden: Hidden, light: Any, stamp_s: float
     sizes += [] if hidden.blur_px is None else [float(hidden.blur_px(stamp_s))]
     if (sigma := float(np.hypot.reduce([0.0, *sizes]))) > LEAST_BLUR_PX:
         light = cv2.GaussianBlur(light, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    outwards = [f for f in blurs if f.covariates == ("radius",)]
+    if not hidden.corner_blur_px and not outwards:
+        return light
     height, width = light.shape[:2]
     x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     size_px = hidden.corner_blur_px * (x**2 * width**2 + y**2 * height**2) / (width**2 + height**2)
-    for field in blurs:
-        if field.covariates == ("radius",):
-            pixels = np.meshgrid(np.arange(width), np.arange(height))
-            size_px = np.hypot(size_px, field.at(seen_radius_px(profile, *pixels))[..., 0])
+    for field in outwards:
+        radius_px = seen_radius_px(profile, *np.meshgrid(np.arange(width), np.arange(height)))
+        size_px = np.hypot(size_px, field.at(radius_px)[..., 0])
     if not (largest := float(size_px.max())):
         return light
     levels = [light, *(cv2.GaussianBlur(light, (0, 0), largest * k / STEPS) for k in range(1, STEPS + 1))]

@@ -135,11 +135,9 @@ class _Edges:
         missed = [self.missed(form) for form in forms]
         best = min(missed, key=lambda one: float(one.mean()))
         block = np.unique(forms[0].block, return_inverse=True)[1]
-        for form, one in zip(forms, missed, strict=True):
-            more = np.bincount(block, one - best)
-            if more.sum() <= CLEARLY * np.sqrt(np.sum((more - more.mean()) ** 2)):
-                return form
-        return forms[-1]
+        more = [np.bincount(block, one - best) for one in missed]  # the best one's is 0
+        beaten = [one.sum() > CLEARLY * np.sqrt(np.sum((one - one.mean()) ** 2)) for one in more]
+        return forms[beaten.index(False)]
 
 
 def blur_field(
