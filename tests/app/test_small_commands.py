@@ -116,6 +116,7 @@ def test_help_shows_no_types_and_cuts_no_description(virest_here) -> None:
         page = virest_here(*command.split(), "--help").stdout
         assert not re.search(r"<(list|str|path|file)", page), command
         assert "Usage: virest" in page
+        assert ("-o, --out" in page) == ("--out " in page), command
 
 
 def test_a_bad_folder_is_told_in_few_lines(virest_here, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def calibrate(
         list[str] | None,
         typer.Option("--with", metavar="NAME,...", help=f"Fit these too: {', '.join(CALIBRATED_EXTRAS)}."),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The calibrated profile goes here.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The calibrated profile goes here.")] = Path(
         "camera.yaml"
     ),
     kalibr: Annotated[

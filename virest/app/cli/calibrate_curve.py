@@ -22,7 +22,7 @@ def calibrate_curve(
         str | None,
         typer.Option(metavar="KIND", callback=one_of(CURVE_KINDS), help=f"{', '.join(CURVE_KINDS)}. [auto]"),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The response block goes here.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The response block goes here.")] = Path(
         "curve.yaml"
     ),
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Curve, data, residuals: png, svg or pdf.")] = None,

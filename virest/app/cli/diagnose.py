@@ -15,7 +15,7 @@ def diagnose(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
     config: Config = None,
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="The capture's folder in here takes the results.")
+        Path, typer.Option("--out", "-o", metavar="DIR", help="The capture's folder in here takes the results.")
     ] = Path("virest-out"),
     check: Annotated[bool, typer.Option("--check", help="Exit with 10 unless the verdict is consistent.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing diagnosis.")] = False,

@@ -35,7 +35,7 @@ TrueCaptures = Annotated[
     typer.Argument(metavar="CAPTURE", help="Captures with truth/; - reads names from stdin. [simulated]"),
 ]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B[:STEP]", help="Judge only these frames. [all]")]
-Maps = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write difference maps in here.")]
+Maps = Annotated[Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write difference maps in here.")]
 
 
 @evaluate.command(short_help="Case A: angles and pictures of straightened boards.")

@@ -31,7 +31,7 @@ def slam(
     ] = "balanced",
     timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", min=0.1, help="Of one run of CMD.")] = 600.0,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Keep sequences, trajectories and results here.")
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Keep sequences, trajectories and results here.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="One short sequence, one seed, two devices.")] = False,
     json: Json = False,

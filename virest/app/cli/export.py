@@ -18,7 +18,7 @@ def export(
     format: Annotated[
         str, typer.Option("--format", metavar="NAME", callback=one_of(FORMATS), help=f"{', '.join(FORMATS)}.")
     ] = "euroc",
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The export goes into DIR/<capture>.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="The export goes into DIR/<capture>.")] = Path(
         "virest-export"
     ),
     restored: Annotated[

@@ -15,7 +15,7 @@ from virest.restoration.settings import PRESETS
 def preview(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder, or the movie in it.")],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="The picture (PNG). [CAPTURE-preview.png]")
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="The picture (PNG). [CAPTURE-preview.png]")
     ] = None,
     config: Config = None,
     frame: Annotated[int | None, typer.Option(metavar="N", help="This frame. [the one with the most blur]")] = None,

@@ -32,7 +32,7 @@ from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHU
 def process(
     captures: Captures,
     out: Annotated[
-        str, typer.Option("--out", metavar="DIR", help="One folder a capture goes in here; an s3:// address too.")
+        str, typer.Option("--out", "-o", metavar="DIR", help="One folder a capture goes in here; an s3:// address too.")
     ] = "virest-out",
     config: Config = None,
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings, as configs/balanced.yaml.")] = None,

@@ -28,7 +28,9 @@ def new(
     fov_deg: Annotated[
         float | None, typer.Option(metavar="DEG", help="Field of view along the long side, for the focal length.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The profile goes here.")] = Path("camera.yaml"),
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The profile goes here.")] = Path(
+        "camera.yaml"
+    ),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: Json = False,
     quiet: Quiet = False,

@@ -18,7 +18,9 @@ def report(
             metavar="RUN_DIR", help="OUT/<capture> of a run or diagnosis, or OUT itself: then all captures in it."
         ),
     ],
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The page. [RUN_DIR/report.html]")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="The page. [RUN_DIR/report.html]")
+    ] = None,
     frames: Annotated[
         int | None, typer.Option(metavar="N", min=1, max=200, help="Frames shown of each capture. [6]")
     ] = None,
