@@ -30,6 +30,8 @@ STEP_PX = 0.4
 FINEST_STEP_PX = 0.1
 """Exposures shorter than this motion are not divided any further."""
 _FILTER_STEP_S = 5e-4
+_SETTLED = 1e-12
+"""Error of a ray, x/z and y/z, below which Newton's steps find nothing but rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +256,8 @@ def _undo_radtan(x: Array, y: Array, lens: Intrinsics) -> tuple[Array, Array]:
     u, v, small = x.copy(), y.copy(), 1e-6
     for _ in range(8):
         fu, fv = distort(u, v)
+        if max(np.abs(fu - x).max(), np.abs(fv - y).max()) < _SETTLED:
+            break
         gu, gv = distort(u + small, v)
         hu, hv = distort(u, v + small)
         a, b, c, d = (gu - fu) / small, (hu - fu) / small, (gv - fv) / small, (hv - fv) / small

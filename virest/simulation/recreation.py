@@ -20,7 +20,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.errors import CaptureError, SettingsError
 from virest.simulation.auto_exposure import NOMINAL_ISO, Exposures
-from virest.simulation.exposure import View, make_view, pixel_rays
+from virest.simulation.exposure import View, make_view
 from virest.simulation.hand_motion import HandMotion
 from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale, seen_radius_px
 from virest.simulation.recorded_motion import recorded_motion
@@ -98,7 +98,7 @@ def recreate_session(
     seen_s = session.first_row_start_s(int(shows[slot]))
     motion = recorded_motion(sample_s, imu.gyro_rad_s, true, seen_s, imu.accel_m_s2)
     view = make_view(true, motion, rest_s=session.imu_span_s[0])
-    _require_ahead(motion, true, session, shows)
+    _require_ahead(motion, view, session, shows)
     chart = _scene(scene, view, motion, seen_s, _slot_gain(true, shows, slot), settings.oversampling)
     return dataclasses.replace(session, scene=chart, motion=motion, view=view)
 
@@ -181,10 +181,9 @@ def _slot_gain(true: CameraProfile, shows: NDArray[np.int64], slot: int) -> floa
     return gain[first] if first < len(gain) else 1.0
 
 
-def _require_ahead(motion: HandMotion, true: CameraProfile, session: Session, shows: NDArray[np.int64]) -> None:
+def _require_ahead(motion: HandMotion, view: View, session: Session, shows: NDArray[np.int64]) -> None:
     """Raise CaptureError where a frame looks so far away that the scene's plane does not reach there."""
-    x, y = pixel_rays(true.intrinsics)  # type: ignore[arg-type]
-    right, below = float(np.abs(x).max()), float(np.abs(y).max())
+    right, below = float(np.abs(view.x).max()), float(np.abs(view.y).max())
     corners = np.array([[i, j, 1.0] for i in (-right, right) for j in (-below, below)])
     corners /= np.linalg.norm(corners, axis=1, keepdims=True)
     turns = motion.rotation(np.array([session.first_row_start_s(int(k)) for k in shows])).as_matrix()
