@@ -19,7 +19,6 @@ MAX_TABLE_BYTES = 4 << 30
 class TextScan:
     """What a cheap look over a text file found."""
 
-    size_bytes: int
     lines: int
     """Line ends, plus one for a last line without."""
     head: str
@@ -78,7 +77,7 @@ def scan_text(path: Path, error: type[CaptureError] = CaptureError, hint: str = 
     except OSError as fault:
         raise error(f"{name}: {fault.strerror}", hint="check its permissions and the disk") from None
     text = head.decode("utf-8-sig", errors="replace")
-    return TextScan(size, lines + (last not in (b"\n", b"")), text, last == b"\n")
+    return TextScan(lines + (last not in (b"\n", b"")), text, last == b"\n")
 
 
 def _check_chunk(chunk: bytes, run: int, name: str, error: type[CaptureError]) -> int:

@@ -31,7 +31,7 @@ from virest.capture.location import locate
 from virest.capture.logged_focal import focal_scales
 from virest.capture.profile_source import default_profile, resolve_profile
 from virest.capture.recorder_metadata import summarise
-from virest.capture.records import NO_STAMP, STALL, STARTUP, Capture, CaptureMetadata, Frame, Note
+from virest.capture.records import IMU_GAP, NO_IMU, NO_STAMP, STALL, STARTUP, Capture, CaptureMetadata, Frame, Note
 from virest.capture.rosbag import ENDINGS as BAG_ENDINGS
 from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source
 from virest.capture.tables import GyroTable, MetadataTable, StampTable
@@ -390,9 +390,9 @@ def _value(column: NDArray[np.float64], row: int) -> float | None:
 def _note_imu(imu: ImuSamples, gaps: tuple[tuple[float, float], ...], notes: list[Note]) -> None:
     for gap_start, gap_end in gaps[:20]:
         text = f"no IMU rows from {gap_start:.3f} to {gap_end:.3f} s ({(gap_end - gap_start) * 1e3:.0f} ms)"
-        notes.append(Note("warning", "imu-gap", text))
+        notes.append(Note("warning", IMU_GAP, text))
     if len(gaps) > 20:
-        notes.append(Note("warning", "imu-gap", f"{len(gaps) - 20} more gaps in the IMU rows"))
+        notes.append(Note("warning", IMU_GAP, f"{len(gaps) - 20} more gaps in the IMU rows"))
     if imu.has_accelerometer:
         _note_accelerometer(imu, notes)
     else:
@@ -416,7 +416,7 @@ def _note_accelerometer(imu: ImuSamples, notes: list[Note]) -> None:
 
 def _note_frames(frames: tuple[Frame, ...], notes: list[Note]) -> None:
     """Say which frames the IMU does not cover. Raises ImuError if it covers none."""
-    outside = [frame.index for frame in frames if {"no-imu", "imu-gap"} & set(frame.skip_codes)]
+    outside = [frame.index for frame in frames if {NO_IMU, IMU_GAP} & set(frame.skip_codes)]
     if len(outside) == len(frames):
         raise ImuError(
             f"none of the {len(frames)} frames lies inside the IMU's time: frame {outside[0]} {frames[0].skip_reason}",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.capture.records import IMU_GAP, NO_IMU
 from virest.capture.tables import EdgeEpochs
 from virest.errors import ClockError
 
@@ -40,8 +41,6 @@ class Alignment:
     """False: row i is frame i, as the logger writes it."""
     rivals: int = 0
     """Other offsets that fit as well."""
-    worst_ns: float = 0.0
-    """Largest difference between PTS and stamp among the joined."""
     drift_ns: float = 0.0
     """How far PTS and stamps part slowly from first to last frame, where they do."""
 
@@ -82,10 +81,9 @@ def align_frames(
     if len(pts_ns) == len(stamps_ns):
         difference = stamps_ns - stamps_ns[0] - pts_ns
         if np.abs(difference).max() <= tolerance_ns:
-            return Alignment(np.arange(len(pts_ns)), int(stamps_ns[0]), False, 0, float(np.abs(difference).max()))
+            return Alignment(np.arange(len(pts_ns)), int(stamps_ns[0]), False)
         if _drifts_slowly(difference, pts_ns, tolerance_ns):
-            worst, drift = float(np.abs(difference).max()), float(difference[-1])
-            return Alignment(np.arange(len(pts_ns)), int(stamps_ns[0]), False, 0, worst, drift)
+            return Alignment(np.arange(len(pts_ns)), int(stamps_ns[0]), False, drift_ns=float(difference[-1]))
     offsets, scores = _best_offsets(pts_ns, stamps_ns, tolerance_ns)
     if not len(offsets) or scores[0] < max(1, MIN_MATCHED_FRACTION * len(pts_ns)):
         raise _misfit(pts_ns, stamps_ns, tolerance_ns, int(scores[0]) if len(scores) else 0, what)
@@ -95,9 +93,7 @@ def align_frames(
     direct = np.abs(offsets - stamps_ns[0]) <= tolerance_ns
     offset = int(offsets[direct][0] if direct.any() else offsets[0])
     rows = match_times(pts_ns + offset, stamps_ns, tolerance_ns)
-    found = rows >= 0
-    worst = float(np.abs(stamps_ns[rows[found]] - pts_ns[found] - offset).max())
-    return Alignment(rows, offset, True, len(offsets) - 1, worst)
+    return Alignment(rows, offset, True, len(offsets) - 1)
 
 
 def _drifts_slowly(difference_ns: Int64, pts_ns: Int64, tolerance_ns: float) -> bool:
@@ -206,11 +202,11 @@ def outside_reason(
     """
     period = median_period_s(time_s) if period_s is None else period_s
     if start_s < time_s[0] - period:
-        return "no-imu", f"begins {(time_s[0] - start_s) * 1e3:.1f} ms before the first IMU row"
+        return NO_IMU, f"begins {(time_s[0] - start_s) * 1e3:.1f} ms before the first IMU row"
     if end_s > time_s[-1] + period:
-        return "no-imu", f"ends {(end_s - time_s[-1]) * 1e3:.1f} ms after the last IMU row"
+        return NO_IMU, f"ends {(end_s - time_s[-1]) * 1e3:.1f} ms after the last IMU row"
     for gap_start, gap_end in gaps_s:
         if start_s < gap_end and end_s > gap_start:
             length = (gap_end - gap_start) * 1e3
-            return "imu-gap", f"falls into the IMU gap {gap_start:.3f}–{gap_end:.3f} s ({length:.0f} ms)"
+            return IMU_GAP, f"falls into the IMU gap {gap_start:.3f}–{gap_end:.3f} s ({length:.0f} ms)"
     return None

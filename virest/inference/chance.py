@@ -39,11 +39,6 @@ def normal_deviate(tail: Any) -> float:
     return float(-special.ndtri(tail))
 
 
-def gamma_tail(value: Any, shape: Any, scale: Any) -> float:
-    """Probability of a larger gamma deviate."""
-    return float(special.gammaincc(shape, np.asarray(value, float) / scale))
-
-
 def t_ratio(values: NDArray[np.float64]) -> float:
     """Mean of values (n,) over its standard error; 0 for fewer than three."""
     if len(values) < 3:

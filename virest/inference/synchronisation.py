@@ -73,7 +73,6 @@ class OffsetEstimate:
     """Fitted; negative where the rows are read the other way."""
     drift_s_per_s: float = 0.0
     """How the offset drifts: the clock skew that the profile may lack."""
-    drift_std_s_per_s: float = float("inf")
     focal_px: float | None = None
     """Fitted where the profile knows none, the points follow the fit and the motion determines it to a quarter."""
     focal_std_px: float | None = None
@@ -207,7 +206,7 @@ def _concluded(
         focal_px, focal_std_px = found.intrinsics.fx_px, float(found.intrinsics.fx_px * spread)
     return OffsetEstimate(
         offset_s, float(np.sqrt(variance)), determined, "; ".join(notes), float("nan"), found.gyro_bias_rad_s,
-        tuple(bias_std_rad_s.tolist()), found.shutter.readout_time_s, drift, float(drift_std), focal_px, focal_std_px,
+        tuple(bias_std_rad_s.tolist()), found.shutter.readout_time_s, drift, focal_px, focal_std_px,
         fit.scene is not None,
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.recounting import counted_from
 from virest.camera.response import ResponseCurve
-from virest.capture.records import Capture, Frame
+from virest.capture.records import IMU_GAP, NO_IMU, NO_STAMP, Capture, Frame
 from virest.errors import CaptureError, SettingsError
 from virest.simulation.auto_exposure import NOMINAL_ISO, Exposures
 from virest.simulation.exposure import View, make_view
@@ -30,7 +30,7 @@ from virest.simulation.session import TICKS_PER_S, ImuLog, Session, SessionSetti
 
 Array = NDArray[np.float64]
 
-UNSEEN = frozenset({"no-imu", "imu-gap", "no-stamp"})
+UNSEEN = frozenset({NO_IMU, IMU_GAP, NO_STAMP})
 """Frames of which neither time nor motion is known cannot be taken again."""
 LEAST_AHEAD = 0.15
 """z of the unit rays through the picture's corners, in the scene's axes: below this a picture holds no such view."""

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.field import FORCES, RATES, Field
-from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
 from virest.diagnosis.field.stretches import axis_names
@@ -368,8 +367,3 @@ def _at_rates(field: Field) -> str:
 def _lateness(field: Field) -> str:
     values = np.array(field.values)[:, 0]
     return "late" if values[np.argmax(np.abs(values))] > 0 else "early"
-
-
-def found_in(profile: CameraProfile) -> str:
-    """Names of a profile's fields, for a headline."""
-    return ", ".join(dict.fromkeys(f"field of {f.kind} over {', '.join(f.covariates)}" for f in profile.fields))
