@@ -111,8 +111,8 @@ def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDA
     rows = _trend_rows(samples.exposure, suspect)[: 1 + family.bends]
     no_trend = np.eye(len(suspect)) - rows.T @ rows
 
-    def miss(q: Array) -> Array:
-        lookup = log_lookup(family.build(q[:shape]))
+    def miss(q: Array, lookup: LogLookup | None = None) -> Array:
+        lookup = lookup or log_lookup(family.build(q[:shape]))
         correction = no_trend @ q[shape:]
         parts = [(residual_of(lookup, samples, correction) / samples.sigma).ravel() / 2.0, q[shape:] / belief]
         if family.smoothness:
@@ -120,11 +120,12 @@ def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDA
         return np.concatenate(parts)
 
     def jacobian(q: Array) -> Array:
-        base = miss(q)
+        here = log_lookup(family.build(q[:shape]))
+        base = miss(q, here)
         columns = np.empty((len(base), len(q)))
         for i in range(len(q)):
             h = -STEP if i < shape and q[i] + STEP > family.upper[i] else STEP
-            columns[:, i] = (miss(q + h * np.eye(1, len(q), i)[0]) - base) / h
+            columns[:, i] = (miss(q + h * np.eye(1, len(q), i)[0], None if i < shape else here) - base) / h
         return columns
 
     wide = np.full(len(suspect), WIDEST_EV)

@@ -13,7 +13,9 @@ second appears a third weaker and 0.2 rad late.  The memory belongs to the movie
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -152,24 +154,20 @@ def predict(observations: PhotometricObservations, profile: CameraProfile, weigh
     weight: (n,) of the observations in that fit; 1 / noise² unless given.
     """
     weight = 1.0 / observations.noise**2 if weight is None else weight
-    grey_table, slope_table = _tables(profile.response or ResponseCurve("srgb"))
-    factor = log_light_factor(observations, profile)
+    tables = _tables(profile.response or ResponseCurve("srgb"))
+    factor, kept = log_light_factor(observations, profile), _kept(observations)
     patch = observations.patch
-    seen = np.interp(observations.grey, grey_table, _LOG_LIGHT) - factor
-    slope = _at(slope_table, seen + factor)
+    seen = np.interp(observations.grey, tables[0], _LOG_LIGHT) - factor
+    _, slope = _at(tables, seen + factor)
     light = _patch_sum(patch, weight * slope**2 * seen) / _patch_sum(patch, weight * slope**2)
-    for _ in range(_LIGHT_STEPS):
-        inside = light[patch] + factor
-        residual = observations.grey - remembered(observations, _at(grey_table, inside))
-        slope = _at(slope_table, inside)
-        step = _patch_sum(patch, weight * slope * residual) / _patch_sum(patch, weight * slope**2)
-        light = light + np.clip(step, -1.0, 1.0)
-    inside = light[patch] + factor
-    slope = _at(slope_table, inside)
-    stiffness = weight * slope**2
-    share = stiffness / _patch_sum(patch, stiffness)[patch]
-    residual = observations.grey - remembered(observations, _at(grey_table, inside))
-    return Prediction(residual, slope, share, observations)
+    for left in reversed(range(_LIGHT_STEPS + 1)):
+        grey, slope = _at(tables, light[patch] + factor)
+        residual = observations.grey - _remembered(kept, grey)
+        stiffness = weight * slope**2
+        whole = _patch_sum(patch, stiffness)
+        if left:
+            light = light + np.clip(_patch_sum(patch, weight * slope * residual) / whole, -1.0, 1.0)
+    return Prediction(residual, slope, stiffness / whole[patch], observations)
 
 
 def remembered(observations: PhotometricObservations, grey: Array) -> Array:
@@ -177,20 +175,31 @@ def remembered(observations: PhotometricObservations, grey: Array) -> Array:
 
     Linear in ``grey``.  A patch that was not seen for some frames forgets accordingly; its first sight is exact.
     """
-    memory = observations.memory
-    if memory == 0.0 or len(grey) == 0:
-        return grey
-    patch, frame = observations.patch, observations.frame
+    return _remembered(_kept(observations), grey)
+
+
+def _kept(observations: PhotometricObservations) -> list[Array]:
+    """What is left of a lag after 1, 2, 4 … observations of its patch, (n,) each; none where nothing is remembered."""
+    memory, patch, frame = observations.memory, observations.patch, observations.frame
+    if memory == 0.0 or len(patch) == 0:
+        return []
     follows = np.append(False, (patch[1:] == patch[:-1]) & (frame[1:] > frame[:-1])) & ~observations.intra
-    kept = np.where(follows, memory ** np.append(1, np.maximum(np.diff(frame), 1)), 0.0)
-    kept = kept.reshape(-1, *(1,) * (grey.ndim - 1))
-    lag = kept * (np.roll(grey, 1, axis=0) - grey)
-    # lag[i] += kept[i] lag[i-1], by doubling: after a few passes memory ** reach is nothing.
-    reach, factor = 1, kept
-    while reach < 64 and memory**reach > 1e-4:
-        lag[reach:] = lag[reach:] + factor[reach:] * lag[:-reach]
-        factor = np.concatenate([np.zeros_like(factor[:reach]), factor[reach:] * factor[:-reach]])
-        reach *= 2
+    kept = [np.where(follows, memory ** np.append(1, np.maximum(np.diff(frame), 1)), 0.0)]
+    while (reach := 2 ** len(kept)) < 64 and memory**reach > 1e-4:
+        half = reach // 2
+        kept.append(np.concatenate([np.zeros(half), kept[-1][half:] * kept[-1][:-half]]))
+    return kept
+
+
+def _remembered(kept: Sequence[Array], grey: Array) -> Array:
+    """Brightness (n,) or (n, k) with its lags; lag[i] += kept[i] lag[i − 1], by doubling."""
+    if not kept:
+        return grey
+    columns = (-1, *(1,) * (grey.ndim - 1))
+    lag = kept[0].reshape(columns) * (np.roll(grey, 1, axis=0) - grey)
+    for power, factor in enumerate(kept):
+        reach = 2**power
+        lag[reach:] = lag[reach:] + factor[reach:].reshape(columns) * lag[:-reach]
     return grey + lag
 
 
@@ -216,6 +225,7 @@ def _patch_sum(patch: Indices, values: Array) -> Array:
     return np.maximum(total, 1e-12) if np.all(values >= 0) else total
 
 
+@lru_cache(maxsize=16)
 def _tables(curve: ResponseCurve) -> tuple[Array, Array]:
     """Grey (255) and its slope per log light on the grid; the grey is kept strictly rising for the inverse."""
     grey = 255.0 * np.asarray(curve.encode(np.exp(_LOG_LIGHT)), float)
@@ -223,10 +233,11 @@ def _tables(curve: ResponseCurve) -> tuple[Array, Array]:
     return grey + 1e-9 * np.arange(len(grey)), np.maximum(slope, _LEAST_SLOPE)
 
 
-def _at(table: Array, log_light: Array) -> Array:
-    """Linear interpolation on the even grid, ends held."""
+def _at(tables: tuple[Array, Array], log_light: Array) -> tuple[Array, Array]:
+    """Grey and its slope by linear interpolation on the even grid, ends held."""
     step = _LOG_LIGHT[1] - _LOG_LIGHT[0]
     position = np.clip((log_light - _LOG_LIGHT[0]) / step, 0, len(_LOG_LIGHT) - 1.001)
     index = position.astype(np.intp)
     part = position - index
-    return np.asarray(table[index] * (1 - part) + table[index + 1] * part)
+    grey, slope = (table[index] * (1 - part) + table[index + 1] * part for table in tables)
+    return grey, slope
