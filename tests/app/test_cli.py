@@ -591,7 +591,7 @@ def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
 
 
 @pytest.mark.scenario
-@pytest.mark.parametrize("preset", ["fast", "balanced", "best"])
+@pytest.mark.parametrize("preset", ["fast", "best"])
 def test_the_bytes_do_not_depend_on_the_number_of_jobs(
     virest: Virest, long_swing: Path, tmp_path: Path, preset: str
 ) -> None:

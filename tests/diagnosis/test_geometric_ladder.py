@@ -111,7 +111,7 @@ def test_a_readout_of_the_wrong_sense_is_named() -> None:
     assert verdict.model.profile.shutter == truth.shutter
 
 
-@pytest.mark.parametrize(("seed", "scale"), [(81, 1.12), (82, 0.9), (84, 1.08)])
+@pytest.mark.parametrize(("seed", "scale"), [(81, 1.12), (82, 0.9)])
 def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: float) -> None:
     """A gyroscope that tells too much, and a focal length given too short for it: right but for roll, alone worse."""
     setup = replace(HAND, seed=seed, frames=61, about=(0.8, 1.0, 1.0), gyro_scale=scale)

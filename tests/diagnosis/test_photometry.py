@@ -155,10 +155,9 @@ def named(observed: PhotometricObservations) -> dict[str, PictureVerdict]:
     return dict.fromkeys([finding.name for finding in verdict.findings], verdict)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(seed: int) -> None:
+def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(rng: np.random.Generator) -> None:
     """It stands on one side, comes over it for a while, or passes through; a cloud before the sun dims all alike."""
-    observed = made_observations(hidden(), np.random.default_rng(seed))
+    observed = made_observations(hidden(), rng)
     x, t = observed.x_px / 639, observed.frame / FRAMES
     side, while_there = 1 / (1 + np.exp(-(x - 0.5) / 0.06)), np.exp(-(((t - 0.5) / 0.2) ** 2))
     one_side = 1 / (1 + np.exp(-(x - 0.6) / 0.06))
