@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
@@ -197,19 +196,8 @@ def _turned_about(known: IntegratedMotion, turn: Array) -> IntegratedMotion:
     """The ground with the camera's axes turned on the IMU, (3, 3): everything in camera and world axes turns along."""
     way = known.trajectory
     trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, turn @ way.rate_polynomials)
-    if known.displacement is None:
-        return replace(known, trajectory=trajectory)
-    old = known.displacement
-    path, per_bias, per_delay = (_turned_spline(spline, turn) for spline in (old.path, old.per_bias, old.per_delay))
-    moved = Displacement(trajectory, path, per_bias, per_delay, old.arm_cam_m)
-    return replace(known, trajectory=trajectory, displacement=moved)
-
-
-def _turned_spline(spline: CubicHermiteSpline, turn: Array) -> CubicHermiteSpline:
-    """A spline of vectors (m, 3), or of matrices' rows (m, 9), in turned axes."""
-    pieces = spline.c.reshape(*spline.c.shape[:2], 3, -1)
-    turned_pieces = np.einsum("ij,pmjk->pmik", turn, pieces).reshape(spline.c.shape)
-    return CubicHermiteSpline.construct_fast(turned_pieces, spline.x, spline.extrapolate, spline.axis)
+    displacement = None if known.displacement is None else known.displacement.turned(turn, trajectory)
+    return replace(known, trajectory=trajectory, displacement=displacement)
 
 
 def seen_s(profile: CameraProfile, points_px: Array, stamp_s: Array, exposure_s: Array) -> Array:

@@ -159,7 +159,7 @@ class Stretch:
         origin = np.array([float(known.profile.imu_time_s(self.table.origin_s[window]))])
         slope = _velocity_slope(moves, time_s, origin)
         own = np.concatenate([scene.gravity_m_s2, scene.accel_bias_m_s2, [scene.accel_delay_s]])
-        velocity = scene.velocity_m_s[window] + moves.path(time_s, 1) - moves.path(origin, 1)
+        velocity = scene.velocity_m_s[window] + moves.velocity(time_s, origin)[0]
         # the IMU's distance from the camera adds −R (ω × p_cam_imu)
         turning = np.cross(known.trajectory.rate_rad_s(time_s), moves.arm_cam_m)
         arm = np.einsum("nij,nj->ni", known.trajectory.orientation(time_s), turning)
@@ -218,8 +218,7 @@ class Stretch:
 
 def _velocity_slope(moves: Displacement, time_s: Array, origin_s: Array) -> Array:
     """Change (n, 3, 7) of the velocity since an origin (1,) per unit of gravity, accelerometer bias and delay."""
-    per_bias = (moves.per_bias(time_s, 1) - moves.per_bias(origin_s, 1)).reshape(-1, 3, 3)
-    per_delay = moves.per_delay(time_s, 1) - moves.per_delay(origin_s, 1)
+    _, per_bias, per_delay = moves.velocity(time_s, origin_s)
     since = (time_s - origin_s)[:, None, None] * np.eye(3)
     return np.concatenate([since, -per_bias, per_delay[..., None]], axis=-1)
 

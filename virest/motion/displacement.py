@@ -27,12 +27,9 @@ class Displacement:
     """Path of the camera's centre by the accelerometer alone, the trajectory's axes; from rest at the first row."""
 
     trajectory: Trajectory
-    path: CubicHermiteSpline
-    """(m, 3) of the IMU, metres, as if gravity, velocity and bias were nought."""
-    per_bias: CubicHermiteSpline
-    """(m, 9) its change per m/s² of bias along each IMU axis."""
-    per_delay: CubicHermiteSpline
-    """(m, 3) its change per second by which the accelerations are older than their stamps."""
+    spline: CubicHermiteSpline
+    """(m, 15), row by row (3, 5): P of the IMU, metres, as if gravity, velocity and bias were nought; its change per
+    m/s² of bias along each IMU axis; its change per second by which the accelerations are older than their stamps."""
     arm_cam_m: Array
     """(3,) the IMU's origin in camera axes."""
 
@@ -43,24 +40,34 @@ class Displacement:
         """
         window = np.arange(len(time_s)) if window is None else window
         arm = self._arm(time_s) - self._arm(origin_s)[window] if self.arm_cam_m.any() else 0.0
-        return (
-            self._from_rest(self.path, time_s, origin_s, window) + arm,
-            self._from_rest(self.per_bias, time_s, origin_s, window).reshape(-1, 3, 3),
-            self._from_rest(self.per_delay, time_s, origin_s, window),
-        )
+        begun, speed = self.spline(origin_s)[window], self.spline(origin_s, 1)[window]
+        path, per_bias, per_delay = _parts(self.spline(time_s) - begun - speed * (time_s - origin_s[window])[:, None])
+        return path + arm, per_bias, per_delay
+
+    def velocity(self, time_s: Array, origin_s: Array) -> tuple[Array, Array, Array]:
+        """Of the IMU since an origin (1,): its own (n, 3), per bias (n, 3, 3) and per delay (n, 3), world axes."""
+        return _parts(self.spline(time_s, 1) - self.spline(origin_s, 1))
 
     def acceleration(self, time_s: Array) -> Array:
         """Specific force of the camera's centre in world axes (..., 3), at times (...), without the arm's part."""
-        return np.asarray(self.path(time_s, 2))
+        return _parts(self.spline(time_s, 2))[0]
 
-    @staticmethod
-    def _from_rest(spline: CubicHermiteSpline, time_s: Array, origin_s: Array, window: NDArray[np.intp]) -> Array:
-        begun, speed = spline(origin_s)[window], spline(origin_s, 1)[window]
-        return np.asarray(spline(time_s) - begun - speed * (time_s - origin_s[window])[:, None])
+    def turned(self, turn: Array, trajectory: Trajectory) -> Displacement:
+        """The same in world axes that are turned by (3, 3), along a trajectory in these axes."""
+        rows = np.kron(turn, np.eye(5))
+        pieces = self.spline.c @ rows.T
+        spline = CubicHermiteSpline.construct_fast(pieces, self.spline.x, self.spline.extrapolate, self.spline.axis)
+        return Displacement(trajectory, spline, self.arm_cam_m)
 
     def _arm(self, time_s: Array) -> Array:
         """Camera's centre seen from the IMU, world axes: −R_world_cam p_cam_imu."""
         return -np.squeeze(self.trajectory.orientation(time_s) @ self.arm_cam_m[:, None], -1)
+
+
+def _parts(values: Array) -> tuple[Array, Array, Array]:
+    """What the spline holds (..., 15), part by part: (..., 3), (..., 3, 3), (..., 3)."""
+    rows = values.reshape(*values.shape[:-1], 3, 5)
+    return rows[..., 0], rows[..., 1:4], rows[..., 4]
 
 
 def drift_std_m(imu: ImuSamples, span_s: float) -> float:
@@ -100,11 +107,9 @@ def integrate_accelerometer(
     if measured is None:
         return None
     world_imu = trajectory.rotation_world_cam @ profile.rotation_cam_imu
-    world_force, slope = (np.einsum("nij,nj->ni", world_imu, rows) for rows in measured)
-    path, per_bias, per_delay = (
-        _integrated_twice(imu.time_s, row) for row in (world_force, world_imu.reshape(-1, 9), slope)
-    )
-    return Displacement(trajectory, path, per_bias, per_delay, np.array(profile.p_cam_imu_m))
+    force, slope = (world_imu @ rows[..., None] for rows in measured)
+    rate = np.concatenate([force, world_imu, slope], axis=-1).reshape(-1, 15)
+    return Displacement(trajectory, _integrated_twice(imu.time_s, rate), np.array(profile.p_cam_imu_m))
 
 
 def _integrated_twice(time_s: Array, rate: Array) -> CubicHermiteSpline:
