@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from virest.restoration.neighbours.joint import _cubic_error, _lasting_px, _trust, is_detailed
-from virest.restoration.neighbours.registration import AROUND, TILE, WIDE, TileAgreement, _wide_spectra
+from virest.restoration.neighbours.reduced_tiles import AROUND, TILE, WIDE, wide_spectra
+from virest.restoration.neighbours.registration import TileAgreement
 from virest.restoration.statistics.records import unknown_picture
 
 SPACING_PX = 64.0
@@ -45,7 +46,7 @@ def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:
 
     here, moved = picture(0.0), picture(near_shift_px)
     tops_lefts = np.stack(np.meshgrid(np.arange(3), np.arange(4), indexing="ij"), axis=-1).reshape(-1, 2) * TILE
-    spectra = _wide_spectra(here, tops_lefts)
+    spectra = wide_spectra(here, tops_lefts)
     shift = np.zeros((len(tops_lefts), 2))
     relief = 5
     shift[relief, 0] = near_shift_px

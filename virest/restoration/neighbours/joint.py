@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField
 from virest.image_formation.neighbour import NeighbourView
-from virest.restoration.neighbours.registration import TILE, TileAgreement
+from virest.restoration.neighbours.reduced_tiles import TILE
+from virest.restoration.neighbours.registration import TileAgreement
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 from virest.restoration.statistics.tile_power import passed_power

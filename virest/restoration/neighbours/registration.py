@@ -1,16 +1,13 @@
 """How far two neighbouring frames lie apart once the predicted motion is undone, tile by tile.
 
 Never sharp against blurred: the first frame is blurred along the second one's paths and the second along the first
-one's, so both are the same blur of one scene, and only a shift is left between them.  It is found where the phases of
-their spectra agree best (Kuglin & Hines 1975), from low frequencies to high ones.
+one's, so both are the same blur of one scene, and only a shift is left between them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,31 +19,35 @@ from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField, smooth_field
 from virest.image_formation.neighbour import NeighbourView, turn_jacobian_px
+from virest.restoration.neighbours.reduced_tiles import (
+    MOST_TILES,
+    TILE,
+    WIDE,
+    common_shift,
+    cut,
+    full_px,
+    inner,
+    kernel_spectra,
+    power_of,
+    radii,
+    read_at,
+    reduction,
+    shifted,
+    spectra_of,
+    spread_tiles,
+    tile_shifts,
+    wide_spectra,
+)
 
 Array = NDArray[np.float64]
-TILE = 64
-"""Side of a compared tile, in pixels of the reduced pictures."""
-SHORT_SIDE = 400
-"""Pictures are halved until their shorter side is less: shifts are then known to a tenth of a recorded pixel."""
-AROUND = TILE // 4
-"""What a tile is blurred together with on each side: half of the longest path that is compared."""
-WIDE = TILE + 2 * AROUND
-INNER = slice(AROUND, AROUND + TILE)
-MOST_TILES = 16
 LEAST_TILES = 4
 """A turn has three unknowns and a tile's shift tells two; fewer tiles leave nothing to check it by."""
-CUTOFFS = (0.06, 0.12, 0.2, 0.25)
-"""Highest frequencies of the successive fits, cycles per pixel: the first sees shifts of four pixels without a wrap."""
 FAR_PX = 3.0
 """A common shift beyond this is taken out before the fits, in reduced pixels: tiles then show the same again."""
-RIVAL_PEAK = 0.8
-"""Of two agreements nearly as good the one nearer to the prediction is taken: periodic texture has many."""
 CLIPPED_LIGHT = 0.95
 """Brighter places are not judged: light that was clipped cannot be blurred again."""
 LEAST_SEEN = 0.5
 """Part of a tile that must be seen for it to be judged."""
-LEAST_COHERENCE = 0.5
-"""Tiles whose spectra agree less, Σ|Re A*B| over Σ|A||B|, show different things."""
 HUBER = 1.5
 """Standard deviations beyond which a tile's weight falls (95 % efficiency at normal errors is 1.345)."""
 ROBUST_STEPS = 8
@@ -71,26 +72,6 @@ class PairTurn:
     tiles: int
 
 
-def reduction(height: int, width: int) -> int:
-    """How many times smaller the compared pictures are."""
-    times = 1
-    while min(height, width) / times >= SHORT_SIDE:
-        times *= 2
-    return times
-
-
-def reduced_light(luma: NDArray[np.uint8], light: NDArray[np.float32]) -> Image:
-    """A frame's luma (height, width), reduced, in linear light by a table (256,)."""
-    return cv2.LUT(reduced(luma), light)
-
-
-def reduced(picture: NDArray[Any]) -> NDArray[Any]:
-    """A picture (height, width) of the size at which pictures are compared; rows and columns too many are cut off."""
-    times = reduction(*picture.shape)
-    height, width = (length // times for length in picture.shape)
-    return cv2.resize(picture[: times * height, : times * width], (width, height), interpolation=cv2.INTER_AREA)
-
-
 @dataclass(frozen=True, slots=True)
 class FrameTiles:
     """Tiles of a reduced frame and their kernels, to be compared with those of any of its neighbours."""
@@ -111,7 +92,7 @@ class FrameTiles:
     @property
     def centres_px(self) -> Array:
         """(n, 2) in the recorded picture."""
-        return _full_px(self.tops_lefts, self.times, (TILE - 1) / 2)
+        return full_px(self.tops_lefts, self.times, (TILE - 1) / 2)
 
 
 def frame_tiles(
@@ -122,12 +103,12 @@ def frame_tiles(
     everywhere: tiles all over the picture instead of a few.
     """
     times = reduction(profile.height, profile.width)
-    tops_lefts = _tiles(light.shape[0], light.shape[1], light.size if everywhere else MOST_TILES)
-    kernels = _kernel_spectra(field, tops_lefts, times)
+    tops_lefts = spread_tiles(light.shape[0], light.shape[1], light.size if everywhere else MOST_TILES)
+    kernels = kernel_spectra(field, tops_lefts, times)
     if kernels is None:
         return None
-    tiles = _cut(light, tops_lefts)
-    wide = _wide_spectra(light, tops_lefts)
+    tiles = cut(light, tops_lefts)
+    wide = wide_spectra(light, tops_lefts)
     return FrameTiles(tops_lefts, times, light, tiles.mean(axis=(1, 2)), wide, kernels)
 
 
@@ -140,18 +121,18 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
     if tiles is None:
         return None
     tops_lefts, times = tiles.tops_lefts, tiles.times
-    there = _kernel_spectra(view.field(), tops_lefts, times)
+    there = kernel_spectra(view.field(), tops_lefts, times)
     if there is None:
         return None
-    a, apart = _spectra(_inner(tiles.spectra * there)), np.zeros(2)
+    a, apart = spectra_of(inner(tiles.spectra * there)), np.zeros(2)
     for _ in range(2):
-        b = _wide_spectra(_brought(view, second, times, apart), tops_lefts)
-        b = _spectra(_inner(b * tiles.kernels))
-        common = _common_shift(a, b)
+        b = wide_spectra(_brought(view, second, times, apart), tops_lefts)
+        b = spectra_of(inner(b * tiles.kernels))
+        common = common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
             break
         apart = apart + common
-    shift, precision = _tile_shifts(a, b, common)
+    shift, precision = tile_shifts(a, b, common)
     return _turn(view, tops_lefts, times, shift + apart, precision)
 
 
@@ -191,7 +172,7 @@ class TileAgreement:
 
         numbers: of those tiles.
         """
-        return np.asarray(self.there[numbers] - _inner(_shifted(self.here[numbers], shift_px / self.times)))
+        return np.asarray(self.there[numbers] - inner(shifted(self.here[numbers], shift_px / self.times)))
 
     def shown(self) -> Image:
         """What both show, (n, TILE, TILE), in light over its mean."""
@@ -213,7 +194,7 @@ class TileAgreement:
     def wholly_seen(self) -> NDArray[np.bool_]:
         """(n,) whether the neighbour shows all of a tile."""
         seen = self.inside.astype(np.float32)
-        return np.asarray(_cut(seen, self.tops_lefts).min(axis=(1, 2)) > 0)
+        return np.asarray(cut(seen, self.tops_lefts).min(axis=(1, 2)) > 0)
 
     def over_picture(self, values: Array) -> Image:
         """The largest of tiles (n,) and those beside them, at all places (height, width) of the reduced size."""
@@ -227,7 +208,7 @@ class TileAgreement:
 
         noise: (rings,) power in grey levels at frequencies in cycles per recorded pixel.  slope: grey levels per light.
         """
-        recorded = _radii(WIDE) / self.times
+        recorded = radii(WIDE) / self.times
         power = np.interp(recorded, frequency, noise) / (self.times * slope * max(self.light, 1e-6)) ** 2
         return float(np.mean(self.passed * power))
 
@@ -239,15 +220,15 @@ def tile_agreement(
 
     field: of the neighbour's kernels, from the view.
     """
-    kernels = _kernel_spectra(field, tiles.tops_lefts, tiles.times)
+    kernels = kernel_spectra(field, tiles.tops_lefts, tiles.times)
     if kernels is None:
         return None
     source = view.map_px(times=tiles.times)
-    there = _read(second, source)
+    there = read_at(second, source)
     wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles.tops_lefts, tiles.times), TILE // 4)
-    here, there_blurred = _inner(wide), _inner(_wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
-    a, b = _spectra(here), _spectra(there_blurred)
-    shift, precision = _tile_shifts(a, b, np.zeros(2))
+    here, there_blurred = inner(wide), inner(wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
+    a, b = spectra_of(here), spectra_of(there_blurred)
+    shift, precision = tile_shifts(a, b, np.zeros(2))
     per_mean = [1 / np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
     return TileAgreement(
         tiles.tops_lefts,
@@ -256,19 +237,19 @@ def tile_agreement(
         precision,
         wide * per_mean[0],
         there_blurred * per_mean[1],
-        float(np.median(_cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
+        float(np.median(cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
         _inside(source, second),
         _near_lamps(tiles.light, there, blur_px) > 0,
         blur_px,
-        np.asarray(_power(tiles.kernels).mean(axis=0) + _power(kernels).mean(axis=0)),
+        np.asarray(power_of(tiles.kernels).mean(axis=0) + power_of(kernels).mean(axis=0)),
         tiles.times,
     )
 
 
 def _reach_px(field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int) -> int:
     """Half of the longest path of a neighbour's kernels, reduced pixels, rounded up."""
-    centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)
+    centres_px = full_px(tops_lefts, times, (TILE - 1) / 2)
     return int(np.ceil(0.5 * field(centres_px).length_px.max() / times))
 
 
@@ -285,23 +266,23 @@ def judged_change(
     LEAST_TILES tiles are seen, by half at least.
     """
     times = reduction(view.frame.profile.height, view.frame.profile.width)
-    tops_lefts, field = _tiles(*recorded.shape), view.field()
-    kernels = _kernel_spectra(field, tops_lefts, times)
+    tops_lefts, field = spread_tiles(*recorded.shape), view.field()
+    kernels = kernel_spectra(field, tops_lefts, times)
     if kernels is None:
         return None
     source = view.map_px(times=times)
-    brought = _read(second, source)
+    brought = read_at(second, source)
     unknown = _near_lamps(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
-    seen = _cut(np.float32(1) - unknown, tops_lefts)
-    b = _spectra(_cut(brought, tops_lefts), seen)
-    onto = [_spectra(_inner(_wide_spectra(picture, tops_lefts) * kernels), seen) for picture in (recorded, restored)]
-    shift, precision = _tile_shifts(onto[0] + onto[1], b, np.zeros(2))
-    onto = [_shifted(a, shift) for a in onto]
-    used = (precision > 0) & (_cut(_inside(source, second), tops_lefts).min(axis=(1, 2)) > 0)
+    seen = cut(np.float32(1) - unknown, tops_lefts)
+    b = spectra_of(cut(brought, tops_lefts), seen)
+    onto = [spectra_of(inner(wide_spectra(picture, tops_lefts) * kernels), seen) for picture in (recorded, restored)]
+    shift, precision = tile_shifts(onto[0] + onto[1], b, np.zeros(2))
+    onto = [shifted(a, shift) for a in onto]
+    used = (precision > 0) & (cut(_inside(source, second), tops_lefts).min(axis=(1, 2)) > 0)
     used &= seen.mean(axis=(1, 2)) > LEAST_SEEN
     if np.count_nonzero(used) < LEAST_TILES:
         return None
-    levels = seen[used] * _levels_per_part(_cut(recorded, tops_lefts)[used], view.frame.profile)
+    levels = seen[used] * _levels_per_part(cut(recorded, tops_lefts)[used], view.frame.profile)
     pixels = float(seen[used].sum())
 
     def mean_square(spectra: NDArray[np.complex64]) -> float:
@@ -335,158 +316,12 @@ def _near_lamps(light: Image, there: Image, reach_px: int, beyond: int = 0) -> N
     return cv2.dilate(lamps, around, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
 
 
-def _shifted(spectra: NDArray[np.complex64], shift: Array) -> NDArray[np.complex64]:
-    """Spectra (n, side, side / 2 + 1) of tiles that lie so far (n, 2) on."""
-    along, down = (
-        np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64)
-        for d, f in zip(shift.T, _axes(spectra.shape[1]), strict=True)
-    )
-    return np.asarray(spectra * along[:, None, :] * down[:, :, None])
-
-
-def _power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
-    return spectra.real**2 + spectra.imag**2
-
-
-def _tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
-    """(n, 2) top and left of tiles spread evenly over a picture, at most the given number."""
-    tops, lefts = (
-        np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(
-            np.intp
-        )
-        for length in (height, width)
-    )
-    corners = np.stack(np.meshgrid(tops, lefts, indexing="ij"), -1).reshape(-1, 2)
-    chosen = np.unique(np.linspace(0, len(corners) - 1, min(len(corners), most)).round().astype(np.intp))
-    return np.asarray(corners[chosen])
-
-
-def _full_px(tops_lefts: NDArray[np.intp], times: int, at: float) -> Array:
-    """(n, 2) pixels x, y of the recorded picture at a place ``at`` rows and columns into each reduced tile."""
-    return np.asarray((tops_lefts[:, ::-1] + at + 0.5) * times - 0.5)
-
-
-def _kernel_spectra(
-    field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int
-) -> NDArray[np.complex64] | None:
-    """Transposes of the kernels at tiles' centres, (n, WIDE, WIDE / 2 + 1).
-
-    None where a path does not fit into half a tile.
-    """
-    kernels = field(_full_px(tops_lefts, times, (TILE - 1) / 2)).scaled(1 / times)
-    radius = kernels.radius_px
-    if 2 * radius + 1 > TILE // 2:
-        return None
-    along, down = (np.exp(2j * np.pi * radius * f).astype(np.complex64) for f in _axes(WIDE))
-    rows = fft.rfft(kernels.arrays()[:, ::-1, ::-1], WIDE, axis=2) * along  # the transpose, its middle at 0
-    return np.asarray(fft.fft(rows, WIDE, axis=1) * down[:, None])
-
-
-def _cut(picture: NDArray[Any], tops_lefts: NDArray[np.intp], side: int = TILE) -> NDArray[Any]:
-    return np.stack([picture[top : top + side, left : left + side] for top, left in tops_lefts.tolist()])
-
-
-def _wide_spectra(picture: Image, tops_lefts: NDArray[np.intp]) -> NDArray[np.complex64]:
-    """Spectra (n, WIDE, WIDE / 2 + 1) of tiles with what lies around them; the picture is mirrored at its edges."""
-    padded = cv2.copyMakeBorder(picture, AROUND, AROUND, AROUND, AROUND, cv2.BORDER_REFLECT_101)
-    return np.asarray(fft.rfft2(_cut(padded, tops_lefts, WIDE)))
-
-
-def _inner(wide: NDArray[np.complex64]) -> Image:
-    """Tiles (n, TILE, TILE) of spectra (n, WIDE, WIDE / 2 + 1)."""
-    rows = fft.ifft(wide, axis=1)[:, INNER]
-    return np.asarray(fft.irfft(rows, WIDE, axis=2)[:, :, INNER])
-
-
 def _brought(view: NeighbourView, second: Image, times: int, apart: Array) -> Image:
     """The neighbour's reduced picture where the prediction puts the frame's, less a common shift (2,), reduced pixels.
 
     Row by row: over the rows of a tile, 5 ms, a hand's shake bends the map by up to half a pixel.
     """
-    return _read(second, view.map_px(lambda p: p - times * apart, times))
-
-
-def _read(picture: Image, source: NDArray[np.float32]) -> Image:
-    """A reduced picture at the places of a map (h, w, 2); beyond its edges, these."""
-    return cv2.remap(picture, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _spectra(tiles: Image, seen: Image | None = None) -> NDArray[np.complex64]:
-    """Spectra (n, TILE, TILE / 2 + 1) of tiles less their mean, under a Hann window; light that changed is evened.
-
-    seen: (n, TILE, TILE) weights of the places that make the mean; None: all.
-    """
-    window = _window()
-    weight = np.broadcast_to(window, tiles.shape) if seen is None else window * seen
-    total = np.maximum(weight.sum(axis=(1, 2)), 1e-6)
-    means = (np.einsum("nij,nij->n", tiles, weight) / total)[:, None, None]
-    return np.asarray(fft.rfft2((tiles / np.maximum(means, 1e-3) - 1) * window))
-
-
-@lru_cache(maxsize=1)
-def _window() -> Image:
-    hann = np.hanning(TILE + 2)[1:-1]
-    return np.outer(hann, hann).astype(np.float32)
-
-
-def _axes(side: int = TILE) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Frequencies along and down of half a spectrum (side, side / 2 + 1), cycles per pixel."""
-    return np.fft.rfftfreq(side).astype(np.float32), np.fft.fftfreq(side).astype(np.float32)
-
-
-@lru_cache(maxsize=2)
-def _radii(side: int = TILE) -> Array:
-    """Distance from zero over half a spectrum (side, side / 2 + 1), cycles per pixel."""
-    return np.hypot(*np.meshgrid(np.fft.rfftfreq(side), np.fft.fftfreq(side)))
-
-
-@lru_cache(maxsize=1)
-def _looked_at() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
-    """Places of half a spectrum whose phases are looked at, by rising frequency, and 2π f there, (2, m).
-
-    The third: how many of them each of CUTOFFS takes.
-    """
-    radius = _radii().ravel()
-    order = np.argsort(radius, kind="stable")
-    order = order[(radius[order] > 1 / TILE) & (radius[order] <= CUTOFFS[-1])]
-    waves = 2 * np.pi * np.stack([f.ravel()[order] for f in np.meshgrid(*_axes())]).astype(np.float32)
-    return order, waves, tuple(int(n) for n in np.searchsorted(radius[order], CUTOFFS, side="right"))
-
-
-def _common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
-    """Shift d (2,) with b(x) ≈ a(x + d) for most tiles: the peak of their summed phase correlation, whole pixels."""
-    product = np.conj(a) * b
-    surface = fft.irfft2((product / np.sqrt(np.abs(product) + 1e-12)).sum(axis=0), (TILE, TILE))
-    rows, columns = np.nonzero(surface >= RIVAL_PEAK * surface.max())
-    shifts = -np.stack([columns, rows], -1).astype(float)
-    shifts[shifts < -TILE // 2] += TILE
-    return np.asarray(shifts[np.argmin(np.linalg.norm(shifts, axis=1))])
-
-
-def _tile_shifts(a: NDArray[np.complex64], b: NDArray[np.complex64], start_px: Array) -> tuple[Array, Array]:
-    """Shifts (n, 2) of tiles and their precision (n,), 1 / px², by the phases' scatter; 0: it shows something else."""
-    places, waves, counts = _looked_at()
-    product = np.conj(a.reshape(len(a), -1)[:, places]) * b.reshape(len(b), -1)[:, places]
-    size, phase, shift = np.abs(product), np.angle(product), np.tile(start_px, (len(a), 1))
-    squares = np.stack([waves[0] ** 2, waves[0] * waves[1], waves[1] ** 2], -1)
-    for count in counts:
-        left = _left(phase[:, :count], shift, waves[:, :count])
-        weight = size[:, :count] * np.maximum(np.cos(left), 0)
-        xx, xy, yy = (weight @ squares[:count]).T.astype(float)
-        x, y = ((weight * left) @ waves[:, :count].T).T.astype(float)
-        determinant = np.maximum(xx * yy - xy * xy, 1e-3 * (xx + yy) ** 2 + 1e-20)
-        shift += np.stack([(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant], -1)
-    total = np.maximum(size.sum(axis=1, dtype=float), 1e-20)
-    coherence = (size * np.cos(_left(phase, shift, waves))).sum(axis=1, dtype=float) / total
-    scatter = np.maximum(1 - coherence**2, 1e-4) / np.maximum(coherence**2, 1e-4)
-    narrow = determinant / np.maximum(xx + yy, 1e-20) / total
-    return shift, np.where(coherence > LEAST_COHERENCE, narrow / scatter, 0.0)
-
-
-def _left(phase: NDArray[np.float32], shift: Array, waves: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Phases (n, m) that shifts (n, 2) leave, within a half turn."""
-    left = phase - shift.astype(np.float32) @ waves
-    return np.asarray(left - np.float32(2 * np.pi) * np.rint(left * np.float32(0.5 / np.pi)), np.float32)
+    return read_at(second, view.map_px(lambda p: p - times * apart, times))
 
 
 def _turn(
@@ -496,7 +331,7 @@ def _turn(
     used = precision > 0
     if np.count_nonzero(used) < LEAST_TILES:
         return None
-    centres_px = _full_px(tops_lefts, times, (TILE - 1) / 2)[used]
+    centres_px = full_px(tops_lefts, times, (TILE - 1) / 2)[used]
     apart_s = view.apart_s(centres_px)
     speed = -shift[used] * times / apart_s[:, None]  # b(x) = a(x + d): the neighbour saw x + d where x was predicted
     jacobian = turn_jacobian_px(view.frame, centres_px)

@@ -30,13 +30,13 @@ from virest.restoration.neighbours.joint import (
     neighbour_place,
     rings_passed,
 )
+from virest.restoration.neighbours.reduced_tiles import reduced_light
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import (
     FrameTiles,
     PairTurn,
     frame_tiles,
     pair_turn,
-    reduced_light,
     tile_agreement,
 )
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
