@@ -23,8 +23,7 @@ def test_the_variance_is_that_of_many_drawn_paths(rng):
     drawn = rng.multivariate_normal((0, 0), covariance, 1000)
     path = _slanted(np.zeros((1, 2))).paths_px[0]
     since = ((np.arange(40) + 0.5) / 40 - 0.5)[:, None]
-    frequency = np.fft.fftfreq(SIZE)
-    fx, fy = np.meshgrid(frequency, frequency)
+    fx, fy = np.meshgrid(np.fft.rfftfreq(SIZE), np.fft.fftfreq(SIZE))
     low = np.hypot(fx, fy) < 0.2
     spectra = np.array(
         [np.exp(2j * np.pi * (fx[low][:, None] * p[:, 0] + fy[low][:, None] * p[:, 1])).mean(-1)
@@ -32,6 +31,15 @@ def test_the_variance_is_that_of_many_drawn_paths(rng):
     )  # fmt: skip
     expected = spectra.var(axis=0)
     np.testing.assert_allclose(spread.variance(SIZE)[low], expected, atol=0.25 * expected.max())
+
+
+def test_frequencies_between_those_worked_out_follow():
+    """A spectrum of many frequencies is that of few where both have the same, whatever kernels fit into either."""
+    spread = kernel_spread(_slanted, 60, 40, np.array([[0.09, 0.03], [0.03, 0.04]]))
+    assert spread is not None
+    few, many = spread.variance(15), spread.variance(15 * 16)
+    assert many.shape == (240, 121)
+    np.testing.assert_allclose(many[::16, ::16], few, atol=1e-6)
 
 
 def test_a_known_path_has_no_spread():

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from virest.image_formation.kernels import KernelField
 
@@ -34,12 +35,22 @@ class KernelSpread:
         return KernelSpread(tuple(field.scaled(scale) for field in self.fields))
 
     def variance(self, size: int, scale: float = 1.0) -> NDArray[np.float32]:
-        """Var K over a spectrum (size, size), mean over the places; of a picture ``scale`` times as large."""
+        """Var K over half a spectrum (size, size / 2 + 1), mean over the places; of a picture ``scale`` times as large.
+
+        Kernels of radius r have a |K|² that 4 r + 1 frequencies each way tell exactly: so many are worked out, and
+        those between them follow.
+        """
         fields = [field.scaled(scale) for field in self.fields]
         radius = min(max(field.radius_px for field in fields), (size - 1) // 2)
-        spectra = np.stack([np.fft.fft2(_wrapped(field.arrays(radius), size)) for field in fields])
-        variance = (np.abs(spectra) ** 2).mean(axis=0) - np.abs(spectra.mean(axis=0)) ** 2
-        return np.asarray(variance.mean(axis=0), np.float32)
+        few = min(fft.next_fast_len(4 * radius + 1, real=True), size)
+        spectra = np.stack([fft.rfft2(field.arrays(radius), (few, few)) for field in fields])
+        variance = ((np.abs(spectra) ** 2).mean(axis=0) - np.abs(spectra.mean(axis=0)) ** 2).mean(axis=0)
+        if few < size:
+            shifts = np.roll(fft.irfft2(variance, (few, few)), (2 * radius, 2 * radius), (0, 1))
+            over_shifts = np.zeros((size, size), np.float32)
+            over_shifts[: 4 * radius + 1, : 4 * radius + 1] = shifts[: 4 * radius + 1, : 4 * radius + 1]
+            variance = fft.rfft2(np.roll(over_shifts, (-2 * radius, -2 * radius), (0, 1))).real
+        return np.asarray(np.maximum(variance, 0.0), np.float32)
 
 
 def kernel_spread(
@@ -57,11 +68,3 @@ def kernel_spread(
         sign * np.sqrt(2 * max(v, 0.0)) * axis for v, axis in zip(variances, axes.T, strict=True) for sign in (1, -1)
     ]
     return KernelSpread(tuple(replace(at, paths_px=at.paths_px + since * end) for end in ends))
-
-
-def _wrapped(kernels: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Kernels (n, k, k) in (n, size, size) with their middle at the first place."""
-    radius = kernels.shape[1] // 2
-    padded = np.zeros((len(kernels), size, size), np.float32)
-    padded[:, : 2 * radius + 1, : 2 * radius + 1] = kernels
-    return np.roll(padded, (-radius, -radius), (1, 2))

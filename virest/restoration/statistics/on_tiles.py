@@ -24,7 +24,7 @@ def packed_frequency(size: int) -> NDArray[np.float32]:
 
 
 def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Real values over all frequencies (size, size), even about zero, on OpenCV's packed spectrum."""
+    """Real values over half a spectrum (size, size / 2 + 1), even about zero, on OpenCV's packed one (size, size)."""
     size = len(values)
     index = (np.arange(size) + 1) // 2
     found = values[:, index]
