@@ -133,8 +133,10 @@ class FrameNeighbours:
         luma: what was measured on the frame's.  field: of its kernels.
         """
         assert here.motion is not None
-        tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
         left = {other.frame.index: other for other in around if other.usable and other.frame.index != here.frame.index}
+        if not left or not most:
+            return ()
+        tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
         found: dict[int, NeighbourPlace] = {}
         taken: list[int] = []
         sights = dict(left)
