@@ -69,6 +69,19 @@ def test_a_sensor_that_sits_another_way_round_is_named_alone(turned_deg: tuple[f
     assert verdict.model.profile.rotation_cam_imu == pytest.approx(camera.profile.rotation_cam_imu, abs=2e-3)
 
 
+@pytest.mark.parametrize("factor", [0.55, 2.5])
+def test_the_focal_length_of_another_lens_is_named_alone(factor: float) -> None:
+    """An ultra-wide lens or a telephoto, told to be the main one."""
+    camera = Recording(replace(HAND, frames=49))
+    lens = camera.profile.intrinsics
+    assert lens is not None
+    other = replace(camera.profile, intrinsics=replace(lens, fx_px=lens.fx_px / factor, fy_px=lens.fy_px / factor))
+    verdict = climb(make_evidence(camera.imu, camera.observed), other, (), ())
+    assert [entry.name for entry in verdict.accepted] == ["focal_length"]
+    assert verdict.model.profile.intrinsics is not None
+    assert verdict.model.profile.intrinsics.fx_px == pytest.approx(lens.fx_px, rel=2e-3)
+
+
 def test_frames_before_the_inertial_data_stay_in_their_place(tmp_path: Path) -> None:
     """A gyroscope that begins 0.15 s late leaves the first frames out, and no other frame takes their numbers."""
     folder = tmp_path / "late"
