@@ -15,17 +15,20 @@ from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges
+from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.field.stretches import bridging_form, rate_walk
+from virest.diagnosis.field.sudden import best_instant
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
-from virest.diagnosis.geometric_evidence import make_evidence
+from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.image_formation.point_model import TrackTable
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
-from virest.inference.track_fit import Term
+from virest.inference.track_fit import Term, TrackFit
 
 HAND = Setup(
     seed=71, frames=61, points=20, width=640, height=480, centre_px=(323.0, 236.0), readout_direction="top_to_bottom",
@@ -73,6 +76,14 @@ def judged(
     if doubtful.sets_aside:
         with_bridges(found, observed, doubtful, capture)
     return found, [finding_of(entry, found.noise_px) for entry in found.fields]
+
+
+def fitted_to(phone: StrangePhone) -> tuple[Evidence, TrackFit, TrackTable]:
+    """The phone's points as its profile predicts them."""
+    evidence = make_evidence(phone.capture.imu, phone.observed)
+    model = Model(phone.profile, None, ())
+    table = evidence.table(model, 6000)
+    return evidence, evidence.fit(model, (), table), table
 
 
 def gained(field: FieldFinding) -> float:
@@ -123,6 +134,15 @@ def test_a_lens_off_centre_is_a_map_of_second_order() -> None:
     truth = 0.012 * 3 * (200 / HAND.focal_px) ** 2 * HAND.focal_px
     seen = field.fields[0].at(HAND.centre_px[0], HAND.centre_px[1] + 200)
     assert seen[1] == pytest.approx(truth, rel=0.15)
+
+
+def test_a_lens_hardly_off_centre_takes_its_two_numbers() -> None:
+    """A map of many numbers would not show it, nor does any cause."""
+    phone = StrangePhone(replace(HAND, seed=98, points=40), Strange(tangential=(0.003, -0.002)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert (field.kind, field.shape) == ("displacement", "growing with its square")
+    assert gained(field) > 0.8
 
 
 @pytest.mark.scenario
@@ -282,6 +302,33 @@ def test_a_lens_switch_is_a_step_and_no_drift() -> None:
     # between two frames any instant is as good
     assert np.mean(field.fields[0].knots[0]) == pytest.approx(1.21, abs=0.04)
     assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+
+
+def test_a_slight_lens_switch_is_a_step() -> None:
+    """A fifth of a per cent: between the two frames points go no further than they err."""
+    phone = StrangePhone(replace(HAND, seed=86), Strange(longer=lambda t: np.where(t < 1.21, 0.0, 0.002)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates, field.shape) == ("scale", ("time",), "a step")
+    assert field.size == pytest.approx(0.002, rel=0.3)
+
+
+@pytest.mark.parametrize("off_s", [-0.09, 0.09])
+def test_the_instant_of_a_lens_switch_is_found_from_some_frames_off(off_s: float) -> None:
+    """As far as a first look, which passes over the frames about a change, may err."""
+    phone = StrangePhone(replace(HAND, seed=86), Strange(longer=lambda t: np.where(t < 1.21, 0.0, 0.015)))
+    evidence, fitted, table = fitted_to(phone)
+    seen = point_residuals(evidence.imu, fitted, table)
+    form = best_instant(seen, phone.capture, 1.21 + off_s, 0.015, evidence.period_s)
+    assert form.step_s == pytest.approx(1.21, abs=0.04)
+
+
+def test_a_focal_length_that_settles_soon_is_no_step_beside_a_curve() -> None:
+    """It grows most between the first two frames, and is one curve all the same."""
+    setup = replace(HAND, seed=87, frames=91, points=40)
+    phone = StrangePhone(setup, Strange(longer=lambda t: 0.01 * (1 - np.exp(-np.maximum(t, 0) / 0.4))))
+    _, (field,) = judged(phone, phone.profile, rungs=2)
+    assert (field.covariates, field.shape) == (("time",), "levelling off")
 
 
 def test_a_focal_length_that_settles_soon_is_not_taken_for_another_focal_length() -> None:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from motion.synthetic_tracks import Recording, Setup
+from scipy.spatial.transform import Rotation
 
 from virest.app.bench.broken import _fill, _header
 from virest.app.bench.diagnosis import diagnose_folder
@@ -53,6 +54,32 @@ def test_a_camera_at_rest_tells_nothing_with_exposures_or_without(at_rest: Path)
     assert (found.verdict, found.causes) == (CONSISTENT, ())
     assert any("at rest" in note for note in found.notes)
     assert any("known exposures" in note and "blur not judged" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("turned_deg", [(90, 0, 0), (0, 0, 180), (0, -90, 90)])
+def test_a_sensor_that_sits_another_way_round_is_named_alone(turned_deg: tuple[float, float, float]) -> None:
+    """The profile of another phone: no fit turns by a right angle, but turns of pictures and log tell the axes."""
+    camera = Recording(replace(HAND, frames=49))
+    turned = Rotation.from_euler("ZYX", turned_deg, degrees=True).as_matrix() @ camera.profile.rotation_cam_imu
+    other = replace(camera.profile, r_cam_imu=tuple(map(tuple, turned.tolist())))
+    capture = SimpleNamespace(imu=camera.imu, repeats=())
+    start, terms, _, far, _ = with_null_values(camera.observed, capture, other)  # type: ignore[arg-type]
+    verdict = climb(make_evidence(camera.imu, camera.observed), start, terms, (), far)
+    assert [entry.name for entry in verdict.accepted] == ["imu_rotation"]
+    assert verdict.model.profile.rotation_cam_imu == pytest.approx(camera.profile.rotation_cam_imu, abs=2e-3)
+
+
+@pytest.mark.parametrize("factor", [0.55, 2.5])
+def test_the_focal_length_of_another_lens_is_named_alone(factor: float) -> None:
+    """An ultra-wide lens or a telephoto, told to be the main one."""
+    camera = Recording(replace(HAND, frames=49))
+    lens = camera.profile.intrinsics
+    assert lens is not None
+    other = replace(camera.profile, intrinsics=replace(lens, fx_px=lens.fx_px / factor, fy_px=lens.fy_px / factor))
+    verdict = climb(make_evidence(camera.imu, camera.observed), other, (), ())
+    assert [entry.name for entry in verdict.accepted] == ["focal_length"]
+    assert verdict.model.profile.intrinsics is not None
+    assert verdict.model.profile.intrinsics.fx_px == pytest.approx(lens.fx_px, rel=2e-3)
 
 
 def test_frames_before_the_inertial_data_stay_in_their_place(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.candidates import FarClock, candidates_of
+from virest.diagnosis.candidates import FarStart, candidates_of
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
 from virest.diagnosis.geometric_significance import is_plausible
@@ -33,7 +33,7 @@ def left_open(given: CameraProfile, further: tuple[str, ...]) -> tuple[float, fl
     table = evidence.table(Model(given, None, ()), 7000)
     fitted = evidence.fit(Model(given, None, ()), (offset.term,), table)
     model = Model(fitted.profile, None, (offset.term,))
-    candidates = candidates_of(evidence, given, model, set(), (), FarClock())
+    candidates = candidates_of(evidence, given, model, set(), (), FarStart())
     more = [candidate for candidate in candidates if candidate.name in further and candidate.added]
     found = variance_left_open(evidence, model, [offset], more, is_plausible, one_by_one)
     error = fitted.profile.time_offset_s - camera.profile.time_offset_s

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from motion.synthetic_tracks import Recording, Setup
 
-from virest.diagnosis.candidates import FarClock, candidates_of
+from virest.diagnosis.candidates import FarStart, candidates_of
 from virest.diagnosis.cross_validation import FOLDS, GLANCE, RACED, RACED_STARTS, best_of_each, race, screen
 from virest.diagnosis.geometric_evidence import ITERATIONS, Model, make_evidence
 from virest.diagnosis.geometric_ladder import SearchContext
@@ -22,7 +22,7 @@ EVIDENCE = make_evidence(CAMERA.imu.between(-0.2, CAMERA.stamp_s[-1] + 0.25), CA
 def test_the_right_cause_wins_a_race_as_it_wins_a_screening() -> None:
     """Of all causes at all starts few are fitted to the end; the hidden one comes out first, as well fitted."""
     wrong = Model(replace(CAMERA.profile, time_offset_s=0.025), None, ())
-    candidates = candidates_of(EVIDENCE, wrong.profile, wrong, set(), (), FarClock())
+    candidates = candidates_of(EVIDENCE, wrong.profile, wrong, set(), (), FarStart())
     iterations: list[int] = []
 
     def each(function: Any, calls: Any, done: Any = None) -> list[Any]:
@@ -43,7 +43,7 @@ def test_the_right_cause_wins_a_race_as_it_wins_a_screening() -> None:
 def test_a_rival_way_takes_causes_of_the_first_alone() -> None:
     """What may enter on the way that is climbed for comparison is what entered on the other."""
     model = Model(replace(CAMERA.profile, time_offset_s=0.025), None, ())
-    course = SearchContext(EVIDENCE, model.profile, (), FarClock(), one_by_one)
+    course = SearchContext(EVIDENCE, model.profile, (), FarStart(), one_by_one)
     some = replace(course, among=frozenset({"gyro_bias", "focal_length"}))
     assert {candidate.name for candidate in some.candidates(model, {"focal_length"})} == {"gyro_bias"}
     assert {"gyro_bias", "stabilisation"} < {candidate.name for candidate in course.candidates(model, set())}

@@ -27,23 +27,30 @@ CONSTANT_EXPOSURE = 0.03
 
 
 @dataclass(frozen=True, slots=True)
-class FarClock:
-    """Changes of a profile's clocks, beyond a fit's reach, at which the turns of pictures and gyroscope agree."""
+class FarStart:
+    """Changes of a profile, beyond a fit's reach, at which the turns of pictures and gyroscope agree."""
 
     offset_s: float = 0.0
     """At the profile's own clock rate; 0: none."""
     skewed_offset_s: float = 0.0
     """At the rate changed by ``skew``."""
     skew: float = 0.0
+    axes: tuple[tuple[float, ...], ...] | None = None
+    """Rotation of the sensor; None: the profile's own will do."""
 
-    def start(self, name: str, profile: CameraProfile, offset_free: bool) -> CameraProfile | None:
-        """Where a fit of this effect might begin; a skew moves the offset along if that is fitted too."""
+    def start(self, name: str, profile: CameraProfile, model: CameraProfile, offset_free: bool) -> CameraProfile | None:
+        """A model's profile where a fit of this effect might begin, counted from the given one.
+
+        A skew moves the offset along if that is fitted too.
+        """
+        if name == "imu_rotation" and self.axes is not None:
+            return replace(model, r_cam_imu=self.axes)
         offset_s = profile.time_offset_s or 0.0
         if name == "time_offset" and self.offset_s:
-            return replace(profile, time_offset_s=offset_s + self.offset_s)
+            return replace(model, time_offset_s=offset_s + self.offset_s, clock_skew=profile.clock_skew)
         if name == "clock_skew" and self.skew:
             skewed_s = offset_s + self.skewed_offset_s if offset_free else offset_s
-            return replace(profile, time_offset_s=skewed_s, clock_skew=profile.clock_skew + self.skew)
+            return replace(model, time_offset_s=skewed_s, clock_skew=profile.clock_skew + self.skew)
         return None
 
 
@@ -87,11 +94,11 @@ def candidates_of(
     model: Model,
     tried: set[str],
     lags: Sequence[Schedule],
-    far: FarClock,
+    far: FarStart,
 ) -> list[Candidate]:
     """All causes that are not in a model yet, each at all places where its fit may begin.
 
-    lags: the start-up schedules to try.  far: changes of the clocks at which turns were seen to agree.
+    lags: the start-up schedules to try.  far: changes at which turns were seen to agree.
     """
     in_terms = {term.name for term in model.terms}
     found: list[Candidate] = []
@@ -104,9 +111,9 @@ def candidates_of(
         for values in (None, *effect.starts):
             profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
             found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
-        if (far_off := far.start(effect.name, nominal, "time_offset" in in_terms)) is not None:
-            clocks = replace(model.profile, time_offset_s=far_off.time_offset_s, clock_skew=far_off.clock_skew)
-            found.append(Candidate(effect.name, replace(model, profile=clocks), (effect.term,), effect))
+        begun = far.start(effect.name, nominal, model.profile, "time_offset" in in_terms)
+        if begun is not None:
+            found.append(Candidate(effect.name, replace(model, profile=begun), (effect.term,), effect))
     found += _depths(evidence, model, tried)
     if "frame_lag" not in tried:
         found += [_lagging(model, *lag) for lag in lags]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarClock, candidates_of, worth_beginning
+from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarStart, candidates_of, worth_beginning
 from virest.diagnosis.cross_validation import (
     JUDGE_POINTS,
     Judged,
@@ -70,14 +70,14 @@ def climb(
     nominal: CameraProfile,
     null_terms: Sequence[Term],
     lags: Sequence[Schedule],
-    far: FarClock | None = None,
+    far: FarStart | None = None,
     progress: Callable[[float], None] | None = None,
     max_rungs: int = MAX_RUNGS,
     each: ParallelMap = one_by_one,
 ) -> GeometricVerdict:
     """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
 
-    lags: the start-up schedules to try.  far: changes of the clocks at which turns were seen to agree.
+    lags: the start-up schedules to try.  far: changes at which turns were seen to agree.
     Where a rival might have entered first, the ladder is climbed once more from there, with the causes of the first
     climb alone: whatever else the rival needs makes it the less simple explanation.
     """
@@ -86,7 +86,7 @@ def climb(
     start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
     model, notes = _with_unknowns(evidence, start)
     nominal_model = model
-    course = SearchContext(evidence, nominal, lags, far or FarClock(), each)
+    course = SearchContext(evidence, nominal, lags, far or FarStart(), each)
     say(0.1)
     path, fork = _ascended(course, _Path(model, (), ()), max_rungs)
     say(0.6)
@@ -214,7 +214,7 @@ class SearchContext:
     evidence: Evidence
     nominal: CameraProfile
     lags: Sequence[Schedule]
-    far: FarClock
+    far: FarStart
     each: ParallelMap
     among: frozenset[str] | None = None
     """Names of the causes that may enter; None: all."""

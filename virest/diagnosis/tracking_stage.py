@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
-from virest.diagnosis.candidates import FarClock
+from virest.diagnosis.candidates import FarStart
 from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges, with_description
 from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
@@ -69,7 +69,7 @@ class TrackedPoints:
     start: CameraProfile
     null_terms: tuple[Term, ...]
     schedules: Sequence[Schedule]
-    far: FarClock
+    far: FarStart
     rungs_allowed: int
     each: ParallelMap = one_by_one
 
@@ -190,7 +190,7 @@ def evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Rea
 
 def with_null_values(
     observed: ObservedTracks, capture: Capture, profile: CameraProfile
-) -> tuple[CameraProfile, list[Term], list[str], FarClock, bool]:
+) -> tuple[CameraProfile, list[Term], list[str], FarStart, bool]:
     """The profile with unknown values begun somewhere, terms to fit on every rung, and far-off starts of the clocks.
 
     The last: whether the turns of pictures and gyroscope agree at any offset, as far as the camera turns.
@@ -208,13 +208,13 @@ def with_null_values(
     if not profile.readout_known and telling:
         terms.append(terms_of.READOUT if profile.time_offset_s is None else PLAIN_READOUT)
     if profile.time_offset_s is not None:
-        return profile, terms, notes, far or FarClock(), agree
+        return profile, terms, notes, far or FarStart(), agree
     if far is None:
         notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
-        return replace(profile, time_offset_s=0.0), terms, notes, FarClock(), agree
+        return replace(profile, time_offset_s=0.0), terms, notes, FarStart(), agree
     terms += [terms_of.TIME_OFFSET] if telling else []
     begun = replace(profile, time_offset_s=far.offset_s)
-    return begun, terms, notes, FarClock(0.0, far.skewed_offset_s - far.offset_s, far.skew), agree
+    return begun, terms, notes, FarStart(0.0, far.skewed_offset_s - far.offset_s, far.skew, far.axes), agree
 
 
 def at_rest(observed: ObservedTracks, profile: CameraProfile) -> bool:
@@ -247,15 +247,16 @@ def _one_axis_agrees(observed: ObservedTracks, capture: Capture, profile: Camera
     return bool(np.max(product / square) > AXIS_EXPLAINED)
 
 
-def _agree_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> FarClock | None:
-    """Changes of the profile's clocks at which turns agree best; None where they agree nowhere."""
+def _agree_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> FarStart | None:
+    """Changes of the profile's clocks and axes at which turns agree best; None where they agree nowhere."""
     if len(observed.pairs) < MIN_PAIRS:
         return None
     turns, given_s = observed.turns(profile), profile.time_offset_s or 0.0
     coarse = align_coarsely(turns, capture.imu, profile)
     if coarse is None or coarse.explained < MIN_EXPLAINED or coarse.at_end:
         return None
-    far = FarClock(coarse.time_offset_s - given_s)
+    turned = tuple(map(tuple, coarse.rotation_cam_imu.tolist())) if coarse.axes_changed else None
+    far = FarStart(coarse.time_offset_s - given_s, axes=turned)
     if coarse.explained < WELL_EXPLAINED and (other := align_with_skew(turns, capture.imu, profile)) is not None:
         skewed, skew = other
         far = replace(far, skewed_offset_s=skewed.time_offset_s - given_s, skew=skew - profile.clock_skew)

@@ -80,6 +80,10 @@ def _applied(size: str, text: str) -> Callable[[CameraProfile], str]:
 
 GYRO_SCALE_OFF = 0.15
 """Makers trim gyroscopes to 3 % (BMI160, LSM6DSO, ICM-20602: sensitivity tolerance); five times that is a fault."""
+ANOTHER_LENS = 1.2
+"""In logarithms: a phone's lenses lie between 0.5 and 3 times the main one."""
+SENSOR_TURNED = 3.2
+"""Radians: a sensor may sit any way round, and drivers swap and turn its axes."""
 CLOCK_SKEW_OFF = 0.02
 """Crystals keep 1e-4, recorders that write another clock's rate 0.5 %."""
 
@@ -233,7 +237,7 @@ _POINTS = (
         "imu.T_cam_imu",
         "the gyroscope's axes are turned against the camera's",
         "the inertial sensor sits turned by {rotation_rad} rad against the camera",
-        Steps(by.rotate_imu, by.rotation_between, (1e-3,) * 3, (0.1,) * 3, (INF,) * 3, 1.0),
+        Steps(by.rotate_imu, by.rotation_between, (1e-3,) * 3, (0.1,) * 3, (INF,) * 3, SENSOR_TURNED),
         calibrated=Calibrated("rotation_rad", lambda p: None, by.keep_value("r_cam_imu"), 0.01),
     ),
     Effect(
@@ -243,7 +247,7 @@ _POINTS = (
         "intrinsics.fx_px, fy_px",
         "the focal length is another",
         "the focal length is {focal_scale} times the profile's",
-        Steps(by.scale_focal, _log_ratio(_focal), (1e-3,), (0.1,), (0.5,), 0.5),
+        Steps(by.scale_focal, _log_ratio(_focal), (1e-3,), (0.1,), (0.5,), ANOTHER_LENS),
         calibrated=Calibrated(
             "fx_px",
             lambda p: p.intrinsics.fx_px if p.intrinsics else None,

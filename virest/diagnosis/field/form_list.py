@@ -55,7 +55,8 @@ def possible_forms(
     drifts = [_drift_form(kind, knots, stamp, known) for kind in ("scale", "rate")]
     drifts += [_drift_form("delay", stamps, stamp, known), _drift_form("scale", fine, stamp, known, local=True)]
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
-    forms = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), *drifts]
+    places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
+    forms = [*places, *drifts]
     forms += step_forms(capture, coarse_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms += [_row_form(count) for count in (ROW_KNOTS, FINE_ROW_KNOTS)]
@@ -178,6 +179,27 @@ def _place_form(profile: CameraProfile, count: int) -> FieldForm:
     free, more = null_space(rows / np.linalg.norm(rows, axis=1, keepdims=True)), count + PLACE_KNOTS - 1
     refine = (lambda profile, _known: _place_form(profile, more)) if more <= MOST_PLACE_KNOTS else None
     return FieldForm((field,), free, build=lambda profile, _known: _place_form(profile, count), refine=refine)
+
+
+def _off_centre_form(profile: CameraProfile) -> FieldForm:
+    """A lens that is not centred, in its two numbers: weaker ones show in these than in a map of many.
+
+    Tangential distortion (Brown 1966) about the principal point; cubic splines say squares exactly.
+    """
+    lens = profile.intrinsics
+    assert lens is not None
+    knots = [np.linspace(0, side - 1, PLACE_KNOTS) for side in (profile.width, profile.height)]
+    half = 0.5 * max(profile.width, profile.height)
+    x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
+    u, v = (x - lens.cx_px) / half, (y - lens.cy_px) / half
+    r2 = u**2 + v**2
+    patterns = [np.stack(pair, axis=-1).ravel() for pair in ((2 * u * v, r2 + 2 * v**2), (r2 + 2 * u**2, 2 * u * v))]
+    return FieldForm(
+        (_zero("displacement", ("x", "y"), knots),),
+        np.linalg.qr(np.stack(patterns, axis=-1))[0],
+        build=lambda profile, _known: _off_centre_form(profile),
+        refine=lambda profile, _known: _place_form(profile, PLACE_KNOTS),
+    )
 
 
 def _drift_form(

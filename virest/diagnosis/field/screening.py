@@ -78,11 +78,15 @@ class Scored:
     @property
     def significant(self) -> bool:
         """Whether chance is ruled out and the gain holds wherever it was asked for."""
+        return self.holds(MIN_T)
+
+    def holds(self, least_t: float) -> bool:
+        """Whether chance is ruled out, and the gain is so many times its standard error wherever it was asked for."""
         if self.local:
-            return self.p_value < MAX_P and float(self.gain.sum()) > MIN_T * np.sqrt(HALVES_VARIANCE * self.numbers)
+            return self.p_value < MAX_P and float(self.gain.sum()) > least_t * np.sqrt(HALVES_VARIANCE * self.numbers)
         if self.parts_gain is None:
             return self.p_value < MAX_P and t_ratio(self.gain) > MIN_LOCAL_T
-        return self.p_value < MAX_P and all(t_ratio(gain) > MIN_T for gain in (self.gain, self.parts_gain))
+        return self.p_value < MAX_P and all(t_ratio(gain) > least_t for gain in (self.gain, self.parts_gain))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +146,12 @@ def score_forms(
     return sorted(scored, key=lambda s: -float(s.gain.sum()))
 
 
-def select(scored: Sequence[Scored], total_weight: float, seed: int = 1) -> Selection | None:
-    """The simplest of the forms that cannot be told from the best; None where none is significant or stable."""
-    good = [entry for entry in scored if entry.significant]
+def select(scored: Sequence[Scored], total_weight: float, seed: int = 1, least_t: float = MIN_T) -> Selection | None:
+    """The simplest of the forms that cannot be told from the best; None where none is significant or stable.
+
+    least_t: of what a form gains where it was not fitted; RIVAL_T where it is to take another explanation's place.
+    """
+    good = [entry for entry in scored if entry.holds(least_t)]
     if not good:
         return None
     least = ALIKE_PART * float(good[0].gain.sum())

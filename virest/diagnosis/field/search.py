@@ -19,7 +19,7 @@ from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
 from virest.diagnosis.field.forms import OVER, FieldForm
 from virest.diagnosis.field.records import FittedField
-from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, Design, Scored, Selection, score_forms, select
+from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, RIVAL_T, Design, Scored, Selection, score_forms, select
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
@@ -46,8 +46,10 @@ MIN_SIZE_PX = 0.025
 MIN_BLOCKS = 8
 DEPTH = "scene_depth"
 """A camera's path before a near plane says much that a gyroscope's errors do."""
+SCALE_OVER_TIME = f"scale{OVER}time"
+"""A step, or a curve that a step was compared with, is in the model: no other step is looked for."""
 LASTING_PART = 0.5
-"""Least part of the loss about a sudden change that goes by what the frames before and after say of it."""
+"""Least part of the excess loss about a sudden change that goes by what the frames before and after say of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +80,7 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     for _ in range(MAX_FIELDS):
         asked = _asked_for(evidence, capture, state.model, fitted)
         judged = _Judged(evidence, state.model, fitted)
-        steps = (_step(judged, found, state, one) for one in asked)
+        steps = (_best_step(judged, found, state, alternatives) for alternatives in asked)
         if (step := next((step for step in steps if step is not None), None)) is None:
             break
         chosen, entered, after = step
@@ -163,17 +165,29 @@ class _Judged:
         return self._known[by_point]
 
 
+def _best_step(
+    judged: _Judged, found: GeometricVerdict, state: _Description, alternatives: Sequence[_Asked]
+) -> tuple[_Asked, _Entered, _Description] | None:
+    """Of some forms the one that predicts held-out blocks best, in the model; None where none gains anything."""
+    steps = [step for one in alternatives if (step := _step(judged, found, state, one)) is not None]
+    return min(steps, key=lambda step: float(step[1].after.losses.mean()), default=None)
+
+
 def _step(
     judged: _Judged, found: GeometricVerdict, state: _Description, asked: _Asked
 ) -> tuple[_Asked, _Entered, _Description] | None:
-    """A form that was asked for, in the model, and all that stays beside it; None where it gains nothing."""
+    """A form that was asked for, in the model, and all that stays beside it; None where it gains nothing.
+
+    To take a cause's place a form must be the better rival; to be said beside all causes it must gain more surely.
+    """
     evidence, entered = judged.evidence, _entered(judged, asked)
     if entered is None:
         return None
     more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
     after = _without_stand_ins(evidence, found, more)
-    small = asked.selection is not None and asked.selection.size * evidence.typical_px < MIN_SIZE_PX
-    return None if small and len(after.accepted) == len(state.accepted) else (asked, entered, after)
+    gained_px = np.sqrt(max(entered.before.rms**2 - entered.after.rms**2, 0.0)) * evidence.typical_px
+    small = asked.selection is not None and gained_px < MIN_SIZE_PX
+    return None if (small or asked.instead) and len(after.accepted) == len(state.accepted) else (asked, entered, after)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +197,8 @@ class _Asked:
     form: FieldForm
     selection: Selection | None = None
     sudden: SuddenChange | None = None
+    instead: bool = False
+    """Whether it may only enter where a cause leaves: what is there is said one way or the other."""
 
     @property
     def p_value(self) -> float:
@@ -195,9 +211,10 @@ class _Asked:
         return self.selection.rivals if self.selection else ()
 
 
-def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> Iterator[_Asked]:
-    """The forms that the residuals of a model ask for, and how sure that is.
+def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> Iterator[tuple[_Asked, ...]]:
+    """The forms that the residuals of a model ask for, and how sure that is; those asked at once are alternatives.
 
+    A focal length that settles quickly grows most between two frames too, and a sudden change is a curve of sorts.
     Pairs of covariates, and curves over a few frames, come last and beside all that the plain forms can do.
     """
     table = evidence.table(model, SEARCH_POINTS)
@@ -216,24 +233,30 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     blind_s = FRAMES_PER_STEP * evidence.period_s
     search = _Search(seen, block, blind_s, len(alone) + len(pairs))
     forms = [form for form in alone if form.family not in in_model]
-    if (sudden := sudden_change(seen)) is not None and not any(", a step" in name for name in in_model):
+    plain: list[_Asked] = []
+    sudden = None if any(name.startswith(SCALE_OVER_TIME) for name in in_model) else sudden_change(seen)
+    if sudden is not None:
         form = best_instant(seen, capture, sudden.at_s, sudden.scale, evidence.period_s)
-        yield _Asked(form, sudden=sudden)
+        plain.append(_Asked(form, sudden=sudden))
     smooth = [form for form in forms if not form.local]
-    if (selection := search.best(tangent, smooth)) is not None:
+    scored = search.scored(tangent, smooth)
+    selection = search.best(scored)
+    instead = selection is None and any(OVER not in name for name in in_model)
+    if (selection := search.best(scored, RIVAL_T) if instead else selection) is not None:
         form = smooth[selection.best.place]
         if form.step_s is not None:
             scale = lasting_change(seen, tangent, search.effect(form))
             form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
-        yield _Asked(form, selection)
+        plain.append(_Asked(form, selection, instead=instead))
+    yield tuple(plain)
     forms = [form for form in (*forms, *pairs) if form.local or (form.is_pair and form.family not in in_model)]
-    plain = {form.family: form for form in reversed(alone) if not form.local and form.step_s is None}
-    tangent = np.concatenate([tangent, *(search.effect(form) for form in plain.values())], axis=-1)
-    if (selection := search.best(tangent, forms)) is not None:
-        yield _Asked(forms[selection.best.place], selection)
+    smooth = list({form.family: form for form in reversed(alone) if not form.local and form.step_s is None}.values())
+    tangent = np.concatenate([tangent, *map(search.effect, smooth)], axis=-1)
+    if (selection := search.best(search.scored(tangent, forms))) is not None:
+        yield (_Asked(forms[selection.best.place], selection),)
     elif sudden is not None:
         # one that comes back: of a few frames, whose signs are too few for a test by flips
-        yield from (_Asked(form, sudden=sudden) for form in forms if form.local and form.kind == "scale")
+        yield from ((_Asked(form, sudden=sudden),) for form in forms if form.local and form.kind == "scale")
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,12 +273,12 @@ class _Search:
     _effects: dict[int, tuple[FieldForm, Array]] = field(default_factory=dict, repr=False)
     """By the identity of their form, which is kept so that no other takes its number."""
 
-    def best(self, tangent: Array, forms: Sequence[FieldForm]) -> Selection | None:
-        """The form that residuals ask for beside a tangent space (n, 2, m), if any."""
-        return select(self.scored(tangent, forms), float(self.seen.weight.sum()))
+    def best(self, scored: Sequence[Scored], least_t: float = MIN_T) -> Selection | None:
+        """The form that residuals ask for, if any."""
+        return select(scored, float(self.seen.weight.sum()), least_t=least_t)
 
     def scored(self, tangent: Array, forms: Sequence[FieldForm]) -> list[Scored]:
-        """Scores of forms, best gain first; of the forms of one field the best alone."""
+        """Scores of forms beside a tangent space (n, 2, m), best gain first; of the forms of one field the best."""
         designs = [Design(form.name, self.effect(form), form.over_time, form.local) for form in forms]
         best: dict[str, Scored] = {}
 
@@ -317,12 +340,15 @@ def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
     before, after = judged.held_out(form.local), _held_out(evidence, extended, fitted, form.local)
     gain = before.block_loss - after.block_loss
     log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
-    holds = t_ratio(gain) > (MIN_LOCAL_T if form.over_time and not form.local else MIN_T)
+    least_t = RIVAL_T if asked.instead else MIN_T
+    holds = t_ratio(gain) > (MIN_LOCAL_T if form.over_time and not form.local else least_t)
     if asked.sudden is not None and not form.local:
         # most of the gain lies in one block; that of the others tells the change, and it must hold there
         there = asked.sudden.pair // PAIRS_IN_BLOCK
-        holds = bool(gain[there] > LASTING_PART * before.block_loss[there])
-    if gain.mean() < MIN_GAIN * before.block_loss.mean() or after.rms > before.rms or not holds:
+        excess = max(before.block_loss[there] - float(np.median(before.block_loss)), 0.0)
+        holds = bool(gain[there] > LASTING_PART * excess)
+    least_gain = 0.0 if asked.instead else MIN_GAIN
+    if gain.mean() < least_gain * before.block_loss.mean() or after.rms > before.rms or not holds:
         return None
     return _refined(evidence, model, _Entered(extended, form, before, after), fitted)
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals
-from virest.diagnosis.field.form_list import step_forms
+from virest.diagnosis.field.form_list import FRAMES_PER_STEP, step_forms
 from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
 
@@ -22,8 +22,9 @@ Array = NDArray[np.float64]
 CHANCE = 1e-4
 """Family-wise false-alarm rate: of any pair of a capture growing this much by chance."""
 LEAST_POINTS, LEAST_PAIRS = 8, 15
-INSTANTS, REACH = 49, 1.5
-"""Instants that are tried, over this many frames before and after."""
+INSTANTS, REACH = 97, FRAMES_PER_STEP + 1.0
+"""Instants that are tried, over this many frames before and after: a first look passes over as many about a change,
+and lies half as many off itself."""
 CAUCHY = 2.5
 """In standard deviations."""
 _ITERATIONS = 8
