@@ -275,3 +275,24 @@ def test_stripes_across_a_short_path_are_no_noise(length_px: float, turned_deg: 
     noisy = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
     luma, _ = measure_picture(np.repeat(noisy[..., None], 3, -1), field, STRAIGHT)
     assert luma.noise_levels < 3
+
+
+@pytest.mark.parametrize("std_px", [0.1, 0.6, 2.0])
+def test_a_misplaced_picture_gains_what_its_spectrum_says(std_px: float) -> None:
+    """Errors of restored and recorded power, averaged over many shifts, are those that the record foretells."""
+    frequency = (np.arange(24) + 0.5) / 48
+    signal, passed, noise = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2)), np.full(24, 0.01)
+    found = PictureStatistics(frequency, signal, noise, passed, 1.0)
+    rng, area = np.random.default_rng(4), 2 * np.pi * frequency / 48
+    phase = 2 * np.pi * frequency * rng.normal(0, std_px, (20000, 1))
+    filtered = passed * signal / (passed * signal + noise)
+
+    def missing(kept: NDArray[np.float64], moved: NDArray[np.float64]) -> float:
+        return float(np.mean((np.abs(1 - kept * np.exp(1j * moved)) ** 2 * signal) @ area))
+
+    recorded, restored, recorded_off, restored_off = (
+        missing(kept, moved) for moved in (0 * phase[:1], phase) for kept in (np.sqrt(passed), filtered)
+    )
+    misplaced = found.misplaced(std_px, np.zeros(24))
+    assert misplaced.error == pytest.approx(restored_off - restored, rel=0.03)
+    assert misplaced.part == pytest.approx(max((recorded_off - restored_off) / (recorded - restored), 0), abs=0.02)

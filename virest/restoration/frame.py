@@ -137,7 +137,8 @@ def restore_frame(
     deblurring: Deblurring | None = None
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, light, coding_step)
+        place_std_px = refined.place_std_px() if refined is not None and straighten else 0.0
+        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, place_std_px, light, coding_step)
         restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _relit(picture, curve, light)
@@ -253,6 +254,8 @@ class _KnownBlur:
     """Length of the longest path, defocus included."""
     covariance_px2: NDArray[np.float64]
     """(2, 2) of the path."""
+    place_std_px: float
+    """Of where straightening puts the rows, each axis."""
     light: FrameLight | None
     """Flicker and vignetting; None: neither."""
     coding_step: float | None
@@ -371,7 +374,8 @@ def _details(
     """How a frame was deblurred.  changed: mean square of what restoring changed, grey levels."""
     model = measured.luma_model
     ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
-    gain_db = None if confirmed is None else confirmed.of_change_db(changed, model.blur_error, ideal)
+    misplaced = model.misplaced(blur.place_std_px, joined.passed)
+    gain_db = None if confirmed is None else confirmed.of_change_db(changed, model.blur_error, ideal, misplaced)
     return Deblurring(
         method=settings.deblur,
         preset=settings.preset,

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.inference.chance import student_deviation
+from virest.restoration.statistics.records import Misplaced
 
 LEAST_PAIRS = 2
 """A single one has no scatter."""
@@ -34,6 +35,8 @@ Each of the two tells it to a factor only.  ``python -m virest.app.bench --only 
 truth: 3.35 ± 0.47, 0.64 ± 0.12, 0.28 ± 0.07 on 14 captures, together to 0.70 dB in the median."""
 LEFT_OVER_STD = 0.49
 """One standard deviation of that logarithm; by the same bench."""
+IN_PLACE = Misplaced()
+"""Rows that are where they belong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +63,16 @@ class ConfirmedGain:
         """
         return float(np.clip(1 - 0.5 * (1 - self.share) / (1 + further), 0.0, 1.0))
 
-    def of_change_db(self, changed: float, lost: float, ideal: float) -> tuple[float, float]:
+    def of_change_db(
+        self, changed: float, lost: float, ideal: float, misplaced: Misplaced = IN_PLACE
+    ) -> tuple[float, float]:
         """The gain of a restored picture that differs by ``changed`` from the recorded one, and its deviation.
 
         Mean squares in grey levels; lost: what the blur took, ideal: what an ideal filter would leave, by the spectra.
+        misplaced: what rows that lie wrong make of that.
         """
-        over = removed(changed, lost) / float(np.exp(tellers(ideal, self.left) @ np.array(LEFT_OVER)))
+        left = float(np.exp(tellers(ideal, self.left) @ np.array(LEFT_OVER)))
+        over = misplaced.part * removed(changed, lost) / (left + misplaced.error)
         slope = 10 / np.log(10) * over / (1 + over)
         return 10 * float(np.log10(1 + over)), float(slope * np.hypot(LEFT_OVER_STD, self.std))
 
