@@ -13,7 +13,7 @@ from virest.image_formation.kernels import KernelField
 from virest.restoration.statistics import ring_fit, tile_power
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.on_tiles import on_spectrum
-from virest.restoration.statistics.records import PictureStatistics
+from virest.restoration.statistics.records import PictureStatistics, coder_noise
 from virest.restoration.statistics.rings import ring_index
 
 HEIGHT, WIDTH = 420, 560
@@ -296,3 +296,17 @@ def test_a_misplaced_picture_gains_what_its_spectrum_says(std_px: float) -> None
     misplaced = found.misplaced(std_px, np.zeros(24))
     assert misplaced.error == pytest.approx(restored_off - restored, rel=0.03)
     assert misplaced.part == pytest.approx(max((recorded_off - restored_off) / (recorded - restored), 0), abs=0.02)
+
+
+def test_no_frame_has_less_than_its_coders_noise() -> None:
+    """Noise that was missed is put in, its level grows with it, and noise that was measured stays."""
+    frequency = (np.arange(24) + 0.5) / 48
+    signal, passed = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2))
+    missed, found = (PictureStatistics(frequency, signal, np.full(24, n), passed, np.sqrt(n)) for n in (0.2, 400.0))
+    least = missed.with_coder_noise(30.0, 0.5)
+    recorded = passed * signal + missed.noise
+    assert np.all(least.noise >= missed.noise)
+    assert np.all(least.noise <= np.maximum(0.5 * recorded, missed.noise) + 1e-9)
+    assert least.noise[0] == pytest.approx(0.5 * coder_noise(recorded, 30.0)[0])
+    assert least.noise_levels > 2 * missed.noise_levels
+    assert found.with_coder_noise(30.0, 0.5).noise_levels == pytest.approx(found.noise_levels)
