@@ -35,7 +35,6 @@ def _steps(path: Path, codec: str, options: dict[str, str]) -> tuple[dict[int, f
     ("codec", "options", "step"),
     [
         ("libx264", {"qp": "30", "aq-mode": "0"}, 0.625 * 2 ** (27 / 6)),  # x264 codes key frames by 3 finer
-        ("mpeg4", {"qmin": "8", "qmax": "8"}, 16.0),
         ("libvpx-vp9", {"qmin": "40", "qmax": "40", "b": "0", "crf": "40"}, 305 / 8),  # its index 160
     ],
 )

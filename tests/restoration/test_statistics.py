@@ -310,3 +310,18 @@ def test_no_frame_has_less_than_its_coders_noise() -> None:
     assert least.noise[0] == pytest.approx(0.5 * coder_noise(recorded, 30.0)[0])
     assert least.noise_levels > 2 * missed.noise_levels
     assert found.with_coder_noise(30.0, 0.5).noise_levels == pytest.approx(found.noise_levels)
+
+
+def test_colour_is_measured_where_it_is() -> None:
+    """Beside grey stripes, which held every other tile, colours have the spectrum that they have alone."""
+    field = _field()
+    grey, sharp = _blurred(field, 1.0)
+    other = cv2.filter2D(255 * (0.3 + 0.4 * texture(HEIGHT, WIDTH, seed=9)), -1, field.arrays()[0].astype(float))
+    coloured = grey.copy()
+    coloured[..., 0] = np.clip(np.rint(other + np.random.default_rng(2).normal(0, 1, sharp.shape)), 0, 255)
+    striped = coloured.copy()
+    for left in (0, 256):  # of the first and of the third column of tiles
+        striped[:, left : left + 128] = grey[:, left : left + 128]
+    everywhere, here_and_there = (measure_picture(p, field, STRAIGHT)[1] for p in (coloured, striped))
+    np.testing.assert_allclose(here_and_there.signal[1:8], everywhere.signal[1:8], rtol=0.7)
+    assert here_and_there.noise_to_signal[2] < 3 * everywhere.noise_to_signal[2]
