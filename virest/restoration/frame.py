@@ -330,8 +330,8 @@ def _blur_statistics(
     step = None if few and blur.covariance_px2.any() else blur.coding_step
     field = smooth_field(blur.motion, blur.anchor)
     luma, chroma = picture_statistics(picture, field(centres_px), curve, FEW_TILES if few else MANY_TILES, step)
-    if few and blur.coding_step is not None:
-        luma = luma.with_coder_noise(blur.coding_step, LEAST_CODER_NOISE)
+    if few and step is not None:
+        luma = luma.with_coder_noise(step, LEAST_CODER_NOISE)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
     luma_model = luma.doubted_by(spread)
     share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)
