@@ -12,10 +12,11 @@ def test_known_coefficients_come_back():
     rng, law = np.random.default_rng(3), np.array([2.0, 0.5, 0.2])
     rows = []
     for k in range(240):
-        ideal, removed, left = np.exp(rng.normal((3.5, 4.0, -4.0), (0.8, 1.0, 1.0)))
+        ideal, removed, left, misplaced = np.exp(rng.normal((3.5, 4.0, -4.0, 1.0), (0.8, 1.0, 1.0, 1.0)))
         logarithms = np.log([np.e, ideal, left])
-        gain_db = 10 * np.log10(1 + removed / np.exp(logarithms @ law)) + rng.normal(0, 0.05)
-        rows.append({"capture": f"c{k % 8}", "removed": removed, "logarithms": logarithms, "gain_db": gain_db})
+        gain_db = 10 * np.log10(1 + removed / (np.exp(logarithms @ law) + misplaced)) + rng.normal(0, 0.05)
+        row = {"capture": f"c{k % 8}", "removed": removed, "misplaced": misplaced}
+        rows.append({**row, "logarithms": logarithms, "gain_db": gain_db})
     found = fit_left_over(rows)
     assert found["coefficients"] == pytest.approx(law, abs=0.08)
     assert np.all(np.array(found["std"]) < 0.1)

@@ -13,7 +13,7 @@ from virest.image_formation.kernels import KernelField
 from virest.restoration.statistics import ring_fit, tile_power
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.on_tiles import on_spectrum
-from virest.restoration.statistics.records import PictureStatistics
+from virest.restoration.statistics.records import PictureStatistics, coder_noise
 from virest.restoration.statistics.rings import ring_index
 
 HEIGHT, WIDTH = 420, 560
@@ -275,3 +275,53 @@ def test_stripes_across_a_short_path_are_no_noise(length_px: float, turned_deg: 
     noisy = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
     luma, _ = measure_picture(np.repeat(noisy[..., None], 3, -1), field, STRAIGHT)
     assert luma.noise_levels < 3
+
+
+@pytest.mark.parametrize("std_px", [0.1, 0.6, 2.0])
+def test_a_misplaced_picture_gains_what_its_spectrum_says(std_px: float) -> None:
+    """Errors of restored and recorded power, averaged over many shifts, are those that the record foretells."""
+    frequency = (np.arange(24) + 0.5) / 48
+    signal, passed, noise = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2)), np.full(24, 0.01)
+    found = PictureStatistics(frequency, signal, noise, passed, 1.0)
+    rng, area = np.random.default_rng(4), 2 * np.pi * frequency / 48
+    phase = 2 * np.pi * frequency * rng.normal(0, std_px, (20000, 1))
+    filtered = passed * signal / (passed * signal + noise)
+
+    def missing(kept: NDArray[np.float64], moved: NDArray[np.float64]) -> float:
+        return float(np.mean((np.abs(1 - kept * np.exp(1j * moved)) ** 2 * signal) @ area))
+
+    recorded, restored, recorded_off, restored_off = (
+        missing(kept, moved) for moved in (0 * phase[:1], phase) for kept in (np.sqrt(passed), filtered)
+    )
+    misplaced = found.misplaced(std_px, np.zeros(24))
+    assert misplaced.error == pytest.approx(restored_off - restored, rel=0.03)
+    assert misplaced.part == pytest.approx(max((recorded_off - restored_off) / (recorded - restored), 0), abs=0.02)
+
+
+def test_no_frame_has_less_than_its_coders_noise() -> None:
+    """Noise that was missed is put in, its level grows with it, and noise that was measured stays."""
+    frequency = (np.arange(24) + 0.5) / 48
+    signal, passed = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2))
+    missed, found = (PictureStatistics(frequency, signal, np.full(24, n), passed, np.sqrt(n)) for n in (0.2, 400.0))
+    least = missed.with_coder_noise(30.0, 0.5)
+    recorded = passed * signal + missed.noise
+    assert np.all(least.noise >= missed.noise)
+    assert np.all(least.noise <= np.maximum(0.5 * recorded, missed.noise) + 1e-9)
+    assert least.noise[0] == pytest.approx(0.5 * coder_noise(recorded, 30.0)[0])
+    assert least.noise_levels > 2 * missed.noise_levels
+    assert found.with_coder_noise(30.0, 0.5).noise_levels == pytest.approx(found.noise_levels)
+
+
+def test_colour_is_measured_where_it_is() -> None:
+    """Beside grey stripes, which held every other tile, colours have the spectrum that they have alone."""
+    field = _field()
+    grey, sharp = _blurred(field, 1.0)
+    other = cv2.filter2D(255 * (0.3 + 0.4 * texture(HEIGHT, WIDTH, seed=9)), -1, field.arrays()[0].astype(float))
+    coloured = grey.copy()
+    coloured[..., 0] = np.clip(np.rint(other + np.random.default_rng(2).normal(0, 1, sharp.shape)), 0, 255)
+    striped = coloured.copy()
+    for left in (0, 256):  # of the first and of the third column of tiles
+        striped[:, left : left + 128] = grey[:, left : left + 128]
+    everywhere, here_and_there = (measure_picture(p, field, STRAIGHT)[1] for p in (coloured, striped))
+    np.testing.assert_allclose(here_and_there.signal[1:8], everywhere.signal[1:8], rtol=0.7)
+    assert here_and_there.noise_to_signal[2] < 3 * everywhere.noise_to_signal[2]

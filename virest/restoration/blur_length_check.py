@@ -23,7 +23,8 @@ from virest.camera.response import ResponseCurve
 from virest.image_formation.kernels import blur_chords, smooth_field
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import CLIPPED_LEVELS
-from virest.restoration.statistics.ring_fit import ROUNDING_POWER, RingCells
+from virest.restoration.statistics.records import ROUNDING_POWER
+from virest.restoration.statistics.ring_fit import RingCells
 from virest.restoration.statistics.rings import RINGS, SIDE
 from virest.restoration.statistics.tile_power import MANY_TILES, cut, evenly_steep, passed_power, windowed_power
 

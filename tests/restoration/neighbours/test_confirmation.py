@@ -5,6 +5,7 @@ import pytest
 
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
 from virest.restoration.neighbours.survey import lively_frames
+from virest.restoration.statistics.records import Misplaced
 
 FRAMES, PLACES = 2000, 16
 
@@ -62,6 +63,17 @@ def test_a_larger_change_promises_more_and_a_larger_rest_less():
     assert all(0 < gain_db < much[0] for gain_db, _ in less)
     assert all(deviation > 0 for _, deviation in (much, *less))
     assert found.of_change_db(0.0, 80.0, 30.0)[0] == 0.0
+
+
+def test_rows_that_lie_wrong_promise_less():
+    """Both what is removed and what is left count; where nothing is removed, nothing is promised."""
+    found = ConfirmedGain(1.0, 0.2, 0.02, 4)
+    in_place, less, off = (
+        found.of_change_db(50.0, 80.0, 30.0, misplaced)[0]
+        for misplaced in (Misplaced(), Misplaced(0.8), Misplaced(0.8, 100.0))
+    )
+    assert 0 < off < less < in_place
+    assert found.of_change_db(50.0, 80.0, 30.0, Misplaced(0.0, 200.0))[0] == 0.0
 
 
 def test_neighbours_that_lack_something_else_confirm_nothing():

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from laws import TurningCamera, phone
 
 from virest.motion.trajectory import Trajectory
-from virest.restoration.neighbours.refinement import FollowingTurn, believed_turn, following_turn
+from virest.restoration.neighbours.refinement import FollowingTurn, RefinedMotion, believed_turn, following_turn
 from virest.restoration.neighbours.registration import PairTurn
 
 PERIOD_S = 1 / 30
@@ -74,3 +75,14 @@ def test_a_rest_that_interpolation_tells_better_follows_nothing(rng: np.random.G
     assert following.lag_s == pytest.approx(0.004, abs=5e-4)
     assert bend is not None
     assert bend < 0.01**2
+
+
+def test_rows_lie_off_by_what_is_unknown_of_the_speed() -> None:
+    """Over rows read long after the restored instant an unknown speed carries them further than over the exposure."""
+    motion = TurningCamera(phone()).motion
+    refined = RefinedMotion(motion, np.zeros((3, 3)), scatter_px_s=30.0)
+    middles_s = motion.start_s + motion.readout_time_s * np.linspace(0, 1, 2001) + 0.5 * motion.exposure_s
+    speed_px_s = np.sqrt(np.trace(refined.path_covariance_px2()) / 2) / motion.exposure_s
+    off_px = speed_px_s * (middles_s - motion.reference_s)
+    assert refined.place_std_px() == pytest.approx(np.sqrt(np.mean(off_px**2)), rel=1e-3)
+    assert RefinedMotion(motion, np.zeros((3, 3)), 0.0).place_std_px() == 0.0

@@ -28,6 +28,7 @@ from virest.restoration.neighbours import confirmation
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.settings import PRESETS
 from virest.restoration.statistics import of_picture, ring_fit
+from virest.restoration.statistics.records import Misplaced
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -84,7 +85,8 @@ def fit_workloads(scale: Scale) -> list[Workload]:
 def fit_left_over(rows: Sequence[Row]) -> Row:
     """Coefficients of :data:`confirmation.LEFT_OVER` that promise the gains best, their deviations, and the scatter.
 
-    rows: with ``capture``, ``removed``, ``logarithms`` (1, ln ideal, ln left) and ``gain_db``.  Captures count alike.
+    rows: with ``capture``, ``removed``, ``misplaced``, ``logarithms`` (1, ln ideal, ln left) and ``gain_db``.  Captures
+    count alike.
     """
     captures = np.array([row["capture"] for row in rows])
     names = list(dict.fromkeys(captures.tolist()))
@@ -119,11 +121,13 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 class _Watched(ConfirmedGain):
     """Keeps what it is asked about."""
 
-    asked: list[tuple[float, float, float]] = field(default_factory=list)
+    asked: list[tuple[float, float, float, Misplaced]] = field(default_factory=list)
 
-    def of_change_db(self, changed: float, lost: float, ideal: float) -> tuple[float, float]:
-        self.asked.append((changed, lost, ideal))
-        return ConfirmedGain.of_change_db(self, changed, lost, ideal)
+    def of_change_db(
+        self, changed: float, lost: float, ideal: float, misplaced: Misplaced = confirmation.IN_PLACE
+    ) -> tuple[float, float]:
+        self.asked.append((changed, lost, ideal, misplaced))
+        return ConfirmedGain.of_change_db(self, changed, lost, ideal, misplaced)
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:
@@ -152,13 +156,14 @@ def _promises(
         for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=watched)):
             if restored.degradation is None or restored.degradation.deblur is None:
                 continue
-            changed, lost, ideal = watched.asked[-1]
+            changed, lost, ideal, misplaced = watched.asked[-1]
             before_db, valid_px = straight_db[restored.frame.index]
             yield {
                 "capture": workload.name,
                 "preset": preset,
                 "frame": restored.frame.index,
-                "removed": confirmation.removed(changed, lost),
+                "removed": misplaced.part * confirmation.removed(changed, lost),
+                "misplaced": misplaced.error,
                 "logarithms": confirmation.tellers(ideal, watched.left).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
@@ -181,8 +186,8 @@ def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straig
 
 
 def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
-    logarithms, removed = (np.array([row[k] for row in rows]) for k in ("logarithms", "removed"))
-    return np.asarray(10 * np.log10(1 + removed / np.exp(logarithms @ coefficients)))
+    logarithms, gone, off = (np.array([row[k] for row in rows]) for k in ("logarithms", "removed", "misplaced"))
+    return np.asarray(10 * np.log10(1 + gone / (np.exp(logarithms @ coefficients) + off)))
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:

@@ -177,12 +177,19 @@ DEFOCUSED = (
     _defocused("defocused-more", "text", 8.0, 1.0, 2.8),
 )
 """Each with its true profile: a right model that must not ruin the frames."""
+SHORT = (
+    _workload("short", "ordinary", (0.0, 6.0), "photographs", 8.0, 0.8, 1.5),
+    _workload("short-leaves", "ordinary", (0.0, 6.0), "leaves", 9.0, 0.9, 2.0),
+    _phone("short", "photographs", 9.0, 0.8, 1.5, (0.0, 6.0)),
+    _phone("short-sharp", "leaves", 8.0, 0.9, 1.5, (0.0, 6.0), sharpen=0.8, offset_s=0.002),
+)
+"""Blur of 1 to 5 px, where little is to be gained and a promise is easily too high."""
 HONEST_QUICK = ("leaves", "phone-fast", "phone-stabilised", "defocused-calm")
 
 
 def honesty_workloads(scale: Scale) -> list[Workload]:
-    """Choose the captures of the honesty table: obedient, defocused, phones; with --quick four of six frames."""
-    every = [*(w for w in WORKLOADS if not w.name.endswith("-p")), *DEFOCUSED, *PHONES]
+    """Choose the captures of the honesty table: all kinds, and short blur; with --quick four of six frames."""
+    every = [*(w for w in WORKLOADS if not w.name.endswith("-p")), *DEFOCUSED, *PHONES, *SHORT]
     return [_shortened(w, 6) for w in every if w.name in HONEST_QUICK] if scale.quick else every
 
 

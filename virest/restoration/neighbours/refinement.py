@@ -146,6 +146,21 @@ class RefinedMotion:
         spread = jacobian @ self.rate_covariance @ jacobian.T + self.scatter_px_s**2 * np.eye(2)
         return np.asarray(spread * self.motion.exposure_s**2)
 
+    def place_std_px(self) -> float:
+        """How well it is known where rows belong, as the middles of their exposures show them: rms, each axis.
+
+        What is unknown of the speed adds up over the time from the instant that is restored.
+        """
+        motion = self.motion
+        if motion.exposure_s <= 0:
+            return 0.0
+        first, last = (
+            (time_s - motion.reference_s) / motion.exposure_s
+            for time_s in (motion.start_s + 0.5 * motion.exposure_s, motion.end_s - 0.5 * motion.exposure_s)
+        )
+        square = (first**2 + first * last + last**2) / 3
+        return float(np.sqrt(square * np.trace(self.path_covariance_px2()) / 2))
+
 
 def missing_turn(
     runs: Sequence[Sequence[PairTurn | None]], motions: Sequence[RowMotion], trajectory: Trajectory

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -56,20 +57,20 @@ def measure_picture(
 
     parts = [_planes(cut(picture, corners[i])) for i in chosen]
 
-    def observed(plane: int, every: int) -> NDArray[np.float32]:
-        tiles = zip(parts[::every], known[::every], strict=True)
-        return np.stack([windowed_power(part[plane], seen) for part, seen in tiles])
+    def observed(plane: int, tiles: Iterable[int]) -> NDArray[np.float32]:
+        return np.stack([windowed_power(parts[i][plane], known[i]) for i in tiles])
 
     tiles = zip(chosen, known, strict=True)
     light = np.stack(
         [windowed_power(evenly_steep(_luma_light(cut(picture, corners[i]), curve), curve), seen) for i, seen in tiles]
     )
     luma, *red_blue = _planes(_some_rows(picture))
-    cells, white_levels, grey = RingCells(passed), white_noise(luma), observed(0, 1)
+    cells, white_levels, grey = RingCells(passed), white_noise(luma), observed(0, range(len(parts)))
     spectra, colour = [(light, cells, white_levels, coding_step), (grey, cells, white_levels, coding_step)], grey
     if red_blue:
-        colour = (observed(1, 2) + observed(2, 2)) * np.float32(0.5)
-        spectra.append((colour, RingCells(passed[::2]), white_noise(red_blue[0]), None))
+        colourful = _most_colourful(parts)
+        colour = (observed(1, colourful) + observed(2, colourful)) * np.float32(0.5)
+        spectra.append((colour, RingCells(passed[colourful]), white_noise(red_blue[0]), None))
     of_light, of_luma, *of_chroma = fit_rings(*spectra)
     of_luma = replace(
         of_luma,
@@ -83,13 +84,22 @@ def measure_picture(
     if not of_chroma:
         return of_luma, of_luma
     if weight:
-        of_chroma = [replace(of_chroma[0], places=place_statistics(of_chroma[0], colour, passed[::2], weight))]
+        of_chroma = [replace(of_chroma[0], places=place_statistics(of_chroma[0], colour, passed[colourful], weight))]
     return of_luma, of_chroma[0]
 
 
 def _planes(picture: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     """Luma and both colour differences of a picture (height, width, 3); a luma (height, width) by itself."""
     return (picture,) if picture.ndim == 2 else tuple(cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb)))
+
+
+def _most_colourful(parts: Sequence[tuple[NDArray[np.uint8], ...]]) -> NDArray[np.intp]:
+    """Numbers of the half of the tiles whose colours vary most, rising.
+
+    What others hold tells of no colour, and the filter that is best for them takes away what these have.
+    """
+    spread = [sum(float(cv2.meanStdDev(plane)[1][0, 0]) ** 2 for plane in part[1:]) for part in parts]
+    return np.sort(np.argsort(spread)[len(parts) // 2 :])
 
 
 def _less_one(kernel: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.restoration.statistics.records import PictureStatistics, PlaceStatistics
-from virest.restoration.statistics.ring_fit import ROUNDING_POWER
+from virest.restoration.statistics.records import ROUNDING_POWER, PictureStatistics, PlaceStatistics
 from virest.restoration.statistics.rings import RINGS, axes, place_ring
 from virest.restoration.statistics.tile_power import MANY_TILES
 

@@ -18,6 +18,11 @@ _EDGES_BEYOND = 2.0
 """A picture's edges exceed its mean spectrum by this factor: rings of tiles have the mean of edge and plain surface."""
 _DETAIL_SLOPE = 3.0
 """The power of a natural picture falls with frequency about like f⁻³."""
+ROUNDING_POWER = 1 / 12
+_DEAD_ZONE = 5 / 6
+"""Part of its step below which an H.264 coder leaves a coefficient out, and of a further step at which it rounds up."""
+_CODER_SHARE = (_DEAD_ZONE**3 + (1 - _DEAD_ZONE) ** 3) / 3
+"""Error that leaves, as part of the step's square: of a remainder that is anywhere between two steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +51,16 @@ class PlaceStatistics:
         through = self.passed * s
         left = np.sum((1 - np.sqrt(self.passed)) ** 2 * s + np.minimum(n, through))
         return max(float(10 * np.log10(left / np.sum(s * n / (through + n)))), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Misplaced:
+    """What restoring gains in a picture whose rows are not quite where they belong."""
+
+    part: float = 1.0
+    """Of the squared error that it would remove in its place: sharp edges beside their place are no better."""
+    error: float = 0.0
+    """Mean square, in grey levels, that is left for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +137,17 @@ class PictureStatistics:
         It comes from edges, whose power lies everywhere; a grating's, which lies at few places, is as it is.
         """
         share *= 1 - self.unevenness
-        if not self.measured or not share:
+        return self._with_noise(self.noise + share * self.signal) if self.measured and share else self
+
+    def with_coder_noise(self, step: float, share: float) -> PictureStatistics:
+        """With no less than ``share`` of the noise that a quantiser of such a step leaves, grey levels."""
+        if not self.measured:
             return self
-        noise = self.noise + share * self.signal
+        least = share * coder_noise(self.passed * self.signal + self.noise, step)
+        return self._with_noise(np.maximum(self.noise, least))
+
+    def _with_noise(self, noise: Array) -> PictureStatistics:
+        """With more noise (RINGS,), and a level that has grown as the noise where it weighs."""
         through = self.frequency * self.passed * self.signal
         before, after = (
             np.sum(through * n * n / (self.passed * self.signal + n) ** 2)
@@ -169,6 +192,19 @@ class PictureStatistics:
         """Mean square, in grey levels, of what the picture misses for its blur."""
         return float(self._area() @ self._lost())
 
+    def misplaced(self, std_px: float, further: Array) -> Misplaced:
+        """What rows that lie wrong by ``std_px``, each axis, make of restoring; further: as of :meth:`joint_gain_db`.
+
+        Of power S at f, restored to a part R and moved by δ, |1 − R e^{2πi f δ}|² S is missing: 1 − 2 c R + R² in the
+        mean, with c = exp(−½ (2π f σ)²) for normal δ, and as much with √|K|² for R where nothing was restored.
+        """
+        passed, c = self.passed + further, np.exp(-0.5 * (2 * np.pi * self.frequency * std_px) ** 2)
+        restored, power = passed * self.signal / (passed * self.signal + self.noise), self._area() * self.signal
+        rise, fall = restored - np.sqrt(self.passed), restored**2 - self.passed
+        placed, moved = (float(power @ (2 * kept * rise - fall)) for kept in (np.ones_like(c), c))
+        part = float(np.clip(moved / placed, 0.0, 1.0)) if placed > 0 else 1.0
+        return Misplaced(part, float(power @ (2 * (1 - c) * restored)))
+
     def _area(self) -> Array:
         return np.asarray(2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]))
 
@@ -183,6 +219,17 @@ class PictureStatistics:
         signal, noise, passed = self.signal[:, None], self.noise[:, None], passed + further[:, None]
         wrong = count * signal * noise / (passed * signal + noise)
         return np.asarray(wrong.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
+
+
+def coder_noise(observed: Array, step: float) -> Array:
+    """Noise (RINGS,) that a coder leaves in a picture, by the step of its quantiser.
+
+    Of what stands far above the step an error of the step's own, and what lies far below it is left out: reverse
+    water-filling (Cover & Thomas 2006, section 10.3.3), smooth between the two, for rings hold weak and strong places.
+    """
+    level = max(_CODER_SHARE * step**2, ROUNDING_POWER)
+    falling = np.maximum(np.maximum.accumulate(observed[::-1])[::-1], ROUNDING_POWER)
+    return np.asarray(level * falling / (level + falling))
 
 
 def falling_power(frequency: Array, signal: Array, ring: int) -> Array:

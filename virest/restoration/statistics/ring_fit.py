@@ -7,10 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.restoration.statistics.records import Array, PictureStatistics, falling_power
+from virest.restoration.statistics.records import (
+    ROUNDING_POWER,
+    Array,
+    PictureStatistics,
+    coder_noise,
+    falling_power,
+)
 from virest.restoration.statistics.rings import RINGS, SIDE, ring_index
 
-ROUNDING_POWER = 1 / 12
 _FIT_STEPS = 6
 _CELLS = 64
 _MUST_CANCEL = 0.45
@@ -22,10 +27,6 @@ _CODER_SLOPE = 1.5
 there: recorded less true pictures at 0.25 bits a pixel fall about as f⁻¹·⁵ from 0.08 to 0.5 cycles per pixel (five
 frames, read by eye).  It hardly matters: ``python -m virest.app.bench --only fits`` finds 1.9 ± 2.2, and between 0.5
 and 2.5 the mean gain on 14 captures changes by 0.01 dB."""
-_DEAD_ZONE = 5 / 6
-"""Part of its step below which an H.264 coder leaves a coefficient out, and of a further step at which it rounds up."""
-_CODER_SHARE = (_DEAD_ZONE**3 + (1 - _DEAD_ZONE) ** 3) / 3
-"""Error that leaves, as part of the step's square: of a remainder that is anywhere between two steps."""
 _FINEST = slice(-3, None)
 """Rings of the finest detail."""
 _RECORDED = 0.1
@@ -122,7 +123,7 @@ def _settled(
         if passed[_FINEST].mean() > _RECORDED:
             noise = np.minimum(noise, _at_most(frequency, observed))
         if step is not None:
-            noise = np.minimum(noise, observed[_FINEST].mean() + _coder_noise(observed, step))
+            noise = np.minimum(noise, observed[_FINEST].mean() + coder_noise(observed, step))
     else:
         finest = min(float(observed[_FINEST].mean()), 2 * white_levels**2)
         noise = _falling_noise(frequency, finest, _CODER_SLOPE)
@@ -147,17 +148,6 @@ def _at_most(frequency: Array, observed: Array) -> Array:
     their part, all of what they show at most, and towards low frequencies it grows like f⁻² at most.
     """
     return _falling_noise(frequency, float(observed[_FINEST].mean()), _STEEPEST_NOISE)
-
-
-def _coder_noise(observed: Array, step: float) -> Array:
-    """Noise (RINGS,) that a coder leaves in a picture, by the step of its quantiser.
-
-    Of what stands far above the step an error of the step's own, and what lies far below it is left out: reverse
-    water-filling (Cover & Thomas 2006, section 10.3.3), smooth between the two, for rings hold weak and strong places.
-    """
-    level = max(_CODER_SHARE * step**2, ROUNDING_POWER)
-    falling = np.maximum(np.maximum.accumulate(observed[::-1])[::-1], ROUNDING_POWER)
-    return np.asarray(level * falling / (level + falling))
 
 
 def _falling_noise(frequency: Array, finest: float, slope: float) -> Array:
