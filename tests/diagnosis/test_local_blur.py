@@ -30,7 +30,7 @@ from virest.diagnosis.local_blur import (
     residuals,
 )
 from virest.diagnosis.local_blur_edges import fit_steps, measure_widths, observe_picture
-from virest.diagnosis.local_blur_fit import Defocus, ExposureTime, fit, held_out
+from virest.diagnosis.local_blur_fit import EDGE_STD, Defocus, ExposureTime, fit, held_out
 from virest.diagnosis.local_blur_model import fitted_width, node_tensors
 from virest.image_formation.kernels import kernel_field
 from virest.image_formation.row_motion import row_motion
@@ -187,6 +187,14 @@ def test_exposure_and_defocus_are_found_together(altered: Observed) -> None:
     assert found.profile.extensions.defocus_sigma_px == found.values[1][0]
     held = held_out(*altered, BOTH)
     assert held.after < 0.95 * held.before
+
+
+def test_a_deviation_holds_what_all_widths_have_in_common(altered: Observed) -> None:
+    """Which edges stand alone depends on how wide they seem: all of a capture's may be told a little too wide."""
+    observations, *rest = altered
+    wider = replace(observations.edges, width_px=(1 + EDGE_STD) * observations.edges.width_px)
+    one, other = fit(observations, *rest, BOTH), fit(replace(observations, edges=wider), *rest, BOTH)
+    assert 0 < other.values[1][0] - one.values[1][0] < one.std[1]
 
 
 def test_the_profile_alone_carries_the_effects(altered: Observed) -> None:
