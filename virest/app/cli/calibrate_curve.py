@@ -36,9 +36,9 @@ def calibrate_curve(
 
     \b
     $ virest calibrate-curve bracket --plot curve.png
-    five_segment b (0.1572, 0.0823), c (0.7915, 0.793), y_max 1
-    fit error 1.29 grey levels rms, exposures 0.06232 to 1 covered
-    the curve is known to ± 0.37 grey levels there
+    five_segment b (0.1564, 0.0819), c (0.7936, 0.7957), y_max 1
+    fit error 1.34 grey levels rms, exposures 0.06214 to 1 covered
+    the curve is known to ± 0.36 grey levels there
     ...
     $ virest calibrate-curve stills --exposures stills/exposures.csv
     """  # noqa: D301
