@@ -269,7 +269,7 @@ class _Widths:
         observations, edge = self.observations, self.observations.is_edge
         block = time_blocks(observations.time_s)[self.use]
         by_damping = (self.left(found.state, 1.0 + _DAMPING_STEP) - found.look.left) / _DAMPING_STEP
-        by_width = np.zeros(len(observations))
+        by_width = np.zeros(len(edge))
         by_width[edge] = observations.edges.width_px
         unknown = np.hypot(observations.damping_std, 2 * PATH_STD), EDGE_STD
         both = np.stack([by_damping, by_width[self.use]], axis=-1) * unknown

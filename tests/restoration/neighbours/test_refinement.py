@@ -81,7 +81,8 @@ def test_rows_lie_off_by_what_is_unknown_of_the_speed() -> None:
     """Over rows read long after the restored instant an unknown speed carries them further than over the exposure."""
     motion = TurningCamera(phone()).motion
     refined = RefinedMotion(motion, np.zeros((3, 3)), scatter_px_s=30.0)
-    middles_s = motion.start_s + motion.readout_time_s * np.linspace(0, 1, 2001) + 0.5 * motion.exposure_s
+    along = np.linspace(0, 1, 2001)[:, None] * [motion.profile.width - 1, motion.profile.height - 1]
+    middles_s = motion.row_time_s(along, 0.5)
     speed_px_s = np.sqrt(np.trace(refined.path_covariance_px2()) / 2) / motion.exposure_s
     off_px = speed_px_s * (middles_s - motion.reference_s)
     assert refined.place_std_px() == pytest.approx(np.sqrt(np.mean(off_px**2)), rel=1e-3)

@@ -154,10 +154,8 @@ class RefinedMotion:
         motion = self.motion
         if motion.exposure_s <= 0:
             return 0.0
-        first, last = (
-            (time_s - motion.reference_s) / motion.exposure_s
-            for time_s in (motion.start_s + 0.5 * motion.exposure_s, motion.end_s - 0.5 * motion.exposure_s)
-        )
+        corners = np.array([[0.0, 0.0], [motion.profile.width - 1.0, motion.profile.height - 1.0]])
+        first, last = (motion.row_time_s(corners, 0.5) - motion.reference_s) / motion.exposure_s
         square = (first**2 + first * last + last**2) / 3
         return float(np.sqrt(square * np.trace(self.path_covariance_px2()) / 2))
 
