@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.image_formation.kernels import kernel_field
-from virest.restoration.frame import blurred_part, restore_frame
+from virest.restoration.frame import restore_frame
 from virest.restoration.settings import PRESETS, RestorationSettings
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.of_picture import most_blurred
 from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.records import PictureStatistics, PlaceStatistics
+from virest.restoration.taken_part import blurred_part
 
 WIDTH, HEIGHT = 520, 400
 Scene = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]

@@ -293,7 +293,7 @@ def test_noise_is_measured_where_the_blur_is() -> None:
 
 
 def test_few_iterations_assume_the_coders_noise() -> None:
-    """A frame coded by steps of 60 grey levels has half their noise at least, which `balanced` makes up for itself."""
+    """`fast` assumes at least half of the noise that steps of 60 grey levels leave, `balanced` what it measured."""
     turning = camera()
     recorded = record(turning)
     noise = {}

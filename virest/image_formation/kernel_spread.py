@@ -37,8 +37,8 @@ class KernelSpread:
     def variance(self, size: int, scale: float = 1.0) -> NDArray[np.float32]:
         """Var K over half a spectrum (size, size / 2 + 1), mean over the places; of a picture ``scale`` times as large.
 
-        Kernels of radius r have a |K|² that 4 r + 1 frequencies each way tell exactly: so many are worked out, and
-        those between them follow.
+        |K|² of a kernel of radius r has an autocorrelation of radius 2 r, so 4 r + 1 frequencies per axis
+        determine it: only these are computed, the others are interpolated exactly.
         """
         fields = [field.scaled(scale) for field in self.fields]
         radius = min(max(field.radius_px for field in fields), (size - 1) // 2)

@@ -16,13 +16,13 @@ from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernel_spread import KernelSpread, kernel_spread
-from virest.image_formation.kernels import KernelField, blur_chords, smooth_field
-from virest.image_formation.light import FrameLight, defocus_px, equivalent_length_px, frame_light, most_defocus_px
+from virest.image_formation.kernels import KernelField, smooth_field
+from virest.image_formation.light import FrameLight, equivalent_length_px, frame_light, most_defocus_px
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
 from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture
-from virest.restoration.clipped_light import measured_share, near_clipped, unseen_kept
+from virest.restoration.clipped_light import measured_share, unseen_kept
 from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
@@ -43,21 +43,14 @@ from virest.restoration.shutter import perspective_map, rounded, rowwise_map, va
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
+from virest.restoration.taken_part import blurred_part, share_map, too_little_to_gain, trusted_share
 from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
 """Straightening that moves no point further than this is left out: a gyroscope at rest seems to turn as much."""
-MIN_GAIN_DB = 0.1
-"""A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
-LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
-"""Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
-FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
-"""Gradients of this many times the noise survive the prior; above this gain their loss does not matter."""
 LEAST_CODER_NOISE = 0.5
 """Least part of a coder's noise by its step that a frame has: on 35 frames of five simulated captures it is 0.5 to 2.5
 times that.  Few iterations from few tiles enlarge noise that was missed; more of them, with neighbours, do not."""
-PART_STEP_PX = 80
-"""Grid spacing of the minimum-blur test."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
 NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
@@ -357,7 +350,7 @@ def _part_taken(
         return np.float32(1.0), np.float32(1.0)
     by_tile = settings.deblur not in WHOLE_PICTURE or measured.luma.unevenness > 0
     touched = blurred_part(blur.motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
-    part, seen = touched * _share_map(blurred, measured.share), measured_share(blurred)
+    part, seen = touched * share_map(blurred, measured.share), measured_share(blurred)
     part = part if seen is None else part * seen
     still = still_part(joined.places)
     if still is not None and still.min() < 1:
@@ -440,59 +433,6 @@ def _mean_square(restored: NDArray[np.float32], recorded: NDArray[np.uint8]) -> 
     """Of what restoring changed, (height, width, 3) each; seen in every fourth row."""
     changed = cv2.subtract(restored[::4], recorded[::4], dtype=cv2.CV_32F)
     return float(cv2.norm(changed, cv2.NORM_L2SQR)) / changed.size
-
-
-def too_little_to_gain(luma: PictureStatistics, expected_db: float) -> str:
-    """Why the picture is better left as it was recorded; empty: it is not."""
-    if not luma.measured:
-        return "picture too small, or its blur too long, for its noise to be measured: left alone"
-    if expected_db < MIN_GAIN_DB:
-        return f"deblurring is expected to gain only {max(expected_db, 0.0):.2f} dB, left alone"
-    return ""
-
-
-def blurred_part(motion: RowMotion, min_blur_px: float, tile_px: int) -> NDArray[np.float32] | np.float32:
-    """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on.
-
-    So too where it is shorter than the path changes from a tile's middle to its side, as around the centre of a turn
-    about the optical axis: the tile has the kernel of its middle.  tile_px: its side, 0 where kernels go over into each
-    other.  (height, width), or one number for all.
-    """
-    width, height = motion.profile.width, motion.profile.height
-    x, y = (np.linspace(0, length - 1, max(2, length // PART_STEP_PX)) for length in (width, height))
-    points_px = np.stack(np.meshgrid(x, y), -1)
-    chords = blur_chords(motion, points_px)
-    length_px = equivalent_length_px(np.linalg.norm(chords, axis=-1), defocus_px(motion.profile, points_px))
-    change = np.linalg.norm([np.gradient(chords, x, axis=1), np.gradient(chords, y, axis=0)], axis=(0, -1))
-    least_px = np.maximum(min_blur_px, tile_px / 2 * change)
-    part = np.clip(length_px / least_px - 1.0, 0.0, 1.0).astype(np.float32)
-    if part.min() == 1.0:
-        return np.float32(1.0)
-    return cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)
-
-
-def _share_map(blurred: BlurredPicture, share: float) -> NDArray[np.float32] | np.float32:
-    """How much to take of each pixel: all along the streaks of clipped light, where what is gained is not the texture.
-
-    (height, width), or one number for all.
-    """
-    near = near_clipped(blurred) if share < 1.0 else None
-    return np.float32(share) if near is None else np.float32(share) + np.float32(1.0 - share) * near
-
-
-def trusted_share(luma: PictureStatistics) -> float:
-    """How much of a restored picture to take, the rest being the recorded one.
-
-    Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
-    both pictures is better than either.  Under noise about as large as the picture's own gradients (a very coarsely
-    coded movie) the prior wipes out texture that the recorded picture has; where much is promised that is little,
-    unless nothing stands out of the noise and the promise is empty.
-    """
-    share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
-    stands_out = luma.gradient_scale / luma.noise_levels
-    doubt = 1 - min(1.0, stands_out / FULL_TRUST_SCALE)
-    sure = min(1.0, luma.expected_gain_db / SURE_GAIN_DB) * min(1.0, stands_out)
-    return float(share * (1 - doubt * (1 - sure)))
 
 
 class _Clock:

@@ -74,8 +74,8 @@ def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[Resto
     if mask is None:
         return plan, dict(sights)
     said = (
-        "edges overshoot as they do where a phone sharpens: frames that are deblurred are rid of the expected unsharp "
-        f"mask first, of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
+        "edges overshoot as they do where a phone sharpens: before it deblurs a frame, process undoes the expected "
+        f"unsharp mask, of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
     )
     plan = replace(plan, mask=mask, notes=(*plan.notes, said))
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}

@@ -15,12 +15,13 @@ from virest.image_formation.kernels import blur_chords, smooth_field
 from virest.image_formation.light import equivalent_length_px, most_defocus_px
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import blurred_picture
-from virest.restoration.frame import blurred_part, deblur_method, too_little_to_gain, trusted_share
+from virest.restoration.frame import deblur_method
 from virest.restoration.neighbours.reduced_tiles import reduced
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.tile_power import FEW_TILES
+from virest.restoration.taken_part import blurred_part, too_little_to_gain, trusted_share
 from virest.restoration.tile_layout import THIN_MARGIN
 from virest.restoration.tile_methods import tile_hyper_laplacian
 

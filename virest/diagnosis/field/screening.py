@@ -81,7 +81,7 @@ class Scored:
         return self.holds(MIN_T)
 
     def holds(self, least_t: float) -> bool:
-        """Whether chance is ruled out, and the gain is so many times its standard error wherever it was asked for."""
+        """Whether chance is ruled out and every gain that was asked for exceeds least_t standard errors."""
         if self.local:
             return self.p_value < MAX_P and float(self.gain.sum()) > least_t * np.sqrt(HALVES_VARIANCE * self.numbers)
         if self.parts_gain is None:
