@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 FIRST_PASSES, LATER_PASSES = 12, 4
+_UPPER = np.triu_indices(3)
 
 
 def find_directions(flow: Array, difference: Array, group: Index, groups: int, start: Array | None) -> Array:
@@ -22,20 +24,21 @@ def find_directions(flow: Array, difference: Array, group: Index, groups: int, s
     Across F d, a difference r measures d · (r × F) / |F d|: linear in d but for the length, which each pass takes from
     the one before; Cauchy weights at the noise across.
     """
-    across = difference[:, :1] * flow[:, 1] - difference[:, 1:] * flow[:, 0]
+    ahead, down = np.ascontiguousarray(flow.transpose(1, 2, 0))
+    across = difference[:, 0] * down - difference[:, 1] * ahead
+    square = across[_UPPER[0]] * across[_UPPER[1]]
+    belongs = _members(group, groups)
     first = start is None
     if start is None:
         size = np.maximum(np.linalg.norm(difference, axis=-1), np.quantile(np.abs(difference), 0.2) + 1e-9)
-        rows = across / np.maximum(size * np.linalg.norm(flow, axis=(1, 2)), 1e-12)[:, None]
-        start = _least(rows, group, groups)
+        start = _least(square / np.maximum(size * np.linalg.norm(flow, axis=(1, 2)), 1e-12) ** 2, belongs)
     direction = start
     for _ in range(FIRST_PASSES if first else LATER_PASSES):
-        length = np.linalg.norm(np.einsum("nij,nj->ni", flow, direction[group]), axis=-1)
-        unit = across / np.maximum(length, 1e-12)[:, None]
-        distance = np.abs(np.einsum("ni,ni->n", unit, direction[group]))
+        way = direction.T.take(group, axis=1)
+        squared = np.maximum((ahead * way).sum(axis=0) ** 2 + (down * way).sum(axis=0) ** 2, 1e-24)
+        distance = np.abs((across * way).sum(axis=0)) / np.sqrt(squared)
         scale = max(float(np.median(distance)) / NORMAL_MEDIAN, 1e-3)
-        weight = cauchy_weight(distance**2, CAUCHY * scale)
-        direction = _least(unit * np.sqrt(weight)[:, None], group, groups)
+        direction = _least(square * (cauchy_weight(distance**2, CAUCHY * scale) / squared), belongs)
     return direction
 
 
@@ -46,28 +49,41 @@ def without_directions(
 
     difference (n, 2): whole, in the same units as ``left``.  Schur complement of two tangents for each direction.
     """
-    tangents = np.linalg.svd(direction[:, None, :])[2][:, 1:]
-    moved = np.einsum("nij,nj->ni", flow, direction[group])
+    moved = np.squeeze(flow @ direction[group][..., None], -1)
     size = np.maximum(np.linalg.norm(moved, axis=-1), 1e-12)
     way = moved / size[:, None]
     normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
-    turn = np.einsum("ni,nij,nkj->nk", normal, flow, tangents[group]) / size[:, None]
+    turn = np.squeeze(_tangents(direction)[group] @ (normal[:, None] @ flow).swapaxes(1, 2), -1) / size[:, None]
     columns = turn * (way * difference).sum(axis=-1)[:, None]
-    both = np.concatenate([np.einsum("ni,nik->nk", normal, rows), (normal * left).sum(axis=-1)[:, None]], axis=1)
-    groups = len(direction)
-    square = _group_sum(columns[:, :, None] * (columns * weight[:, None])[:, None, :], group, groups)
+    both = np.concatenate([np.squeeze(normal[:, None] @ rows, 1), (normal * left).sum(axis=-1)[:, None]], axis=1)
+    belongs, weighed = _members(group, len(direction)), (columns * weight[:, None])[:, :, None]
+    square = _group_sum(weighed * columns[:, None, :], belongs)
     square = square + 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-12 * np.eye(2)
-    cross = _group_sum(columns[:, :, None] * (both * weight[:, None])[:, None, :], group, groups)
-    both = both - np.einsum("nk,nkj->nj", columns, np.linalg.solve(square, cross)[group])
+    cross = _group_sum(weighed * both[:, None, :], belongs)
+    both = both - np.squeeze(columns[:, None] @ np.linalg.solve(square, cross)[group], 1)
     return normal[:, :, None] * both[:, None, :-1], normal * both[:, -1:]
 
 
-def _least(rows: Array, group: Index, groups: int) -> Array:
-    """Unit vectors (groups, 3) with the least Σ (row · d)²."""
-    return np.asarray(np.linalg.eigh(_group_sum(rows[:, :, None] * rows[:, None, :], group, groups))[1][..., 0])
+def _least(square: Array, belongs: csr_array) -> Array:
+    """Unit vectors (groups, 3) with the least Σ (row · d)², of the rows' products (6, n) in the order of _UPPER."""
+    total = np.empty((belongs.shape[0], 3, 3))
+    total[:, *_UPPER] = total[:, *_UPPER[::-1]] = belongs @ np.ascontiguousarray(square.T)
+    return np.asarray(np.linalg.eigh(total)[1][..., 0])
 
 
-def _group_sum(values: Array, group: Index, groups: int) -> Array:
-    flat = values.reshape(len(values), -1)
-    total: Array = np.stack([np.bincount(group, column, groups) for column in flat.T], axis=-1)
-    return total.reshape(groups, *values.shape[1:])
+def _tangents(direction: Array) -> Array:
+    """Two unit vectors (n, 2, 3) across each of the unit vectors (n, 3) and across each other."""
+    one = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
+    one /= np.linalg.norm(one, axis=-1, keepdims=True)
+    return np.stack([one, np.cross(direction, one)], axis=1)
+
+
+def _members(group: Index, groups: int) -> csr_array:
+    """(groups, n): 1 where a row belongs to a group."""
+    count = len(group)
+    return csr_array((np.ones(count), (group, np.arange(count))), (groups, count))
+
+
+def _group_sum(values: Array, belongs: csr_array) -> Array:
+    total = belongs @ values.reshape(len(values), -1)
+    return np.asarray(total.reshape(-1, *values.shape[1:]))
