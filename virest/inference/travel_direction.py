@@ -49,18 +49,19 @@ def without_directions(
 
     difference (n, 2): whole, in the same units as ``left``.  Schur complement of two tangents for each direction.
     """
-    moved = np.squeeze(flow @ direction[group][..., None], -1)
+    moved = np.einsum("nij,nj->ni", flow, direction[group])
     size = np.maximum(np.linalg.norm(moved, axis=-1), 1e-12)
     way = moved / size[:, None]
     normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
-    turn = np.squeeze(_tangents(direction)[group] @ (normal[:, None] @ flow).swapaxes(1, 2), -1) / size[:, None]
+    tangents = _tangents(direction)[group]
+    turn = np.einsum("nki,ni->nk", tangents, _dotted(normal, flow)) / size[:, None]
     columns = turn * (way * difference).sum(axis=-1)[:, None]
-    both = np.concatenate([np.squeeze(normal[:, None] @ rows, 1), (normal * left).sum(axis=-1)[:, None]], axis=1)
+    both = np.concatenate([_dotted(normal, rows), (normal * left).sum(axis=-1)[:, None]], axis=1)
     belongs, weighed = _members(group, len(direction)), (columns * weight[:, None])[:, :, None]
     square = _group_sum(weighed * columns[:, None, :], belongs)
     square = square + 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-12 * np.eye(2)
     cross = _group_sum(weighed * both[:, None, :], belongs)
-    both = both - np.squeeze(columns[:, None] @ np.linalg.solve(square, cross)[group], 1)
+    both = both - _dotted(columns, np.linalg.solve(square, cross)[group])
     return normal[:, :, None] * both[:, None, :-1], normal * both[:, -1:]
 
 
@@ -76,6 +77,11 @@ def _tangents(direction: Array) -> Array:
     one = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
     one /= np.linalg.norm(one, axis=-1, keepdims=True)
     return np.stack([one, np.cross(direction, one)], axis=1)
+
+
+def _dotted(pair: Array, rows: Array) -> Array:
+    """(n, k): pairs (n, 2) times rows (n, 2, k)."""
+    return pair[:, :1] * rows[:, 0] + pair[:, 1:] * rows[:, 1]
 
 
 def _members(group: Index, groups: int) -> csr_array:
