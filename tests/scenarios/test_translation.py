@@ -36,9 +36,9 @@ SETTINGS = PRESETS["fast"]
 CHOSEN = range(4, 48, 14)
 USUAL: dict[str, Any] = {"frames": 48, "noise_levels": 1.5, "bitrate_bits_per_px": 0.6, "exposure_ms": 10.0}
 SWAYS: dict[str, dict[str, Any]] = {
-    "landscape": {"width": 640, "height": 480, "seed": 311, "depth_m": 1.5, "sway_m": 0.08, "tilt_deg": (12.0, -18.0)}
+    "landscape": {"width": 512, "height": 384, "seed": 311, "depth_m": 1.5, "sway_m": 0.08, "tilt_deg": (12.0, -18.0)}
     | {"rate_rad_s": 0.6, "effects": ["time_offset=0.011"]},
-    "portrait": {"width": 480, "height": 640, "seed": 312, "depth_m": 2.0, "sway_m": 0.08, "tilt_deg": (-15.0, 10.0)}
+    "portrait": {"width": 384, "height": 512, "seed": 312, "depth_m": 2.0, "sway_m": 0.08, "tilt_deg": (-15.0, 10.0)}
     | {"rate_rad_s": 0.8, "effects": ["time_offset=-0.007"]},
 }
 
