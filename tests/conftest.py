@@ -1,5 +1,6 @@
 """What all tests share: real captures where there are any, the program as a process, fast tests first."""
 
+import gc
 import importlib
 import os
 import subprocess
@@ -27,8 +28,9 @@ def pytest_configure() -> None:
     """Give each of xdist's processes, and all that it starts, a core of its own: they are the parallelism already.
 
     A program that shares its work out over the cores it finds would start and load processes of its own in every test;
-    those that test this say so.
+    those that test this say so.  While tests are collected hardly anything becomes garbage.
     """
+    gc.disable()
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
@@ -42,6 +44,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return item.get_closest_marker("scenario") is not None, item.path.parent.name != "scenarios"
 
     items.sort(key=order)
+
+
+def pytest_collection_finish() -> None:
+    """Search for garbage from here on only, and not among what was collected."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -15,7 +15,7 @@ from cluster_processes import Cluster, running_cluster
 from run_content import content
 
 from virest.app import jobs
-from virest.app.cluster import is_lost
+from virest.app.cluster import CONNECT_VARIABLE, is_lost
 from virest.app.jobs import Workers
 from virest.errors import RestorationError
 
@@ -109,10 +109,12 @@ def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
 
 
 def test_a_wrong_address_is_one_line(virest: Virest, tmp_path: Path) -> None:
-    """Exit 3, before anything is read."""
-    result = virest("process", tmp_path, "--out", tmp_path / "out", "--scheduler", "tcp://127.0.0.1:1")
+    """Exit 3, before anything is read, after as long as Dask's own variable says."""
+    address = ("--scheduler", "tcp://127.0.0.1:1")
+    result = virest("process", tmp_path, "--out", tmp_path / "out", *address, **{CONNECT_VARIABLE: "1200 ms"})
     assert result.returncode == 3
     assert "--scheduler tcp://127.0.0.1:1" in result.stderr
+    assert "1.2 s" in result.stderr
     assert "Traceback" not in result.stderr
     assert len(result.stderr.splitlines()) == 1
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import time
 import uuid
 from collections.abc import Callable
@@ -25,6 +26,8 @@ from virest.image_formation import transforms
 log = logging.getLogger(__name__)
 
 CONNECT_S = 10.0
+CONNECT_VARIABLE = "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"
+"""How long to wait for an answer, and Dask's own variable that says otherwise."""
 FIRST_WORKER_S = 30.0
 """How long to wait for a cluster's first worker, and, once all are gone, for one to come back."""
 LOOK_S = 2.0
@@ -72,7 +75,7 @@ class ClusterExecutor(Executor):
         try:
             self._require_alike()
         except BaseException:
-            self._client.close(timeout=CONNECT_S)
+            self._client.close(timeout=_connect_s())
             raise
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -133,7 +136,7 @@ class ClusterExecutor(Executor):
         if self._client.status == "running":
             self._executor.shutdown(wait=wait and not cancel_futures)
             self._await_last()
-        self._client.close(timeout=CONNECT_S)
+        self._client.close(timeout=_connect_s())
 
     # ── asking ───────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -141,7 +144,7 @@ class ClusterExecutor(Executor):
         """Threads of each worker, as the scheduler knows them."""
         try:
             if self._client.status == "running":
-                return dict(self._client.sync(self._client.scheduler.ncores, callback_timeout=CONNECT_S))
+                return dict(self._client.sync(self._client.scheduler.ncores, callback_timeout=_connect_s()))
         except OSError as error:
             raise self.lost() from error
         raise self.lost()
@@ -186,6 +189,12 @@ class ClusterExecutor(Executor):
         log.warning("a worker is still writing a segment that was called off; wait before --overwrite")
 
 
+def _connect_s() -> float:
+    from dask.utils import parse_timedelta
+
+    return float(parse_timedelta(os.environ.get(CONNECT_VARIABLE, CONNECT_S)))
+
+
 def _connect(address: str, verbose: bool) -> Any:
     import dask
     from dask.distributed import Client
@@ -194,18 +203,18 @@ def _connect(address: str, verbose: bool) -> Any:
         for name in [*logging.root.manager.loggerDict, *TALKERS]:  # Dask gives some of their children levels
             if name.partition(".")[0] in TALKERS:
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECT_S}s"})
     try:
+        dask.config.set({"distributed.comm.timeouts.connect": f"{_connect_s()}s"})
         asyncio.run(_knock(address))  # a client that cannot connect would complain at length when it is taken away
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+        client = Client(address, timeout=_connect_s(), set_as_default=False)
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise SettingsError(
             f"--scheduler {address}: {_line(error)}", hint="start `dask scheduler`, or leave it out"
         ) from error
     try:
         client.wait_for_workers(1, timeout=FIRST_WORKER_S)
     except OSError:
-        client.close(timeout=CONNECT_S)
+        client.close(timeout=_connect_s())
         raise SettingsError(
             f"--scheduler {address}: has no workers", hint=f"start some: dask worker {address} --nthreads 1"
         ) from None
@@ -215,7 +224,7 @@ def _connect(address: str, verbose: bool) -> Any:
 async def _knock(address: str) -> None:
     from distributed.comm import connect
 
-    comm = await connect(address, timeout=CONNECT_S)
+    comm = await connect(address, timeout=_connect_s())
     await comm.close()
 
 
