@@ -261,6 +261,7 @@ def test_what_cannot_be_read_is_said(tiny: Path, tmp_path: Path, ladder) -> None
 @pytest.mark.scenario
 def test_a_readout_that_is_half_as_long_is_found(tmp_path: Path, monkeypatch) -> None:
     """From a capture to the right cause by two processes, its size within its deviation, and neighbours that agree."""
+    blank = diagnose.draw_figures
     monkeypatch.setattr(diagnose, "draw_figures", DRAW_FIGURES)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
     size = {"width": 256, "height": 192, "frames": 24, "readout_ms": 24.0, "rate_rad_s": 1.1, "noise_levels": 1.0}
@@ -277,7 +278,10 @@ def test_a_readout_that_is_half_as_long_is_found(tmp_path: Path, monkeypatch) ->
     assert gain["disagreement_after_px"] < 0.4 * gain["disagreement_before_px"]
     assert all((tmp_path / "out/trip" / path).is_file() for path in cause["figures"])
     assert read_profile(tmp_path / "out/trip/extended.yaml").shutter.readout_time_s == pytest.approx(found["estimate"])
+    monkeypatch.setattr(diagnose, "draw_figures", blank)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
     assert run(tmp_path / "trip", "--out", tmp_path / "alone", "-q") == 0
-    both = [(tmp_path / name / "trip" / "diagnosis.json").read_bytes() for name in ("out", "alone")]
-    assert both[0] == both[1], "one process tells what two tell"
+    alone = json.loads((tmp_path / "alone/trip/diagnosis.json").read_text())
+    for cause in [*facts["causes"], *alone["causes"]]:
+        del cause["figures"]
+    assert facts == alone, "one process tells what two tell"
