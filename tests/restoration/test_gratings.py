@@ -67,6 +67,20 @@ def test_a_grating_is_told_from_texture(angle_rad: float) -> None:
     assert found.unevenness > 0.3
 
 
+@pytest.mark.parametrize("speed", [1.0, 0.3])
+@pytest.mark.parametrize("scene", [_bars, _board])
+def test_gratings_are_told_whatever_their_size_and_direction(
+    scene: Callable[[float, float], Scene], speed: float
+) -> None:
+    """Neither S and N that fit rings best nor those that are settled on describe them: both misfits are large."""
+    turning = camera(tuple(speed * r for r in RATE_RAD_S), width=WIDTH, height=HEIGHT)  # type: ignore[arg-type]
+    for period_px in (7.0, 21.0):
+        for angle_rad in (ALONG_RAD, 1.2):
+            canvas = _canvas(scene(period_px, angle_rad))
+            found = _statistics(turning, record_canvas(turning, canvas, noise_levels=2.0).picture)
+            assert found.unevenness == 1.0
+
+
 def test_upright_bars_are_told_by_their_few_places_along_the_axes() -> None:
     """Places near the axes are no part of the fit, so upright bars do not harm it; there they are seen."""
     turning = camera(tuple(0.5 * r for r in RATE_RAD_S), 0.02, width=WIDTH, height=HEIGHT)  # type: ignore[arg-type]

@@ -13,8 +13,9 @@ from virest.image_formation.kernels import KernelField
 from virest.restoration.statistics import ring_fit, tile_power
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.on_tiles import on_spectrum
+from virest.restoration.statistics.place_fit import unevenness
 from virest.restoration.statistics.records import PictureStatistics, coder_noise
-from virest.restoration.statistics.rings import ring_index
+from virest.restoration.statistics.rings import SIDE, ring_index
 
 HEIGHT, WIDTH = 420, 560
 STRAIGHT = ResponseCurve("linear")
@@ -224,6 +225,20 @@ def test_detail_that_a_coder_took_away_is_taken_to_fall_as_a_pictures_does() -> 
     np.testing.assert_allclose(found, signal, rtol=1e-9)
     clear = ring_fit._as_detail_falls(frequency, signal, passed, np.full(24, 1e-3))
     np.testing.assert_array_equal(clear, signal)
+
+
+def test_detail_that_a_coder_took_away_makes_no_grating(rng: np.random.Generator) -> None:
+    """Where it lies below the law of natural pictures, rings still fit what was recorded, and no place is looked at."""
+    fy, fx = np.fft.fftfreq(SIDE)[:, None], np.arange(1, SIDE // 2)[None, :] / SIDE
+    frequency = np.hypot(fx, fy)
+    passed = np.stack([np.sinc(3 * (fx * np.cos(a) + fy * np.sin(a))) ** 2 for a in np.linspace(0.4, 0.65, 6)])
+    recorded = passed * 200 * frequency**-3.6 * np.exp(-4 * (frequency / 0.12) ** 2) + 0.5
+    seen = (recorded * rng.exponential(1.0, passed.shape)).astype(np.float32)
+    passed = passed.astype(np.float32)
+    found = ring_fit.fit_rings((seen, ring_fit.RingCells(passed), 0.5, None))[0]
+    law = found.noise[:, None] + found.signal[:, None] * ring_fit.RingCells(passed).passed
+    assert law[12].max() > 3 * seen.mean(axis=0)[ring_index(SIDE) == 12].mean()
+    assert unevenness(found, seen, passed) == 0.0
 
 
 @pytest.mark.parametrize("height", [41, 45])

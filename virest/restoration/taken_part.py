@@ -17,8 +17,8 @@ MIN_GAIN_DB = 0.1
 """A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
-FULL_TRUST_SCALE, SURE_GAIN_DB = 2.0, 3.0
-"""Gradients of this many times the noise survive the prior; above this gain their loss does not matter."""
+SURE_GAIN_DB = 3.0
+"""Above this gain the loss of gradients that the noise drowns does not matter."""
 PART_STEP_PX = 80
 """Grid spacing of the minimum-blur test."""
 
@@ -70,7 +70,5 @@ def trusted_share(luma: PictureStatistics) -> float:
     unless nothing stands out of the noise and the promise is empty.
     """
     share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
-    stands_out = luma.gradient_scale / luma.noise_levels
-    doubt = 1 - min(1.0, stands_out / FULL_TRUST_SCALE)
-    sure = min(1.0, luma.expected_gain_db / SURE_GAIN_DB) * min(1.0, stands_out)
-    return float(share * (1 - doubt * (1 - sure)))
+    sure = min(1.0, luma.expected_gain_db / SURE_GAIN_DB) * min(1.0, luma.gradient_scale / luma.noise_levels)
+    return float(share * (1 - luma.drowned * (1 - sure)))

@@ -104,7 +104,11 @@ def _reduction(statistics: PictureStatistics, settings: RestorationSettings) -> 
 def tile_hyper_laplacian(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> Image:
-    """The sharp luma, (height, width): Krishnan & Fergus 2009, each step over all tiles."""
+    """The sharp luma, (height, width): Krishnan & Fergus 2009, each step over all tiles.
+
+    Few iterations give back no texture that the prior took for noise: where noise drowns the gradients, the linear
+    filter's picture, which weighs them frequency by frequency, takes the prior's place.
+    """
     deconvolution = luma_tiles(blurred, settings, around)
     statistics, few = blurred.statistics, settings.iterations <= FEW_ITERATIONS
     unit = statistics.gradient_scale * (FEW_SCALE if few else 1.0)
@@ -127,8 +131,8 @@ def tile_hyper_laplacian(
         if step == len(betas) - 1 and not few:
             solved = _with_residual(deconvolution, projected, solved, statistics)
         sharp = deconvolution.blend(solved)
-    if statistics.unevenness:
-        share = LINEAR_SHARE * statistics.unevenness
+    share = max(LINEAR_SHARE * statistics.unevenness, statistics.drowned if few else 0.0)
+    if share:
         sharp = cv2.addWeighted(linear, share, sharp, 1 - share, 0.0)
     return deconvolution.restore_highlights(sharp)
 

@@ -16,6 +16,8 @@ _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 _EDGES_BEYOND = 2.0
 """A picture's edges exceed its mean spectrum by this factor: rings of tiles have the mean of edge and plain surface."""
+_STANDS_OUT = 2.0
+"""Gradients of this many times the noise survive the prior."""
 _DETAIL_SLOPE = 3.0
 """The power of a natural picture falls with frequency about like f⁻³."""
 ROUNDING_POWER = 1 / 12
@@ -114,6 +116,14 @@ class PictureStatistics:
         gain = 2 - 2 * _bessel_j0(2 * np.pi * self.frequency)
         area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]) * (self.frequency < 0.5)
         return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
+
+    @property
+    def drowned(self) -> float:
+        """0 where the picture's gradients stand out of the noise, up to 1 where nothing does.
+
+        A prior of sparse gradients then takes texture for noise.
+        """
+        return 1 - min(1.0, self.gradient_scale / self.noise_levels / _STANDS_OUT)
 
     @property
     def finest(self) -> float:

@@ -39,6 +39,13 @@ _CLEAR_SIGNAL = 3.0
 """What passes the blur is clear where it has this many times the noise's power."""
 _PLACES_IN_CELL = 4
 """The mean of fewer tells little."""
+_OF_FIT = 2.0
+"""How many times the misfit of the fit itself counts beside that of what is settled on.
+
+Of 108 gratings (waves, bars and boards of 7 to 21 px in four directions, under paths of 3 to 10 px) 94 have more
+than 0.8 of the latter, and 92 of these have 0.58 to 2.2 of the former.  Of frames of ordinary scenes, from which a
+coder took detail, 15 in six simulated captures have more than 1.1 of the latter, ten of them 0.3 to 0.5 of the former.
+"""
 
 
 class RingCells:
@@ -89,13 +96,20 @@ def fit_rings(
     found = []
     for i, (_, _, white_levels, step) in enumerate(spectra):
         settled = _settled(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels, step)
-        misfit = _misfit(count[i], g[i], settled.noise[:, None] + settled.signal[:, None] * k[i])
-        found.append(replace(settled, misfit=misfit))
+        by_law, by_fit = (
+            _misfit(count[i], g[i], n[:, None] + s[:, None] * k[i])
+            for n, s in ((settled.noise, settled.signal), (noise[i], signal[i]))
+        )
+        found.append(replace(settled, misfit=min(by_law, _OF_FIT * by_fit)))
     return found
 
 
 def _misfit(count: Array, observed: Array, expected: Array) -> float:
-    """RMS of ln(observed / expected) over the cells, by their places; of what is below the rounding's power, none."""
+    """RMS of ln(observed / expected) over the cells, by their places; of what is below the rounding's power, none.
+
+    No S and N of rings fit a grating.  Where those that fit differ from those that are settled on, a coder took away
+    detail that the law of natural pictures puts back: nothing is wrong with rings.
+    """
     weight = count * (count >= _PLACES_IN_CELL)
     logarithms = np.log(np.maximum(observed, ROUNDING_POWER) / np.maximum(expected, ROUNDING_POWER))
     return float(np.sqrt(np.sum(weight * logarithms**2) / max(np.sum(weight), 1.0)))
