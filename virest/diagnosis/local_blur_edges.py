@@ -187,7 +187,7 @@ class WidthFit:
 def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
     """Fit profiles (n, m) over all reaches, and keep those that hold ISOLATION widths on both sides of the step.
 
-    The reaches follow from the profiles alone, never from a predicted blur, so the model cannot choose its own evidence.
+    The reaches follow from the profiles alone, never from a predicted blur: no model chooses its own evidence.
     """
     middle, parts = profiles.shape[1] // 2, [(np.zeros(0, np.intp), *[np.zeros(0)] * 3)]
     for reach in REACHES_PX:
@@ -239,6 +239,14 @@ def _step_model(u: Array, profiles: Array, centre: Array, width: Array) -> tuple
 def _no_edges() -> EdgeWidths:
     empty = np.zeros(0)
     return EdgeWidths(
-        np.zeros(0, np.intp), empty, empty, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.intp),
-        empty, empty, empty, empty,
+        np.zeros(0, np.intp),
+        empty,
+        empty,
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+        np.zeros(0, np.intp),
+        empty,
+        empty,
+        empty,
+        empty,
     )
