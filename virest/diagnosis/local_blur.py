@@ -255,7 +255,7 @@ def _recent(frames: Sequence[Frame], index: int) -> tuple[Frame, ...]:
 def _chosen(
     edges: EdgeWidths, ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory, bits_per_px: float
 ) -> BlurObservations:
-    still = evenly_isolated(edges.select(_motion_px(edges, profile, trajectory) < STILL_PX))
+    still = evenly_isolated(edges.select(_motion_px(edges, profile, trajectory) < STILL_PX), MIN_EDGES)
     through = transfers(ratios, profile, trajectory)[:, :, 0].min(axis=1)
     ratio = np.where(through > MIN_TRANSFER, ratios.log_ratio, np.nan)
     isolated = len(isolated_edges(edges))

@@ -33,11 +33,11 @@ Picture = NDArray[np.uint8]
 
 STEP_PX = 0.5
 """Between two samples of a profile."""
-REACHES_PX = (4.0, 5.5, 7.5, 10.0, 14.0, 19.0)
+REACHES_PX = (4.0, 5.5, 7.5, 10.0, 14.0, 16.5, 19.0)
 """Half lengths of the profiles that are tried, shortest first."""
 ISOLATION = 4.0
 """Plateaus must reach this many widths, and a pixel, from the edge's middle."""
-SPREAD = 1.3
+SPREAD = 1.2
 """Edges this many times as wide as is usual are still measured over the reach that all of a capture share: widths of
 one scatter by 4 to 14 % about the usual one (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
 LEAST_WIDTH_PX = 0.05
@@ -131,18 +131,20 @@ def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
     return far.select(first[far.width_px[first] > 0])
 
 
-def evenly_isolated(seen: EdgeWidths) -> EdgeWidths:
+def evenly_isolated(seen: EdgeWidths, least: int) -> EdgeWidths:
     """The isolated edges over one reach, which is SPREAD times what the usual width asks for; wider ones over theirs.
 
     Whether an edge of about the usual width counts then depends on what stands beside it, and not on its own width.
+    Where fewer than the least number are isolated over so long a reach, each has its own.
     """
-    found, least_px = isolated_edges(seen), 0.0
-    while len(found):
+    found, reach_px = isolated_edges(seen), 0.0
+    while len(found) >= max(least, 1):
         asked_px = ISOLATION * SPREAD * float(np.median(found.width_px)) + 1.0
-        reach_px = next((reach for reach in REACHES_PX if reach >= asked_px), REACHES_PX[-1])
-        if reach_px <= least_px:
+        longer_px = next((reach for reach in REACHES_PX if reach >= asked_px), REACHES_PX[-1])
+        further = isolated_edges(seen, longer_px)
+        if longer_px <= reach_px or len(further) < least:
             break
-        found, least_px = isolated_edges(seen, reach_px), reach_px
+        found, reach_px = further, longer_px
     return found
 
 

@@ -37,7 +37,7 @@ SHIFT_STD_S = 0.004
 """How far the rows' times may be off after the geometry was fitted; a shift is a nuisance of every fit."""
 PATH_STD = 0.03
 """Relative error of the predicted path's length that focal length and gyroscope scale leave."""
-EDGE_STD = 0.03
+EDGE_STD = 0.04
 """Part by which a capture's edges are all told too narrow or too wide, as the scene has soft ones and the encoder takes
 detail away: ``python -m virest.app.bench --only edges`` prints it for a defocus of 2 to 3.5 px."""
 _NUISANCE = np.array([LENS_SIGMA_PX, 0.0])
