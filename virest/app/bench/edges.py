@@ -82,7 +82,8 @@ def _soft_row(work: Path, number: int, hidden: tuple[float, str]) -> Row:
     source = open_source(capture)
     trajectory = integrate_gyro(source.capture.imu, source.profile)
     seen = look_for_blur(source.gray, source.capture, source.profile, trajectory)
-    found = fit(seen, source.profile, trajectory, [Defocus()])
+    effects: list[Any] = [Defocus()]
+    found = fit(seen, source.profile, trajectory, effects)
     told = {"told_px": float(found.values[0][0]), "std_px": float(found.std[0])} if found.determined[0] else {}
     return {"scene": scene, "sigma_px": sigma_px, "edges": len(seen.edges), **told}
 
