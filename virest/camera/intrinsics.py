@@ -159,7 +159,7 @@ class Intrinsics:
 
 @lru_cache(maxsize=256)
 def _fold_radius(coefficients: tuple[float, ...]) -> float:
-    """Greatest radius, units of the focal length, up to which r (1 + k1 r² + k2 r⁴ + k3 r⁶) grows with r."""
+    """Greatest r (1 + k1 r² + k2 r⁴ + k3 r⁶), units of the focal length, before it falls as r grows; inf: never."""
     k1, k2, k3 = (k if abs(k) > _RAY_TOLERANCE else 0.0 for k in (*coefficients[:2], coefficients[4]))
     roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.array([1.0, 3 * k1, 5 * k2, 7 * k3]), "b"))
     squares = [root.real for root in roots if abs(root.imag) < _RAY_TOLERANCE and root.real > 0]

@@ -11,7 +11,7 @@ profile: textures, thin lines and shading fail that test, whereas steps pass it 
 
 Few steps stand alone over a long way, so whoever takes for each edge the shortest way that holds its own width takes
 those that seem narrow.  All edges of a capture are therefore looked at over a way that holds what is usual there and
-SPREAD more (:func:`isolated_edges`).
+SPREAD more (:func:`evenly_isolated`).
 """
 
 from __future__ import annotations
@@ -40,8 +40,11 @@ ISOLATION = 4.0
 SPREAD = 1.2
 """Edges this many times as wide as is usual are still measured over the reach that all of a capture share: widths of
 one scatter by 4 to 14 % about the usual one (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
+OTHERS_WIDER = 2.0
+"""Other pictures of a capture may be up to this many times as soft: so far a picture's edges are looked at."""
 LEAST_WIDTH_PX = 0.05
-_FIT_STEPS = 12
+_FIT_STEPS, _FURTHER_STEPS = 12, 3
+"""Of the descent, from a guess and from what a shorter part of the same step gave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +125,11 @@ def observe_picture(
     )
 
 
+def shared_reach_px(width_px: Array) -> float:
+    """Over which edges of these widths (n,) should all be measured."""
+    return ISOLATION * SPREAD * float(np.median(width_px)) + 1.0 if len(width_px) else 0.0
+
+
 def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
     """Each edge over its shortest reach from the least on, if its profile there is a step's."""
     far = seen.select(seen.reach_px >= least_reach_px)
@@ -139,7 +147,7 @@ def evenly_isolated(seen: EdgeWidths, least: int) -> EdgeWidths:
     """
     found, reach_px = isolated_edges(seen), 0.0
     while len(found) >= max(least, 1):
-        asked_px = ISOLATION * SPREAD * float(np.median(found.width_px)) + 1.0
+        asked_px = shared_reach_px(found.width_px)
         longer_px = next((reach for reach in REACHES_PX if reach >= asked_px), REACHES_PX[-1])
         further = isolated_edges(seen, longer_px)
         if longer_px <= reach_px or len(further) < least:
@@ -187,32 +195,46 @@ class WidthFit:
 
 
 def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
-    """Fit profiles (n, m) over all reaches, and keep those that hold ISOLATION widths on both sides of the step.
+    """Fit profiles (n, m) of a picture over all reaches that may be shared, and keep those that hold ISOLATION widths.
 
     The reaches follow from the profiles alone, never from a predicted blur: no model chooses its own evidence.
     """
-    middle, parts = profiles.shape[1] // 2, [(np.zeros(0, np.intp), *[np.zeros(0)] * 3)]
+    count, middle = len(profiles), profiles.shape[1] // 2
+    centre, width, ended = np.zeros(count), np.zeros(count), np.zeros(count, bool)
+    parts = [(np.zeros(0, np.intp), *[np.zeros(0)] * 3)]
     for reach in REACHES_PX:
         half = round(reach / STEP_PX)
         part = profiles[:, middle - half : middle + half + 1]
-        whole = np.flatnonzero(np.isfinite(part).all(axis=1) & (np.ptp(np.nan_to_num(part), axis=1) > 0))
-        if not len(whole):
-            break
-        centre, width, misfit = fit_steps(part[whole], reach)
-        ends = (ISOLATION * width + 1.0 <= reach - np.abs(centre)) & (np.abs(centre) < 0.5 * reach)
+        whole = np.isfinite(part).all(axis=1) & (np.ptp(np.nan_to_num(part), axis=1) > 0)
+        misfit = np.full(count, np.inf)
+        further = ended & (reach <= OTHERS_WIDER * shared_reach_px(width[ended]))
+        for rows, steps in ((whole & ~ended, _FIT_STEPS), (whole & further, _FURTHER_STEPS)):
+            width[rows & ~ended] = 0.25 * reach
+            centre[rows & ~ended] = 0.0
+            centre[rows], width[rows], misfit[rows] = fit_steps(part[rows], reach, (centre[rows], width[rows]), steps)
+        ends = (
+            whole
+            & (further | ~ended)
+            & (ISOLATION * width + 1.0 <= reach - np.abs(centre))
+            & (np.abs(centre) < 0.5 * reach)
+        )
         good = (misfit < max_misfit) & (width > LEAST_WIDTH_PX)
-        parts.append((whole[ends], np.where(good, width, 0.0)[ends], centre[ends], np.full(int(ends.sum()), reach)))
+        ended |= ends & good
+        parts.append((*np.nonzero(ends), np.where(good, width, 0.0)[ends], centre[ends], np.full(ends.sum(), reach)))
     return WidthFit(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def fit_steps(profiles: Array, reach_px: float) -> tuple[Array, Array, Array]:
+def fit_steps(
+    profiles: Array, reach_px: float, start: tuple[Array, Array] | None = None, steps: int = _FIT_STEPS
+) -> tuple[Array, Array, Array]:
     """Least squares of a + b erf((u − u0)/√2 s) to profiles (n, m) over ± reach: u0, s, misfit.
 
     a and b follow linearly from u0 and s; these by damped Gauss-Newton steps.  misfit: rms as part of the step 2 b.
+    start: u0 and s (n,) to begin from; None: a step in the middle, a quarter of the reach wide.
     """
     u = np.linspace(-reach_px, reach_px, profiles.shape[1])
-    centre, width = np.zeros(len(profiles)), np.full(len(profiles), 0.25 * reach_px)
-    for _ in range(_FIT_STEPS):
+    centre, width = start or (np.zeros(len(profiles)), np.full(len(profiles), 0.25 * reach_px))
+    for _ in range(steps):
         _, jacobian, residual = _step_model(u, profiles, centre, width)
         normal = np.einsum("nim,njm->nij", jacobian, jacobian)
         normal[:, range(4), range(4)] *= 1.0 + 1e-3
