@@ -36,6 +36,7 @@ from virest.diagnosis.local_blur_edges import (
     isolated_edges,
     measure_widths,
     observe_picture,
+    share_a_reach,
 )
 from virest.diagnosis.local_blur_fit import EDGE_STD, Defocus, ExposureTime, fit, held_out
 from virest.diagnosis.local_blur_model import fitted_width, node_tensors
@@ -184,6 +185,8 @@ def test_where_too_few_stand_alone_each_has_its_own_reach(rng: np.random.Generat
     seen = crowded(rng, 3.1)
     own = isolated_edges(seen)
     np.testing.assert_array_equal(evenly_isolated(seen, len(own)).width_px, own.width_px)
+    assert not share_a_reach(own)
+    assert share_a_reach(evenly_isolated(seen, 40))
 
 
 def test_widths_add_in_squares_up_to_the_shape_of_a_path() -> None:

@@ -130,6 +130,11 @@ def shared_reach_px(width_px: Array) -> float:
     return ISOLATION * SPREAD * float(np.median(width_px)) + 1.0 if len(width_px) else 0.0
 
 
+def share_a_reach(edges: EdgeWidths) -> bool:
+    """Whether isolated edges were all measured over one reach at least, as :func:`evenly_isolated` wants it."""
+    return bool(np.all(edges.reach_px >= min(shared_reach_px(edges.width_px), REACHES_PX[-1])))
+
+
 def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
     """Each edge over its shortest reach from the least on, if its profile there is a step's."""
     far = seen.select(seen.reach_px >= least_reach_px)
