@@ -33,6 +33,22 @@ def _pixels() -> NDArray[np.float64]:
     return np.stack([x, y], -1)
 
 
+@pytest.mark.parametrize("tangential", [(0.0, 0.0), (0.001, -0.0005)])
+def test_where_a_lens_folds_its_picture_back_rays_end(tangential: tuple[float, float]) -> None:
+    """At k1 −0.2 nothing is seen beyond 0.86 focal lengths: pixels there have rays that hardly depend on the lens."""
+
+    def rays(k1: float) -> NDArray[np.float64]:
+        lens = Intrinsics(640, 360, 330.0, 330.0, 390.0, 205.0, "radtan", (k1, 0.0, *tangential, 0.0))
+        return lens.rays(pixels)[..., :2]
+
+    x, y = np.meshgrid(np.linspace(0, 639, 33), np.linspace(0, 359, 21))
+    pixels = np.stack([x, y], -1)
+    beyond = np.hypot(x - 390.0, y - 205.0) / 330.0 > 2 / 3 * np.sqrt(1 / 0.6)
+    assert 0.05 < beyond.mean() < 0.3
+    assert np.linalg.norm(rays(-0.2), axis=-1).max() < np.sqrt(1 / 0.6) + 0.01
+    assert np.abs(rays(-0.2 + 1e-6) - rays(-0.2)).max() < 50e-6
+
+
 @pytest.mark.parametrize("lens", LENSES)
 def test_project_undoes_rays(lens: Model) -> None:
     """The ray through a pixel lands on that pixel again, at the picture's corners too."""

@@ -45,7 +45,8 @@ def seen(added_px: Array | float, seed: int = 5) -> tuple[BlurObservations, Capt
     width = np.sqrt(LENS_SIGMA_PX**2 + np.broadcast_to(added_px, count) ** 2) * np.exp(rng.normal(0, 0.12, count))
     edges = EdgeWidths(
         frame, STAMPS[frame], np.full(count, 0.004), PLACES, np.stack([np.cos(turn), np.sin(turn)], -1),
-        width, 0.05 * width, rng.uniform(20, 90, count), rng.uniform(0.2, 0.8, count), candidates=20 * count,
+        np.tile(np.arange(EACH), FRAMES), np.full(count, 5.5), width,
+        rng.uniform(20, 90, count), rng.uniform(0.2, 0.8, count), candidates=20 * count,
     )  # fmt: skip
     logged = tuple(Frame(k, 0, float(t), 0.004, focus_dioptres=float(focus_dioptres(t))) for k, t in enumerate(STAMPS))
     nowhere = Path("nowhere")

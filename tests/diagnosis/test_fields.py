@@ -344,6 +344,19 @@ def test_a_focal_length_that_settles_soon_is_not_taken_for_another_focal_length(
     assert gained(field) > 0.8
 
 
+def test_what_gains_in_the_first_blocks_alone_is_no_chance() -> None:
+    """Settled in a seventh of the capture, it gains in so few blocks that all blocks' scatter hides it."""
+
+    def longer(time_s):
+        return -0.0054 * (1 - np.exp(-np.maximum(time_s, 0) / 0.475))
+
+    setup = replace(HAND, seed=7932, frames=91, points=40, rate_rad_s=1.095, gyro_noise_rad_s=0.0013166)
+    phone = StrangePhone(setup, Strange(longer=longer))
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert not verdict.accepted
+    assert (field.covariates, field.shape) == (("time",), "levelling off")
+
+
 def test_a_pause_in_the_readout_is_a_jump_of_the_row() -> None:
     """Two even blocks with 2 ms between them: six knots do not say it, more are taken."""
 

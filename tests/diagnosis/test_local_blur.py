@@ -29,7 +29,15 @@ from virest.diagnosis.local_blur import (
     observe_blur,
     residuals,
 )
-from virest.diagnosis.local_blur_edges import fit_steps, measure_widths, observe_picture
+from virest.diagnosis.local_blur_edges import (
+    EdgeWidths,
+    evenly_isolated,
+    fit_steps,
+    isolated_edges,
+    measure_widths,
+    observe_picture,
+    share_a_reach,
+)
 from virest.diagnosis.local_blur_fit import EDGE_STD, Defocus, ExposureTime, fit, held_out
 from virest.diagnosis.local_blur_model import fitted_width, node_tensors
 from virest.image_formation.kernels import kernel_field
@@ -133,7 +141,7 @@ def test_the_width_of_a_blurred_step_is_found(rng: np.random.Generator) -> None:
     u = np.arange(-14, 14.01, 0.5)
     width, centre = rng.uniform(0.8, 3.0, 40), rng.uniform(-0.6, 0.6, 40)
     steps = 0.3 + 0.2 * erf((u - centre[:, None]) / (np.sqrt(2) * width[:, None]))
-    found_centre, found, _, _ = fit_steps(steps, 14.0)
+    found_centre, found, _ = fit_steps(steps, 14.0)
     np.testing.assert_allclose(found, width, rtol=0.01)
     np.testing.assert_allclose(found_centre, centre, atol=0.01)
 
@@ -144,9 +152,41 @@ def test_lines_and_waves_are_no_steps() -> None:
     line = np.exp(-0.5 * (u / 1.5) ** 2)
     wave = np.sin(2 * np.pi * u / 9)
     step = erf(u / (np.sqrt(2) * 1.7))
-    found = measure_widths(np.stack([line, wave, step]), 0.02).width_px
-    assert found[0] == found[1] == 0
-    assert found[2] == pytest.approx(1.7, rel=0.01)
+    found = measure_widths(np.stack([line, wave, step]), 0.02)
+    steps = found.width_px > 0
+    assert set(found.row[steps]) == {2}
+    np.testing.assert_allclose(found.width_px[steps], 1.7, rtol=0.01)
+
+
+def crowded(rng: np.random.Generator, width_px: float) -> EdgeWidths:
+    """Widths that profiles show of steps whose widths scatter by 15 %, each with another step at some distance."""
+    u, beside = np.arange(-19, 19.01, 0.5), 8.0 + 6.0 * rng.exponential(1.0, 3000)
+    own = width_px * np.exp(rng.normal(0, 0.15, 3000))[:, None]
+    steps = erf(u / (np.sqrt(2) * own)) - 0.7 * erf((u - beside[:, None]) / (np.sqrt(2) * own))
+    fit = measure_widths(steps + rng.normal(0, 0.004, steps.shape), 0.02)
+    one, two = np.ones(len(fit.row)), np.zeros((len(fit.row), 2))
+    return EdgeWidths(
+        np.zeros(len(one), np.intp), one, one, two, two, fit.row, fit.reach_px, fit.width_px, one, one, len(steps)
+    )
+
+
+@pytest.mark.parametrize("width_px", [2.1, 2.6, 3.1])
+def test_edges_with_others_beside_them_do_not_seem_narrow(rng: np.random.Generator, width_px: float) -> None:
+    """Few stand alone over a long way, so those that hold their own width are the narrow ones: 4 % too narrow."""
+    seen = crowded(rng, width_px)
+    own, even = isolated_edges(seen).width_px, evenly_isolated(seen, 40).width_px
+    assert np.median(own) < 0.968 * width_px
+    assert len(even) >= 40
+    assert np.median(even) == pytest.approx(width_px, rel=0.03)
+
+
+def test_where_too_few_stand_alone_each_has_its_own_reach(rng: np.random.Generator) -> None:
+    """Few edges over one reach tell less than more of them over their own."""
+    seen = crowded(rng, 3.1)
+    own = isolated_edges(seen)
+    np.testing.assert_array_equal(evenly_isolated(seen, len(own)).width_px, own.width_px)
+    assert not share_a_reach(own)
+    assert share_a_reach(evenly_isolated(seen, 40))
 
 
 def test_widths_add_in_squares_up_to_the_shape_of_a_path() -> None:
@@ -213,7 +253,7 @@ def test_a_scene_of_smooth_things_is_not_called_defocused(rng: np.random.Generat
     texture = cv2.GaussianBlur(rng.normal(size=(336, 448)), (0, 0), 3.0)
     picture = np.clip(120 + 45 * texture / texture.std(), 1, 250).astype(np.uint8)
     frame = Frame(0, 0, 0.0, 0.01)
-    edges = observe_picture(picture, frame, ResponseCurve("srgb"), EdgeSettings())
+    edges = isolated_edges(observe_picture(picture, frame, ResponseCurve("srgb"), EdgeSettings()))
     observations, profile, trajectory = altered
     smooth = replace(observations, edges=edges, candidates=edges.candidates, isolated=len(edges))
     assert edges.candidates > 100

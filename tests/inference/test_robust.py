@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from virest.inference.chance import chance_of, t_ratio
+from virest.inference.chance import beyond_noise, chance_of, t_ratio
 from virest.inference.hold_out import group_means, loss
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
@@ -33,3 +33,14 @@ def test_an_even_gain_is_no_chance_and_three_blocks_are_needed() -> None:
     assert t_ratio(np.array([1.0, 1.1])) == 0
     assert chance_of(np.array([1.0, 1.1])) == 0.5
     assert chance_of(np.array([1.0, 1.1, 0.9, 1.0])) < 1e-3 < chance_of(np.array([1.0, -1.1, 0.9, 0.0]))
+
+
+def test_a_gain_of_a_few_blocks_stands_out_of_what_the_others_scatter(rng: np.random.Generator) -> None:
+    """By all blocks' scatter 3 of 30 reach no t of 2, however much they gain; where nothing gains both are the same."""
+    gain = rng.normal(0, 1, 30)
+    gain[:3] += 40
+    assert t_ratio(gain) < 2
+    assert beyond_noise(gain) > 10
+    nothing = np.array([beyond_noise(rng.normal(0, 1, 30)) for _ in range(2000)])
+    assert 0.9 < nothing.std() < 1.25
+    assert np.mean(nothing > 3) < 0.01

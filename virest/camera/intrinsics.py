@@ -8,6 +8,7 @@ Distortion models are OpenCV's: ``radtan`` (Brown 1971; k1 k2 p1 p2 k3) and ``fi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ COEFFICIENT_NAMES: dict[str, tuple[str, ...]] = {
 }
 _UNDISTORT_STEPS = 12
 _RAY_TOLERANCE = 1e-9
+_WITHIN_FOLD = 1e-2
+"""Part of the radius at which a picture folds back by which rays are kept inside: there Newton's method still ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +113,11 @@ class Intrinsics:
         )
 
     def _undistort(self, distorted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Newton's method on the distortion; the Jacobian is taken as the local radial scale."""
+        """Newton's method on the distortion.
+
+        Beyond the radius at which the picture of a radial lens folds back no ray is seen: what lies there gets the rays
+        just inside, which are finite, and change little with the lens.
+        """
         if self.model != "fisheye" and not any(self.coefficients):
             return distorted
         if self.model == "fisheye":
@@ -121,6 +128,10 @@ class Intrinsics:
                 theta -= (_fisheye_angle(theta, self.coefficients) - angle) / np.where(np.abs(slope) > 1e-3, slope, 1.0)
             theta = np.clip(theta, 0.0, 1.55)
             return distorted * np.where(angle > 1e-9, np.tan(theta) / np.maximum(angle, 1e-12), 1.0)
+        most = (1 - _WITHIN_FOLD) * _fold_radius(self.coefficients)
+        radius = np.linalg.norm(distorted, axis=-1, keepdims=True)
+        if np.max(radius, initial=0.0) > most:
+            distorted = distorted * np.minimum(1.0, most / np.maximum(radius, most))
         plane = distorted.copy()
         for _ in range(_UNDISTORT_STEPS):
             error = self._distort(plane) - distorted
@@ -144,6 +155,18 @@ class Intrinsics:
             ],
             axis=-2,
         )
+
+
+@lru_cache(maxsize=256)
+def _fold_radius(coefficients: tuple[float, ...]) -> float:
+    """Greatest r (1 + k1 r² + k2 r⁴ + k3 r⁶), units of the focal length, before it falls as r grows; inf: never."""
+    k1, k2, k3 = (k if abs(k) > _RAY_TOLERANCE else 0.0 for k in (*coefficients[:2], coefficients[4]))
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.array([1.0, 3 * k1, 5 * k2, 7 * k3]), "b"))
+    squares = [root.real for root in roots if abs(root.imag) < _RAY_TOLERANCE and root.real > 0]
+    if not squares:
+        return np.inf
+    r2 = min(squares)
+    return float(np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))))
 
 
 def _fisheye_angle(theta: NDArray[np.float64], k: tuple[float, ...]) -> NDArray[np.float64]:

@@ -23,7 +23,13 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis.isolated_steps import IsolatedSteps, isolated_steps, join_steps
-from virest.diagnosis.local_blur_edges import EdgeWidths, join_edges, observe_picture
+from virest.diagnosis.local_blur_edges import (
+    EdgeWidths,
+    evenly_isolated,
+    isolated_edges,
+    join_edges,
+    observe_picture,
+)
 from virest.diagnosis.local_blur_model import (
     across,
     covariates,
@@ -249,10 +255,11 @@ def _recent(frames: Sequence[Frame], index: int) -> tuple[Frame, ...]:
 def _chosen(
     edges: EdgeWidths, ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory, bits_per_px: float
 ) -> BlurObservations:
-    still = edges.select(_motion_px(edges, profile, trajectory) < STILL_PX)
+    still = evenly_isolated(edges.select(_motion_px(edges, profile, trajectory) < STILL_PX), MIN_EDGES)
     through = transfers(ratios, profile, trajectory)[:, :, 0].min(axis=1)
     ratio = np.where(through > MIN_TRANSFER, ratios.log_ratio, np.nan)
-    return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, len(edges), bits_per_px)
+    isolated = len(isolated_edges(edges))
+    return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, isolated, bits_per_px)
 
 
 @dataclass(frozen=True, slots=True)

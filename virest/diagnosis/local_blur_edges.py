@@ -8,6 +8,10 @@ motion path that lies along the normal.  Variances of blurs that follow each oth
 An edge is measured in linear light, where blurs act, by fitting a step spread by a Gaussian, a + b erf((u − u0)/√2 s),
 to its profile.  It counts only if both plateaus reach ISOLATION widths from its middle and nothing else disturbs the
 profile: textures, thin lines and shading fail that test, whereas steps pass it however blurred they are.
+
+Few steps stand alone over a long way, so whoever takes for each edge the shortest way that holds its own width takes
+those that seem narrow.  All edges of a capture are therefore looked at over a way that holds what is usual there and
+SPREAD more (:func:`evenly_isolated`).
 """
 
 from __future__ import annotations
@@ -29,16 +33,26 @@ Picture = NDArray[np.uint8]
 
 STEP_PX = 0.5
 """Between two samples of a profile."""
-REACHES_PX = (4.0, 5.5, 7.5, 10.0, 14.0, 19.0)
+REACHES_PX = (4.0, 5.5, 7.5, 10.0, 14.0, 16.5, 19.0)
 """Half lengths of the profiles that are tried, shortest first."""
 ISOLATION = 4.0
 """Plateaus must reach this many widths, and a pixel, from the edge's middle."""
-_FIT_STEPS = 12
+SPREAD = 1.2
+"""Edges this many times as wide as is usual are still measured over the reach that all of a capture share: widths of
+one scatter by 4 to 14 % about the usual one (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
+OTHERS_WIDER = 2.0
+"""Other pictures of a capture may be up to this many times as soft: so far a picture's edges are looked at."""
+LEAST_WIDTH_PX = 0.05
+_FIT_STEPS, _FURTHER_STEPS = 12, 3
+"""Of the descent, from a guess and from what a shorter part of the same step gave."""
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeWidths:
-    """Widths of isolated edges, one row an edge, and where, when and under which conditions they were seen."""
+    """Widths of edges, and where, when and under which conditions they were seen.
+
+    Before :func:`isolated_edges` one row for each edge and reach that holds it, afterwards one row an isolated edge.
+    """
 
     frame: NDArray[np.intp]
     """(n,) movie index."""
@@ -50,10 +64,12 @@ class EdgeWidths:
     """(n, 2) middle of the edge."""
     normal: Array
     """(n, 2) unit normal, from dark to bright."""
+    number: NDArray[np.intp]
+    """(n,) of the edge in its frame."""
+    reach_px: Array
+    """(n,) half length of the profile."""
     width_px: Array
-    """(n,) standard deviation of the Gaussian that spreads the step."""
-    noise_px: Array
-    """(n,) standard deviation of width_px, from the profile's own misfit."""
+    """(n,) standard deviation of the Gaussian that spreads the step; 0 where the profile is no step."""
     step_levels: Array
     """(n,) height, grey levels."""
     brightness: Array
@@ -91,23 +107,58 @@ def observe_picture(
     grey = _profiles(picture.astype(np.float32), points, normals)
     light = _profiles(curve.linear_table()[picture], points, normals)
     fit = measure_widths(light, settings.max_misfit)
-    step_levels, brightest, brightness = _levels_of(grey, fit.reach_px)
+    step_levels, brightest, brightness = _levels_of(grey[fit.row], fit.reach_px)
     clipped = brightest > float(np.flatnonzero(~curve.clipped_table(1.5)).max(initial=0))
-    keep = (fit.width_px > 0) & (step_levels > settings.min_step_levels) & ~clipped
-    moved = points + fit.centre_px[:, None] * normals
-    full = np.ones(int(keep.sum()))
+    full = np.ones(len(fit.row))
     return EdgeWidths(
         frame=np.full(len(full), frame.index, np.intp),
         stamp_s=frame.time_s * full,
         exposure_s=(frame.exposure_s or 0.0) * full,
-        points_px=moved[keep],
-        normal=normals[keep],
-        width_px=fit.width_px[keep],
-        noise_px=fit.noise_px[keep],
-        step_levels=step_levels[keep],
-        brightness=brightness[keep] / 255.0,
+        points_px=points[fit.row] + fit.centre_px[:, None] * normals[fit.row],
+        normal=normals[fit.row],
+        number=fit.row,
+        reach_px=fit.reach_px,
+        width_px=np.where((step_levels > settings.min_step_levels) & ~clipped, fit.width_px, 0.0),
+        step_levels=step_levels,
+        brightness=brightness / 255.0,
         candidates=len(points),
     )
+
+
+def shared_reach_px(width_px: Array) -> float:
+    """Over which edges of these widths (n,) should all be measured."""
+    return ISOLATION * SPREAD * float(np.median(width_px)) + 1.0 if len(width_px) else 0.0
+
+
+def share_a_reach(edges: EdgeWidths) -> bool:
+    """Whether isolated edges were all measured over one reach at least, as :func:`evenly_isolated` wants it."""
+    return bool(np.all(edges.reach_px >= min(shared_reach_px(edges.width_px), REACHES_PX[-1])))
+
+
+def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
+    """Each edge over its shortest reach from the least on, if its profile there is a step's."""
+    far = seen.select(seen.reach_px >= least_reach_px)
+    order = np.lexsort((far.reach_px, far.number, far.frame))
+    edge = np.stack([far.frame, far.number], axis=-1)[order]
+    first = order[np.r_[True, (np.diff(edge, axis=0) != 0).any(axis=1)]] if len(order) else order
+    return far.select(first[far.width_px[first] > 0])
+
+
+def evenly_isolated(seen: EdgeWidths, least: int) -> EdgeWidths:
+    """The isolated edges over one reach, which is SPREAD times what the usual width asks for; wider ones over theirs.
+
+    Whether an edge of about the usual width counts then depends on what stands beside it, and not on its own width.
+    Where fewer than the least number are isolated over so long a reach, each has its own.
+    """
+    found, reach_px = isolated_edges(seen), 0.0
+    while len(found) >= max(least, 1):
+        asked_px = shared_reach_px(found.width_px)
+        longer_px = next((reach for reach in REACHES_PX if reach >= asked_px), REACHES_PX[-1])
+        further = isolated_edges(seen, longer_px)
+        if longer_px <= reach_px or len(further) < least:
+            break
+        found, reach_px = further, longer_px
+    return found
 
 
 def _profiles(plane: Any, points: Array, normals: Array) -> Array:
@@ -139,64 +190,67 @@ def _levels_of(grey: Array, reach_px: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class WidthFit:
-    """Steps fitted to profiles; rows that are no isolated step have width 0."""
+    """Steps fitted to profiles over every reach that holds them; width 0: another thing than a step."""
 
+    row: NDArray[np.intp]
+    """(n,) which profile."""
     width_px: Array
-    noise_px: Array
     centre_px: Array
     reach_px: Array
 
 
 def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
-    """Fit each profile (n, m) over the shortest reach that holds ISOLATION widths on both sides of its step.
+    """Fit profiles (n, m) of a picture over all reaches that may be shared, and keep those that hold ISOLATION widths.
 
-    The reach follows from the profile alone, never from a predicted blur, so the model cannot choose its own evidence.
+    The reaches follow from the profiles alone, never from a predicted blur: no model chooses its own evidence.
     """
     count, middle = len(profiles), profiles.shape[1] // 2
-    found = WidthFit(*(np.zeros(count) for _ in range(4)))
-    open_rows = np.arange(count)
+    centre, width, ended = np.zeros(count), np.zeros(count), np.zeros(count, bool)
+    parts = [(np.zeros(0, np.intp), *[np.zeros(0)] * 3)]
     for reach in REACHES_PX:
         half = round(reach / STEP_PX)
-        part = profiles[open_rows, middle - half : middle + half + 1]
+        part = profiles[:, middle - half : middle + half + 1]
         whole = np.isfinite(part).all(axis=1) & (np.ptp(np.nan_to_num(part), axis=1) > 0)
-        open_rows, part = open_rows[whole], part[whole]
-        if not len(open_rows):
-            break
-        centre, width, noise, misfit = fit_steps(part, reach)
-        ends = (ISOLATION * width + 1.0 <= reach - np.abs(centre)) & (np.abs(centre) < 0.5 * reach)
-        good = ends & (misfit < max_misfit) & np.isfinite(noise) & (width > 0.05)
-        rows = open_rows[good]
-        found.width_px[rows], found.noise_px[rows] = width[good], noise[good]
-        found.centre_px[rows], found.reach_px[rows] = centre[good], reach
-        open_rows = open_rows[~ends & np.isfinite(width)]
-    return found
+        misfit = np.full(count, np.inf)
+        further = ended & (reach <= OTHERS_WIDER * shared_reach_px(width[ended]))
+        for rows, steps in ((whole & ~ended, _FIT_STEPS), (whole & further, _FURTHER_STEPS)):
+            width[rows & ~ended] = 0.25 * reach
+            centre[rows & ~ended] = 0.0
+            centre[rows], width[rows], misfit[rows] = fit_steps(part[rows], reach, (centre[rows], width[rows]), steps)
+        ends = (
+            whole
+            & (further | ~ended)
+            & (ISOLATION * width + 1.0 <= reach - np.abs(centre))
+            & (np.abs(centre) < 0.5 * reach)
+        )
+        good = (misfit < max_misfit) & (width > LEAST_WIDTH_PX)
+        ended |= ends & good
+        parts.append((*np.nonzero(ends), np.where(good, width, 0.0)[ends], centre[ends], np.full(ends.sum(), reach)))
+    return WidthFit(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def fit_steps(profiles: Array, reach_px: float) -> tuple[Array, Array, Array, Array]:
-    """Least squares of a + b erf((u − u0)/√2 s) to profiles (n, m) over ± reach: u0, s, its deviation, misfit.
+def fit_steps(
+    profiles: Array, reach_px: float, start: tuple[Array, Array] | None = None, steps: int = _FIT_STEPS
+) -> tuple[Array, Array, Array]:
+    """Least squares of a + b erf((u − u0)/√2 s) to profiles (n, m) over ± reach: u0, s, misfit.
 
     a and b follow linearly from u0 and s; these by damped Gauss-Newton steps.  misfit: rms as part of the step 2 b.
+    start: u0 and s (n,) to begin from; None: a step in the middle, a quarter of the reach wide.
     """
     u = np.linspace(-reach_px, reach_px, profiles.shape[1])
-    centre, width = np.zeros(len(profiles)), np.full(len(profiles), 0.25 * reach_px)
-    for _ in range(_FIT_STEPS):
+    centre, width = start or (np.zeros(len(profiles)), np.full(len(profiles), 0.25 * reach_px))
+    for _ in range(steps):
         _, jacobian, residual = _step_model(u, profiles, centre, width)
         normal = np.einsum("nim,njm->nij", jacobian, jacobian)
         normal[:, range(4), range(4)] *= 1.0 + 1e-3
         normal[:, range(4), range(4)] += 1e-12
         move = np.linalg.solve(normal, np.einsum("nim,nm->ni", jacobian, residual)[..., None])[..., 0]
         centre = np.clip(centre + np.clip(move[:, 2], -1.0, 1.0), -reach_px, reach_px)
-        width = np.clip(width * np.exp(np.clip(move[:, 3] / width, -0.5, 0.5)), 0.05, 2 * reach_px)
-    level, jacobian, residual = _step_model(u, profiles, centre, width)
-    # Samples are closer than a pixel, so neighbours share their noise: 1/STEP_PX of them count as one.
-    free = max(len(u) * STEP_PX - 4.0, 1.0)
-    variance = (residual**2).sum(axis=1) * STEP_PX / free
-    normal = np.einsum("nim,njm->nij", jacobian, jacobian) * STEP_PX
-    normal[:, range(4), range(4)] += 1e-12
-    noise = np.sqrt(np.maximum(np.linalg.inv(normal)[:, 3, 3], 0) * variance)
+        width = np.clip(width * np.exp(np.clip(move[:, 3] / width, -0.5, 0.5)), LEAST_WIDTH_PX, 2 * reach_px)
+    level, _, residual = _step_model(u, profiles, centre, width)
     with np.errstate(divide="ignore", invalid="ignore"):
         misfit = np.where(level > 0, np.sqrt(np.mean(residual**2, axis=1)) / (2 * level), np.inf)
-    return centre, width, noise, misfit
+    return centre, width, misfit
 
 
 def _step_model(u: Array, profiles: Array, centre: Array, width: Array) -> tuple[Array, Array, Array]:
@@ -214,5 +268,14 @@ def _step_model(u: Array, profiles: Array, centre: Array, width: Array) -> tuple
 def _no_edges() -> EdgeWidths:
     empty = np.zeros(0)
     return EdgeWidths(
-        np.zeros(0, np.intp), empty, empty, np.zeros((0, 2)), np.zeros((0, 2)), empty, empty, empty, empty
+        np.zeros(0, np.intp),
+        empty,
+        empty,
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+        np.zeros(0, np.intp),
+        empty,
+        empty,
+        empty,
+        empty,
     )

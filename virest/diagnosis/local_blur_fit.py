@@ -22,6 +22,7 @@ from virest.diagnosis.local_blur import (
     residuals,
     time_blocks,
 )
+from virest.diagnosis.local_blur_edges import share_a_reach
 from virest.diagnosis.local_blur_model import predicted_ratios
 from virest.inference.clustered import scatter
 from virest.inference.descent import Residuals, Slopes, System, descend, slices, slopes_by_steps
@@ -37,10 +38,12 @@ SHIFT_STD_S = 0.004
 """How far the rows' times may be off after the geometry was fitted; a shift is a nuisance of every fit."""
 PATH_STD = 0.03
 """Relative error of the predicted path's length that focal length and gyroscope scale leave."""
-EDGE_STD = 0.06
-"""Part by which a capture's edges are all told too narrow or too wide: which of them stand alone over how far a profile
-is looked at depends on how wide they seem.  Over 12 simulated captures of four scenes, a defocus of 2 to 3.5 px: −0.048
-in the mean, standard deviation 0.036."""
+EDGE_STD = 0.04
+"""Part by which a capture's edges are all told too narrow or too wide, as the scene has soft ones and the encoder takes
+detail away: ``python -m virest.app.bench --only edges`` prints it for a defocus of 2 to 3.5 px."""
+OWN_REACH_STD = 0.06
+"""The same where too few edges stand alone over one reach, and each was measured over its own: over 12 simulated
+captures −0.048 in the mean, standard deviation 0.036."""
 _NUISANCE = np.array([LENS_SIGMA_PX, 0.0])
 _NUISANCE_STD = np.array([LENS_STD_PX, SHIFT_STD_S])
 _NUISANCE_LOW = np.array([0.35, -0.03])
@@ -271,7 +274,8 @@ class _Widths:
         by_damping = (self.left(found.state, 1.0 + _DAMPING_STEP) - found.look.left) / _DAMPING_STEP
         by_width = np.zeros(len(edge))
         by_width[edge] = observations.edges.width_px
-        unknown = np.hypot(observations.damping_std, 2 * PATH_STD), EDGE_STD
+        edge_std = EDGE_STD if share_a_reach(observations.edges) else OWN_REACH_STD
+        unknown = np.hypot(observations.damping_std, 2 * PATH_STD), edge_std
         both = np.stack([by_damping, by_width[self.use]], axis=-1) * unknown
         pulled = found.inverse() @ found.pull(both[:, None])
         return found.sandwich(scatter(found.score, block)) + pulled @ pulled.T

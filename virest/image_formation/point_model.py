@@ -125,10 +125,17 @@ class Poses:
     first_s: Array
     """(n,) IMU clock."""
     second_s: Array
+    first_exposure_s: Array
+    """(n,) about those times, over which everything that moves is seen at its mean."""
+    second_exposure_s: Array
     before: Array
     """(n, 3, 3) R_world_cam at the first sight."""
     back: Array
     """(n, 3, 3) R_cam_world at the second."""
+
+    def again(self, lens: MovingLens, rays: Array) -> Array:
+        """Pixels (n, 2) at which a lens shows rays (n, 3), camera axes, at the second sight."""
+        return lens.project(rays, self.second_s, self.second_exposure_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,13 +243,13 @@ def predict(
     """
     poses, sights = _poses(known, table, like), _sights(known.lens, table, like)
     at_rest = known.lens.rays_at_rest(table.first_px, poses.first_s) if sights is None else sights.rays
-    world = turned(poses.before, known.lens.from_rest(at_rest, poses.first_s))
+    world = turned(poses.before, known.lens.from_rest(at_rest, poses.first_s, poses.first_exposure_s))
     if scene is None or isinstance(scene, DirectedMotion):
         rays = turned(poses.back, world)
-        expected = known.lens.project(rays, poses.second_s)
+        expected = poses.again(known.lens, rays)
         if scene is None:
             return Prediction(expected, poses, sights=sights)
-        per_step = _lens_slope(known, rays, poses.second_s, expected) @ poses.back
+        per_step = _lens_slope(known.lens, rays, poses, expected) @ poses.back
         step = scene.direction[scene.group(table.pair)]
         along = np.squeeze(per_step @ step[..., None], -1)
         return Prediction(expected, poses, along, per_step=per_step, sights=sights)
@@ -264,9 +271,9 @@ def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sig
     return Sightings(lens.lens, lens.lens.rays(table.first_px))
 
 
-def _lens_slope(known: IntegratedMotion, rays: Array, second_s: Array, expected: Array) -> Array:
+def _lens_slope(lens: MovingLens, rays: Array, poses: Poses, expected: Array) -> Array:
     """Change (n, 2, 3) of pixels per unit of each part of rays (n, 3)."""
-    steps = (known.lens.project(rays + RAY_STEP * axis, second_s) for axis in np.eye(3))
+    steps = (poses.again(lens, rays + RAY_STEP * axis) for axis in np.eye(3))
     return np.stack([(step - expected) / RAY_STEP for step in steps], axis=-1)
 
 
@@ -280,9 +287,9 @@ def _poses(known: IntegratedMotion, table: TrackTable, like: Prediction | None) 
         same = old.trajectory is known.trajectory and old.exposure_scale == scale
         if same and np.array_equal(first_s, old.first_s) and np.array_equal(second_s, old.second_s):
             return old
-    before = known.trajectory.mean_orientation(first_s, scale * table.first_exposure_s)
-    after = known.trajectory.mean_orientation(second_s, scale * table.second_exposure_s)
-    return Poses(known.trajectory, scale, first_s, second_s, before, np.swapaxes(after, -1, -2))
+    exposures = scale * table.first_exposure_s, scale * table.second_exposure_s
+    before, after = map(known.trajectory.mean_orientation, (first_s, second_s), exposures)
+    return Poses(known.trajectory, scale, first_s, second_s, *exposures, before, np.swapaxes(after, -1, -2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,16 +336,16 @@ def _paths(known: IntegratedMotion, table: TrackTable, scene: InertialMotion, po
 
 
 def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Moved) -> Prediction:
-    back, second_s = poses.back, poses.second_s
+    back = poses.back
     rays = turned(back, world + moved.step * moved.inverse_depth[:, None])
     rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)
-    expected = known.lens.project(rays, second_s)
+    expected = poses.again(known.lens, rays)
     if moved.per_entry is None:
         ahead = rays + RAY_STEP * turned(back, moved.step)
         return Prediction(
-            expected, poses, (known.lens.project(ahead, second_s) - expected) / RAY_STEP, None, moved
+            expected, poses, (poses.again(known.lens, ahead) - expected) / RAY_STEP, None, moved
         )  # fmt: skip
-    per_world = _lens_slope(known, rays, second_s, expected) @ back
+    per_world = _lens_slope(known.lens, rays, poses, expected) @ back
     along = np.squeeze(per_world @ moved.step[..., None], -1)
     return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
 

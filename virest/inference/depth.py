@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, TrackTable, predict, turned
+from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, Poses, TrackTable, predict, turned
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
@@ -153,9 +153,9 @@ def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, p
     assert moved is not None
     assert moved.paths is not None
     centre_1 = moved.paths[0].centre(scene, scene.velocity_m_s[table.window])
-    rays, expected = known.lens.rays(table.first_px, poses.first_s), moved.inverse_depth
+    rays, expected = known.lens.rays(table.first_px, poses.first_s, poses.first_exposure_s), moved.inverse_depth
     way = turned(poses.before, rays)
-    view = _Parallax(known.lens, turned(poses.back, way), turned(poses.back, moved.step), table, poses.second_s)
+    view = _Parallax(known.lens, turned(poses.back, way), turned(poses.back, moved.step), table, poses)
     depth, std, across = view.inverse_depths(expected, passes, reach)
     safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
     points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], poses.first_s, depth, std)
@@ -172,13 +172,13 @@ class _Parallax:
     step: Array
     """(n, 3) its shift a unit of inverse depth."""
     table: TrackTable
-    second_s: Array
+    poses: Poses
 
     def seen(self, inverse_depth: Array) -> Array:
         """Pixels (n, 2)."""
         rays = self.far + self.step * inverse_depth[:, None]
         rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)
-        return self.lens.project(rays, self.second_s)
+        return self.poses.again(self.lens, rays)
 
     def inverse_depths(self, start: Array, passes: int, reach: float) -> tuple[Array, Array, Array]:
         """(n,) inverse depths, their standard deviations, and what is left across in those of the tracking noise."""

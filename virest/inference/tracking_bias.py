@@ -70,6 +70,8 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
         return np.asarray(SHARED_READOUT * told)
     scaled = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX * np.array(BIAS_STD[name])
     floor = np.maximum(np.maximum(scaled, SHARED * told), WANDER_STD.get(name, 0.0))
+    if name == "time_offset":
+        floor = np.hypot(floor, DECODED_LAG_S)
     if name == "gyro_bias" and own is not None:
         floor = np.hypot(floor, SHARED_RELIEF * fit.by_relief[own])
     return np.asarray(floor)

@@ -47,9 +47,9 @@ class MovingLens:
     zoom: tuple[Field, ...] = ()
     """Parts by which the focal length is longer, over time or over what is logged."""
 
-    def rays(self, points_px: Array, time_s: Any) -> Array:
+    def rays(self, points_px: Array, time_s: Any, exposure_s: Any = 0.0) -> Array:
         """Rays (..., 3) with z = 1 through pixels (..., 2) seen at times (...): the inverse of :meth:`project`."""
-        return self.from_rest(self.rays_at_rest(points_px, time_s), time_s)
+        return self.from_rest(self.rays_at_rest(points_px, time_s), time_s, exposure_s)
 
     def rays_at_rest(self, points_px: Array, time_s: Any) -> Array:
         """Rays (..., 3) as if the stabiliser were at rest."""
@@ -57,17 +57,23 @@ class MovingLens:
             points_px = self._about_centre(points_px, 1.0 / self._focal_scale(time_s, points_px))
         return self.lens.rays(points_px)
 
-    def from_rest(self, rays: Array, time_s: Any) -> Array:
-        """Rays (..., 3) through where :meth:`rays_at_rest` go, with the stabiliser where it is at times (...)."""
+    def from_rest(self, rays: Array, time_s: Any, exposure_s: Any = 0.0) -> Array:
+        """Rays (..., 3) through where :meth:`rays_at_rest` go, with the stabiliser where it is at times (...).
+
+        exposure_s: (...) about those times, over which the rays are the mean ones.
+        """
         if self.shift is None:
             return rays
-        plane = rays[..., :2] - self.shift_at(time_s)
+        plane = rays[..., :2] - self.shift_at(time_s, exposure_s)
         return np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
 
-    def project(self, rays: Array, time_s: Any) -> Array:
-        """Pixels (..., 2) at which rays (..., 3) in camera axes are seen at times (...)."""
+    def project(self, rays: Array, time_s: Any, exposure_s: Any = 0.0) -> Array:
+        """Pixels (..., 2) at which rays (..., 3) in camera axes are seen at times (...), or over exposures about them.
+
+        exposure_s: (...); the rays are then the mean ones.
+        """
         if self.shift is not None:
-            plane = rays[..., :2] / rays[..., 2:] + self.shift_at(time_s)
+            plane = rays[..., :2] / rays[..., 2:] + self.shift_at(time_s, exposure_s)
             rays = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         points_px = self.lens.project(rays)
         if self.focal_drift_per_s or self.zoom:
@@ -77,10 +83,16 @@ class MovingLens:
             points_px = seen_px
         return points_px
 
-    def shift_at(self, time_s: Any) -> Array:
-        """The stabiliser's shift (..., 2) at times (...), units of the focal length."""
+    def shift_at(self, time_s: Any, exposure_s: Any = 0.0) -> Array:
+        """The stabiliser's mean shift (..., 2) over exposures (...) about times (...), units of the focal length.
+
+        By Gauss' two nodes: exact for paths that bend like a polynomial of third order.
+        """
         if self.shift is None or self.shift_time_s is None:
             return np.zeros((*np.shape(time_s), 2))
+        if np.any(exposure_s):
+            aside_s = np.asarray(exposure_s) / np.sqrt(12)
+            return 0.5 * (self.shift_at(time_s - aside_s) + self.shift_at(time_s + aside_s))
         return np.stack([np.interp(time_s, self.shift_time_s, self.shift[:, i]) for i in (0, 1)], axis=-1)
 
     def between(self, start_s: float, end_s: float) -> MovingLens:

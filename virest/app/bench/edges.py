@@ -1,4 +1,4 @@
-"""How far edges overshoot that nobody sharpened, and what is seen of a phone's sharpening: :mod:`unsharp_mask`.
+"""What edges show: a phone's sharpening, or that nobody sharpened (:mod:`unsharp_mask`), and defocus.
 
 $ python -m virest.app.bench --only edges --quick
 """
@@ -14,6 +14,8 @@ import numpy as np
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, simulated
 from virest.app.diagnose import open_source
+from virest.diagnosis.local_blur import look_for_blur
+from virest.diagnosis.local_blur_fit import Defocus, fit
 from virest.inference.unsharp_mask import FALSE_ALARM, MOST_FRAMES, Overshoot, overshoot
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
@@ -29,13 +31,18 @@ MOTIONS = ((0.4, 6.0), (0.6, 8.0), (1.2, 12.0))
 MASKS = ((0.0, 1.0), (0.4, 1.0), (0.7, 1.0), (1.0, 1.5))
 """Amount and radius; the first is none."""
 FRAMES, FIRST_SEED = 6, 7000
+DEFOCUS_PX, SOFT_SCENES = (2.0, 2.5, 3.0, 3.5), ("leaves", "text", "board", "photographs")
+SOFT_FRAMES, FIRST_SOFT_SEED = 60, 7200
 
 
 def edges_section(work: Path, scale: Scale) -> tuple[Row, str]:
     """Measure captures of all scenes, sizes and motions, each with every mask."""
     every = list(product(SCENES, SIZES, MOTIONS))[:: 4 if scale.quick else 1]
     groups = [[_row(work, number, *one, mask) for number, one in enumerate(every)] for mask in MASKS]
-    return {"captures": [row for rows in groups for row in rows]}, _text(groups)
+    softened = list(enumerate(product(DEFOCUS_PX, SOFT_SCENES)))[:: 5 if scale.quick else 1]
+    soft = [_soft_row(work, *one) for one in softened]
+    found = {"captures": [row for rows in groups for row in rows], "defocus": soft}
+    return found, f"{_text(groups)}\n{_soft_text(soft)}"
 
 
 def _row(
@@ -60,6 +67,38 @@ def _row(
     overshoots = {"of_all": found.of_all, "of_sharpest": found.of_sharpest, "p_value": found.p_value}
     expected = found.expected_mask().amount
     return row | overshoots | {"fitted": [fitted.amount, fitted.radius_px], "expected": expected}
+
+
+def _soft_row(work: Path, number: int, hidden: tuple[float, str]) -> Row:
+    """Fit the defocus of one capture, of which nothing else is wrong, to its edges."""
+    sigma_px, scene = hidden
+    rng = np.random.default_rng([FIRST_SOFT_SEED, number])
+    capture = simulated(
+        work, f"defocus-{number}", scene=scene, width=480, height=360, frames=SOFT_FRAMES,
+        rate_rad_s=float(rng.uniform(0.5, 1.4)), exposure_ms=float(rng.uniform(4, 11)),
+        noise_levels=float(rng.uniform(1, 2.5)), bitrate_bits_per_px=float(rng.uniform(0.15, 0.4)),
+        seed=FIRST_SOFT_SEED + number, effects=(f"defocus={sigma_px}",), truth_frames=False,
+    )  # fmt: skip
+    source = open_source(capture)
+    trajectory = integrate_gyro(source.capture.imu, source.profile)
+    seen = look_for_blur(source.gray, source.capture, source.profile, trajectory)
+    effects: list[Any] = [Defocus()]
+    found = fit(seen, source.profile, trajectory, effects)
+    told = {"told_px": float(found.values[0][0]), "std_px": float(found.std[0])} if found.determined[0] else {}
+    return {"scene": scene, "sigma_px": sigma_px, "edges": len(seen.edges), **told}
+
+
+def _soft_text(rows: list[Row]) -> str:
+    told = [row for row in rows if "told_px" in row]
+    lines = [
+        [f"{row['sigma_px']:g}", row["scene"], str(row["edges"]), f"{row['told_px']:.2f} ± {row['std_px']:.2f}"]
+        for row in told
+    ]
+    off = np.array([row["told_px"] / row["sigma_px"] - 1 for row in told])
+    return (
+        f"DEFOCUS, px: told less hidden is {np.mean(off):+.3f} of it in the mean, rms {np.sqrt(np.mean(off**2)):.3f},\n"
+        f"in {len(told)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "told"], lines)
+    )
 
 
 def _overshoot(capture: Path) -> Overshoot | None:

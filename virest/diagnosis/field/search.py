@@ -30,7 +30,7 @@ from virest.diagnosis.geometric_ladder import (
     GeometricVerdict,
     p_of,
 )
-from virest.inference.chance import t_ratio
+from virest.inference.chance import beyond_noise, t_ratio
 from virest.inference.track_fit import Term, TrackFit
 
 log = logging.getLogger(__name__)
@@ -341,7 +341,7 @@ def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
     gain = before.block_loss - after.block_loss
     log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
     least_t = RIVAL_T if asked.instead else MIN_T
-    holds = t_ratio(gain) > (MIN_LOCAL_T if form.over_time and not form.local else least_t)
+    holds = _holds_over_time(gain) if form.over_time and not form.local else t_ratio(gain) > least_t
     if asked.sudden is not None and not form.local:
         # most of the gain lies in one block; that of the others tells the change, and it must hold there
         there = asked.sudden.pair // PAIRS_IN_BLOCK
@@ -351,6 +351,11 @@ def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
     if gain.mean() < least_gain * before.block_loss.mean() or after.rms > before.rms or not holds:
         return None
     return _refined(evidence, model, _Entered(extended, form, before, after), fitted)
+
+
+def _holds_over_time(gain: Array) -> bool:
+    """Whether what a form over time gains (blocks,) is no chance: of all blocks, or by far in a few."""
+    return t_ratio(gain) > MIN_LOCAL_T or beyond_noise(gain) > MIN_T
 
 
 def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackFit) -> _Entered:
