@@ -290,7 +290,7 @@ def test_patches_of_one_moment_share_its_errors(rng: np.random.Generator) -> Non
 def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Residuals that are alike in a stretch of time tell less than as many that are not."""
     time_s = np.linspace(0.0, 4.0, 400)
-    edges = SimpleNamespace(width_px=np.zeros(0))
+    edges = SimpleNamespace(width_px=np.zeros(0), reach_px=np.zeros(0))
     seen = SimpleNamespace(time_s=time_s, damping_std=0.1, is_edge=np.zeros(400, bool), edges=edges)
     effects = [local_blur_fit.ExposureTime()]
     evidence = local_blur_fit._Widths(seen, CameraProfile(64, 48), None, effects, np.ones(400, bool))  # type: ignore[arg-type]
