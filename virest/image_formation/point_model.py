@@ -342,9 +342,7 @@ def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Move
     expected = poses.again(known.lens, rays)
     if moved.per_entry is None:
         ahead = rays + RAY_STEP * turned(back, moved.step)
-        return Prediction(
-            expected, poses, (poses.again(known.lens, ahead) - expected) / RAY_STEP, None, moved
-        )  # fmt: skip
+        return Prediction(expected, poses, (poses.again(known.lens, ahead) - expected) / RAY_STEP, None, moved)
     per_world = _lens_slope(known.lens, rays, poses, expected) @ back
     along = np.squeeze(per_world @ moved.step[..., None], -1)
     return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
