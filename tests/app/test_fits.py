@@ -14,8 +14,9 @@ def test_known_coefficients_come_back():
     for k in range(240):
         ideal, removed, left, misplaced = np.exp(rng.normal((3.5, 4.0, -4.0, 1.0), (0.8, 1.0, 1.0, 1.0)))
         logarithms = np.log([np.e, ideal, left])
-        gain_db = 10 * np.log10(1 + removed / (np.exp(logarithms @ law) + misplaced)) + rng.normal(0, 0.05)
-        row = {"capture": f"c{k % 8}", "removed": removed, "misplaced": misplaced}
+        off, left = np.array([0.0, misplaced]), np.exp(logarithms @ law)
+        gain_db = np.mean(10 * np.log10((left + removed + off) / (left + 2 * off))) + rng.normal(0, 0.05)
+        row = {"capture": f"c{k % 8}", "removed": removed, "misplaced": (off, 2 * off, (0.5, 0.5))}
         rows.append({**row, "logarithms": logarithms, "gain_db": gain_db})
     found = fit_left_over(rows)
     assert found["coefficients"] == pytest.approx(law, abs=0.08)

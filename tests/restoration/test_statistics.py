@@ -299,7 +299,8 @@ def test_a_misplaced_picture_gains_what_its_spectrum_says(std_px: float) -> None
     signal, passed, noise = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2)), np.full(24, 0.01)
     found = PictureStatistics(frequency, signal, noise, passed, 1.0)
     rng, area = np.random.default_rng(4), 2 * np.pi * frequency / 48
-    phase = 2 * np.pi * frequency * rng.normal(0, std_px, (20000, 1))
+    distance_px = np.hypot(*rng.normal(0, std_px, (2, 20000, 1))) * np.cos(rng.uniform(0, 2 * np.pi, (20000, 1)))
+    phase = 2 * np.pi * frequency * distance_px
     filtered = passed * signal / (passed * signal + noise)
 
     def missing(kept: NDArray[np.float64], moved: NDArray[np.float64]) -> float:
@@ -309,8 +310,9 @@ def test_a_misplaced_picture_gains_what_its_spectrum_says(std_px: float) -> None
         missing(kept, moved) for moved in (0 * phase[:1], phase) for kept in (np.sqrt(passed), filtered)
     )
     misplaced = found.misplaced(std_px, np.zeros(24))
-    assert misplaced.error == pytest.approx(restored_off - restored, rel=0.03)
-    assert misplaced.part == pytest.approx(max((recorded_off - restored_off) / (recorded - restored), 0), abs=0.02)
+    assert misplaced.removed == pytest.approx(recorded - restored)
+    assert misplaced.weight @ misplaced.restored == pytest.approx(restored_off - restored, rel=0.03)
+    assert misplaced.weight @ misplaced.blurred == pytest.approx(recorded_off - recorded, rel=0.03)
 
 
 def test_no_frame_has_less_than_its_coders_noise() -> None:

@@ -66,14 +66,41 @@ def test_a_larger_change_promises_more_and_a_larger_rest_less():
 
 
 def test_rows_that_lie_wrong_promise_less():
-    """Both what is removed and what is left count; where nothing is removed, nothing is promised."""
+    """The more a sharp picture loses by its place over a blurred one, the less is promised; a loss is told as one."""
     found = ConfirmedGain(1.0, 0.2, 0.02, 4)
-    in_place, less, off = (
+    in_place, less, lost = (
         found.of_change_db(50.0, 80.0, 30.0, misplaced)[0]
-        for misplaced in (Misplaced(), Misplaced(0.8), Misplaced(0.8, 100.0))
+        for misplaced in (Misplaced(), _misplaced(20.0, 60.0), _misplaced(50.0, 400.0))
     )
-    assert 0 < off < less < in_place
-    assert found.of_change_db(50.0, 80.0, 30.0, Misplaced(0.0, 200.0))[0] == 0.0
+    assert lost < 0 < less < in_place
+
+
+def test_a_promise_of_next_to_nothing_still_has_a_deviation():
+    """Rows that may lie anywhere within half a pixel: the mean gain is small, what it may be is not."""
+    deviation_db = ConfirmedGain(1.0, 0.2, 0.02, 4).of_change_db(5.0, 5.0, 5.0, _misplaced(40.0, 50.0))[1]
+    in_place_db = ConfirmedGain(1.0, 0.2, 0.02, 4).of_change_db(5.0, 5.0, 5.0)[1]
+    assert deviation_db > in_place_db > 0
+
+
+def test_a_weaker_restoration_loses_less_by_its_place():
+    """What was hardly changed can hardly be worse."""
+    found = ConfirmedGain(1.0, 0.2, 0.02, 4)
+    weak, strong = (found.of_change_db(by, by, 30.0, _misplaced(50.0, 400.0, 80.0))[0] for by in (0.01, 60.0))
+    assert strong < weak
+    assert weak == pytest.approx(0.0, abs=0.01)
+
+
+def test_two_tellers_that_disagree_widen_the_promise():
+    """The same geometric mean of what was changed and what was lost, once alike and once a hundredfold apart."""
+    found = ConfirmedGain(1.0, 0.0, 0.02, 4)
+    alike, apart = (found.of_change_db(changed, 100.0 / changed, 30.0) for changed in (10.0, 100.0))
+    assert alike[0] == pytest.approx(apart[0])
+    assert apart[1] > 1.5 * alike[1]
+
+
+def _misplaced(blurred: float, restored: float, removed: float = 1.0) -> Misplaced:
+    """Either in its place or off by such errors, as likely."""
+    return Misplaced(np.array([0.0, blurred]), np.array([0.0, restored]), removed, np.array([0.5, 0.5]))
 
 
 def test_neighbours_that_lack_something_else_confirm_nothing():

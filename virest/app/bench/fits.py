@@ -157,13 +157,14 @@ def _promises(
             if restored.degradation is None or restored.degradation.deblur is None:
                 continue
             changed, lost, ideal, misplaced = watched.asked[-1]
+            gone = confirmation.removed(changed, lost)
             before_db, valid_px = straight_db[restored.frame.index]
             yield {
                 "capture": workload.name,
                 "preset": preset,
                 "frame": restored.frame.index,
-                "removed": misplaced.part * confirmation.removed(changed, lost),
-                "misplaced": misplaced.error,
+                "removed": gone,
+                "misplaced": np.stack((*misplaced.errors(gone), misplaced.weight)).tolist(),
                 "logarithms": confirmation.tellers(ideal, watched.left).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
@@ -186,8 +187,13 @@ def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straig
 
 
 def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
-    logarithms, gone, off = (np.array([row[k] for row in rows]) for k in ("logarithms", "removed", "misplaced"))
-    return np.asarray(10 * np.log10(1 + gone / (np.exp(logarithms @ coefficients) + off)))
+    left, gone = (
+        np.exp([row["logarithms"] for row in rows] @ coefficients),
+        np.array([row["removed"] for row in rows]),
+    )
+    blurred, restored, weight = np.array([row["misplaced"] for row in rows]).transpose(1, 0, 2)
+    gains_db = 10 * np.log10(((left + gone)[:, None] + blurred) / (left[:, None] + restored))
+    return np.asarray(np.sum(weight * gains_db, axis=1))
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:

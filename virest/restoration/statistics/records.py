@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ _STANDS_OUT = 2.0
 _DETAIL_SLOPE = 3.0
 """The power of a natural picture falls with frequency about like f⁻³."""
 ROUNDING_POWER = 1 / 12
+_LIKELY_SQUARES, _LIKELY_WEIGHTS = np.polynomial.laguerre.laggauss(12)
+"""Half the squares of distances, in standard deviations of each axis, and how likely each is, together 1."""
 _DEAD_ZONE = 5 / 6
 """Part of its step below which an H.264 coder leaves a coefficient out, and of a further step at which it rounds up."""
 _CODER_SHARE = (_DEAD_ZONE**3 + (1 - _DEAD_ZONE) ** 3) / 3
@@ -57,12 +59,26 @@ class PlaceStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Misplaced:
-    """What restoring gains in a picture whose rows are not quite where they belong."""
+    """What it costs that a picture's rows do not lie quite where they belong.
 
-    part: float = 1.0
-    """Of the squared error that it would remove in its place: sharp edges beside their place are no better."""
-    error: float = 0.0
-    """Mean square, in grey levels, that is left for it."""
+    Mean squares in grey levels, (n,), for n distances that are as likely as their weights say.
+    """
+
+    blurred: Array = field(default_factory=lambda: np.zeros(1))
+    """Of the picture as it was recorded."""
+    restored: Array = field(default_factory=lambda: np.zeros(1))
+    """Of what an ideal filter makes of it: sharp edges beside their place are farther off than blurred ones."""
+    removed: float = 0.0
+    """What that filter takes off the squared error of rows in their place."""
+    weight: Array = field(default_factory=lambda: np.ones(1))
+
+    def errors(self, removed: float) -> tuple[Array, Array]:
+        """(n,) each, before and after a restoration that removes so much of the squared error of rows in their place.
+
+        One that removes less than the ideal filter sharpens by less, and loses as much less by misplaced edges.
+        """
+        part = min(removed / self.removed, 1.0) if self.removed > 0 else 1.0
+        return self.blurred, self.blurred + part * (self.restored - self.blurred)
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,15 +221,17 @@ class PictureStatistics:
     def misplaced(self, std_px: float, further: Array) -> Misplaced:
         """What rows that lie wrong by ``std_px``, each axis, make of restoring; further: as of :meth:`joint_gain_db`.
 
-        Of power S at f, restored to a part R and moved by δ, |1 − R e^{2πi f δ}|² S is missing: 1 − 2 c R + R² in the
-        mean, with c = exp(−½ (2π f σ)²) for normal δ, and as much with √|K|² for R where nothing was restored.
+        Of power S at f, restored to a part R and moved by δ, |1 − R e^{2πi f δ}|² S is missing: (1 − R)² as in its
+        place and 2 R (1 − J₀(2π f |δ|)) for the move, in the mean over a ring; √|K|² for R where nothing was
+        restored.  The square of a normal δ is distributed exponentially (Gauss–Laguerre quadrature).
         """
-        passed, c = self.passed + further, np.exp(-0.5 * (2 * np.pi * self.frequency * std_px) ** 2)
-        restored, power = passed * self.signal / (passed * self.signal + self.noise), self._area() * self.signal
-        rise, fall = restored - np.sqrt(self.passed), restored**2 - self.passed
-        placed, moved = (float(power @ (2 * kept * rise - fall)) for kept in (np.ones_like(c), c))
-        part = float(np.clip(moved / placed, 0.0, 1.0)) if placed > 0 else 1.0
-        return Misplaced(part, float(power @ (2 * (1 - c) * restored)))
+        distance_px = std_px * np.sqrt(2 * _LIKELY_SQUARES)
+        off = 2 - 2 * _bessel_j0(2 * np.pi * np.outer(distance_px, self.frequency).ravel())
+        off = off.reshape(len(distance_px), -1)
+        passed, power = self.passed + further, self._area() * self.signal
+        restored, blurred = passed * self.signal / (passed * self.signal + self.noise), np.sqrt(self.passed)
+        removed = float(power @ ((1 - blurred) ** 2 - (1 - restored) ** 2))
+        return Misplaced(off @ (power * blurred), off @ (power * restored), removed, _LIKELY_WEIGHTS)
 
     def _area(self) -> Array:
         return np.asarray(2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]))
