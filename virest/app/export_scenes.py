@@ -263,7 +263,7 @@ def gyroflow_profile(profile: CameraProfile, fps: float) -> tuple[str, float]:
     device = profile.device or "phone"
     content = {
         "name": f"{device}_virest_{lens.width}x{lens.height}-{fps:.2f}fps",
-        "note": "fitted by virest calibrate",
+        "note": "written by virest export",
         "calibrated_by": "virest",
         "camera_brand": device.partition(" ")[0],
         "camera_model": device.partition(" ")[2] or device,

@@ -306,6 +306,8 @@ def _deblurred(
     restored = _mixed(sharp, recorded, part)
     changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
     details = _details(blur, settings, measured, joined, confirmed, changed)
+    if details.expected_gain_db is not None and details.expected_gain_db < 0:
+        return as_shown, None, (too_little_to_gain(measured.luma_model, details.expected_gain_db),)
     if unmasked is not None:  # where nothing was blurred the picture stays as it was shown
         restored = _mixed(restored.__getitem__, as_shown, touched)
     return restored, details, ()

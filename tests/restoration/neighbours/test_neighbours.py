@@ -13,6 +13,7 @@ from virest.evaluation.fidelity import psnr_db
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, restore_frames
+from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.sights import Sight, light_of, turn_between, with_neighbours
 from virest.restoration.settings import PRESETS
 from virest.simulation.phone_isp import PhoneIsp
@@ -110,6 +111,19 @@ def test_frames_restored_together_are_better_than_each_alone(simulated):
     assert joint.mean() > single.mean() + 0.5
     promised = [r.parameters["deblur"] for r in capture.restored(plan)]
     assert {bool(p["neighbours"]) == (p["neighbours_gain_db"] > 0) for p in promised} == {True}
+
+
+def test_a_frame_that_is_expected_to_lose_is_only_straightened(simulated, monkeypatch):
+    """Where the places of rows make sharp edges worse than blurred ones, the frame is left blurred, and says so."""
+    capture = simulated()
+    plan = replace(capture.plan(PRESETS["fast"]), confirmed=ConfirmedGain(1.0, 0.2, 0.02, 4))
+    straight = next(capture.restored(replace(plan, settings=replace(plan.settings, deblur="none"))))
+    monkeypatch.setattr(ConfirmedGain, "of_change_db", lambda *_: (-0.3, 0.2))
+    left = next(capture.restored(plan))
+    assert left.degradation is not None
+    assert left.degradation.deblur is None
+    assert any("expected to gain only 0.00 dB" in warning for warning in left.warnings)
+    np.testing.assert_array_equal(left.picture, straight.picture)
 
 
 def test_colour_is_restored_together_too(simulated):
