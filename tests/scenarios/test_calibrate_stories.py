@@ -33,7 +33,7 @@ def capture_with(folder: Path, **options: Any) -> Path:
         "imu_rotation={},{},{}".format(*ROTATION),
         "gyro_bias={},{},{}".format(*BIAS),
     ]
-    simulate_command(folder, frames=75, exposure_ms=7, rate_rad_s=1.2, direction=DIRECTION, crf=20, effects=hidden,
+    simulate_command(folder, frames=54, exposure_ms=7, rate_rad_s=1.2, direction=DIRECTION, crf=20, effects=hidden,
                      truth_frames=False, **SIZE, **options)  # fmt: skip
     return folder
 
@@ -259,7 +259,7 @@ def test_clocks_that_drift_apart_are_noticed_unasked(
     assert not [note for note in right["notes"] if "held fixed" in note]
     drifting = tmp_path / "drifting"
     hidden = ["time_offset=0.02", "clock_skew=0.003"]
-    simulate_command(drifting, frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=63,
+    simulate_command(drifting, frames=48, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=63,
                      truth_frames=False, **SIZE)  # fmt: skip
     facts = calibrate(virest, drifting, tmp_path / "out")
     for name, truth in (("time_offset_s", 0.02), ("clock_skew", 0.003)):
@@ -272,7 +272,7 @@ def test_clocks_that_drift_apart_are_noticed_unasked(
 def test_a_lens_that_was_held_fixed_and_is_wrong_is_named(virest: Any, tmp_path: Path) -> None:
     """Neither is fitted unasked: the points tell both, and how far off they are."""
     hidden, seed = ["focal_length=0.96", "radial_distortion=0.05"], 64
-    simulate_command(tmp_path / "lens", frames=60, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=seed,
+    simulate_command(tmp_path / "lens", frames=48, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=seed,
                      truth_frames=False, **SIZE)  # fmt: skip
     (note,) = [n for n in calibrate(virest, tmp_path / "lens", tmp_path / "out")["notes"] if "held fixed" in n]
     assert "--with focal,distortion," in note

@@ -10,7 +10,7 @@ from story import Result, process, psnrs_db, simulate
 
 pytestmark = pytest.mark.scenario
 
-OPTIONS = "--width 480 --height 360 --frames 14 --rate 1.5 --exposure-ms 14 --seed"
+OPTIONS = "--width 480 --height 360 --frames 10 --rate 1.5 --exposure-ms 14 --seed"
 
 
 def said(result: Result, text: str) -> list[str]:

@@ -24,7 +24,7 @@ def _capture(work: Path, name: str, effects: list[str], seed: int, **options: An
     upright = seed % 2
     size = {"width": 360, "height": 480} if upright else {"width": 480, "height": 360}
     simulate_command(
-        work / name, frames=45, seed=seed, effects=effects, rate_rad_s=1.1, overwrite=True, truth_frames=False,
+        work / name, frames=33, seed=seed, effects=effects, rate_rad_s=1.1, overwrite=True, truth_frames=False,
         **{"exposure_ms": 8, **size, **options},
     )  # fmt: skip
     return work / name
