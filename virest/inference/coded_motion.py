@@ -21,9 +21,11 @@ from virest.image_formation.point_model import IntegratedMotion, Prediction, Tra
 from virest.motion.scene_motion import Motion
 
 Array = NDArray[np.float64]
-DRAWN_PER_PX = (0.5, 2.5)
+DRAWN_PER_PX = (1.0, 2.5)
 """Usual error of a step that the blocks to the left and above make, over the square of a step's noise, both in px:
 ``python -m virest.app.bench --only coding`` prints it."""
+MOST_PX = 0.06
+"""No longer errors were seen, at 0.16 px of noise; more noise than that is not the coder's alone."""
 FURTHEST_PX = 16.0
 """Side of a block."""
 ALIKE = 1e-4
@@ -44,5 +46,6 @@ def step_slopes(known: IntegratedMotion, table: TrackTable, scene: Motion | None
 def drawn_px(slopes: Array, noise_px: Array) -> Array:
     """Errors (2, n, 2) of steps that slopes (2, n, 2) and the noise of a step (n,) make: of one deviation each."""
     usual = np.sqrt(np.mean((slopes**2).sum(axis=-1), axis=-1))[:, None]
-    length_px = np.array(DRAWN_PER_PX)[:, None] * noise_px**2 / np.maximum(usual, ALIKE)
-    return -np.minimum(length_px, FURTHEST_PX)[..., None] * slopes
+    error_px = np.minimum(np.array(DRAWN_PER_PX)[:, None] * noise_px**2, MOST_PX)
+    away_px = np.minimum(error_px / np.maximum(usual, ALIKE), FURTHEST_PX)
+    return np.asarray(-away_px[..., None] * slopes)
