@@ -14,6 +14,7 @@ from virest.errors import ImuError
 from virest.image_formation.point_model import ground, predict
 from virest.inference import profile_terms as terms_of
 from virest.inference.clustered import CovarianceModel
+from virest.inference.coded_motion import drawn_px, step_slopes
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import InertialMotion
@@ -233,7 +234,8 @@ def test_no_number_of_points_tells_more_than_their_shared_errors_leave() -> None
     assert all_std < 0.6 * few_std
     assert all_bias == pytest.approx(few_bias, rel=0.15)
     weight, curvature = fits[1].weight.sum(), float(fits[1].curvature[0, 0])
-    assert all_bias == pytest.approx(0.025 * np.sqrt(2 * weight * curvature), rel=1e-6)
+    shared = 0.025 * np.sqrt(2 * weight * curvature)
+    assert all_bias == pytest.approx(np.hypot(shared, fits[1].by_coding[0]), rel=1e-6)
 
 
 def test_relief_that_stands_in_its_place_is_one_error_and_not_many() -> None:
@@ -296,3 +298,39 @@ def test_what_cancels_in_a_combination_is_not_doubted() -> None:
     np.testing.assert_allclose(doubt.by_relief(np.array([[1.0, 0.0]])), 0.25)
     lopsided = replace(doubt, by_place=np.diag([3.0, -1.0]))
     np.testing.assert_allclose(np.diag(lopsided.of(np.eye(2))), [4.0, 1.0])
+
+
+# ── points that coding draws to the blocks above ─────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("read", ["top_to_bottom", "bottom_to_top"])
+@pytest.mark.parametrize(
+    "term", [terms_of.TIME_OFFSET, terms_of.PLAIN_READOUT, terms_of.CLOCK_SKEW], ids=lambda term: term.name
+)
+def test_steps_of_the_rows_above_are_within_the_deviation(term: Term, read: str) -> None:
+    """Points that step as the picture does above them seem late, or early where rows are read upwards.
+
+    Whichever of offset, readout and skew is fitted, its deviation holds that.
+    """
+    recording = recorded(replace(LANDSCAPE, readout_direction=read, gyro_noise_rad_s=0.0, noise_px=0.15, frames=60))
+    table, profile = recording.table(), recording.profile
+    known = ground(recording.imu, profile, translation=False)
+    slopes = step_slopes(known, table, None, predict(known, table, None))
+    drawn = drawn_px(slopes, table.noise_px[table.pair])[1]
+    fits = [
+        fit_tracks(recording.imu, replace(table, second_px=table.second_px + shift), profile, (term,))
+        for shift in (0.0, drawn)
+    ]
+    moved = float(fits[1].change[0] - fits[0].change[0])
+    bias, coded = bias_std(fits[1], term.name, 0.15)[0], fits[1].by_coding[0]
+    assert abs(moved) > 2 * np.sqrt(bias**2 - coded**2)
+    assert abs(moved) < 1.1 * bias
+    if term is terms_of.TIME_OFFSET:
+        assert (moved < 0) == (read == "top_to_bottom")
+
+
+def test_steps_that_go_alike_everywhere_are_not_drawn() -> None:
+    """Without a slope nothing is off; where it is small, by no more than a block's side."""
+    assert not drawn_px(np.zeros((2, 5, 2)), np.full(5, 0.2)).any()
+    slight = drawn_px(np.full((2, 5, 2), 1e-3), np.full(5, 0.5))
+    assert np.abs(slight).max() <= 16e-3

@@ -128,7 +128,8 @@ class TrackEvidence:
             limit += list(scene.limits())
             prior += list(scene.prior_std() ** -2.0)
             off += list(scene.vector() - self.start.vector())
-        rows, left = _whitened(look.slope, difference, look.prediction, table, state.depth_spread)
+        rows = self.whitened(state, look.prediction, look.slope)
+        left = self.whitened(state, look.prediction, difference[..., None])[..., 0]
         squared = (left**2).sum(axis=-1)
         typical = NORMAL_MEDIAN if state.depth_spread == ANY_DEPTH else RAYLEIGH_MEDIAN
         scale = max(float(np.median(np.sqrt(squared))) / typical, SMALLEST_SCALE)
@@ -140,6 +141,17 @@ class TrackEvidence:
             )  # fmt: skip
         found = replace(state, scene=scene)
         return System(found, look, rows, left, squared, scale, np.array(prior), np.array(off), np.array(limit))
+
+    def whitened(self, state: State, at: Prediction, columns: Array) -> Array:
+        """Columns (n, 2, k), px, over the standard deviations of points that are predicted there."""
+        noise = self.table.noise_px[self.table.pair]
+        columns = columns / noise[:, None, None]
+        if at.along_px is None:
+            return columns
+        length, way = lengths_and_ways(at.along_px)
+        shrink = 1 - 1 / np.sqrt(1 + (state.depth_spread * length / noise) ** 2)
+        along = np.einsum("ni,nik->nk", way, columns)
+        return np.asarray(columns - way[:, :, None] * (shrink[:, None] * along)[:, None, :])
 
     def moved(self, state: State, step: Array) -> State:
         """The state after a step: of the terms' values, then of the scene's."""
@@ -175,21 +187,6 @@ def lengths_and_ways(vectors: Array) -> tuple[Array, Array]:
     """Lengths (n,) of vectors (n, 2), and the unit vectors (n, 2) along them."""
     length = np.linalg.norm(vectors, axis=-1)
     return length, vectors / np.maximum(length, 1e-12)[:, None]
-
-
-def _whitened(
-    slope: Array, difference: Array, at: Prediction, table: TrackTable, depth_spread: float
-) -> tuple[Array, Array]:
-    """Rows and differences over their standard deviations."""
-    noise = table.noise_px[table.pair][:, None]
-    rows, left = slope / noise[..., None], difference / noise
-    if at.along_px is None:
-        return rows, left
-    length, way = lengths_and_ways(at.along_px)
-    shrink = 1 - 1 / np.sqrt(1 + (depth_spread * length / noise[:, 0]) ** 2)
-    left = left - (shrink * (left * way).sum(axis=-1))[:, None] * way
-    rows = rows - way[:, :, None] * (shrink[:, None] * np.einsum("ni,nik->nk", way, rows))[:, None, :]
-    return rows, left
 
 
 def _directed(table: TrackTable, at: Prediction, motion: DirectedMotion) -> tuple[Prediction, DirectedMotion]:

@@ -19,6 +19,7 @@ from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, ground, with_profile
 from virest.inference.clustered import CovarianceModel, Index, scatter
+from virest.inference.coded_motion import drawn_px, step_slopes
 from virest.inference.descent import MAX_ITERATIONS, descend, slices
 from virest.inference.robust import CAUCHY
 from virest.inference.term import Term
@@ -89,6 +90,9 @@ class TrackFit:
     """(n,) of each point's step, per coordinate."""
     along_px: Array | None
     """(n, 2) change of the second points per unit of inverse depth; None where no relief is allowed for."""
+    by_coding: Array
+    """(k + scene,) deviations of the values where coding draws points to their neighbours' motion; 0 where covariances
+    were not asked for."""
     slices: dict[str, slice] = field(default_factory=dict)
 
     def distance_at(self, depth_spread_per_m: float) -> Array:
@@ -189,11 +193,17 @@ def fit_tracks(
         if not inertial or abs(spread - state.depth_spread) <= SPREAD_TOLERANCE * spread:
             break
         state = replace(system.state, depth_spread=spread)
-    return _conclude(table, terms, system, spread, blocks)
+    by_coding = _by_coding(evidence, system) if covariances else np.zeros(len(system.prior))
+    return _conclude(table, terms, system, spread, blocks, by_coding)
 
 
 def _conclude(
-    table: TrackTable, terms: tuple[Term, ...], system: TrackSystem, depth_spread: float, blocks: int
+    table: TrackTable,
+    terms: tuple[Term, ...],
+    system: TrackSystem,
+    depth_spread: float,
+    blocks: int,
+    by_coding: Array,
 ) -> TrackFit:
     inverse, state, prediction = system.inverse(), system.state, system.look.prediction
     relief = _relief(table, system, inverse, depth_spread)
@@ -207,7 +217,7 @@ def _conclude(
         float(system.scale), depth_spread,
         difference, system.weight, np.sqrt(system.squared), stretches,
         system.cost(1.0), state.known, prediction.second_s, noise_px,
-        None if directed else prediction.along_px, dict(parts),
+        None if directed else prediction.along_px, by_coding, dict(parts),
     )  # fmt: skip
 
 
@@ -230,6 +240,16 @@ def _doubt(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) 
     return CovarianceModel(
         inverse, scatter(moved, block, about_mean=True), by_place, inverse @ (system.prior[:, None] * inverse)
     )
+
+
+def _by_coding(evidence: TrackEvidence, system: TrackSystem) -> Array:
+    """What steps that are drawn to the left and upwards do to the values (k,), together."""
+    table, state, at = evidence.table, system.state, system.look.prediction
+    if not system.prior.size:
+        return np.zeros(0)
+    drawn = drawn_px(step_slopes(state.known, table, state.scene, at), table.noise_px[table.pair])
+    pulled = system.pull(evidence.whitened(state, at, np.moveaxis(drawn, 0, -1)))
+    return np.asarray(np.linalg.norm(system.inverse() @ pulled, axis=-1))
 
 
 def _relief(table: TrackTable, system: TrackSystem, inverse: Array, depth_spread: float) -> Array | None:

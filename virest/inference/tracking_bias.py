@@ -66,12 +66,12 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
     """
     own = fit.slices.get(name)
     told = np.zeros(1) if own is None else np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[own])
+    by_coding = np.zeros(1) if own is None else fit.by_coding[own]
     if name == "readout_time":
-        return np.asarray(SHARED_READOUT * told)
+        return np.asarray(np.hypot(SHARED_READOUT * told, by_coding))
     scaled = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX * np.array(BIAS_STD[name])
     floor = np.maximum(np.maximum(scaled, SHARED * told), WANDER_STD.get(name, 0.0))
-    if name == "time_offset":
-        floor = np.hypot(floor, DECODED_LAG_S)
+    floor = np.hypot(floor, by_coding)
     if name == "gyro_bias" and own is not None:
         floor = np.hypot(floor, SHARED_RELIEF * fit.by_relief[own])
     return np.asarray(floor)
@@ -94,8 +94,6 @@ mostly the codec's, whose predicted blocks shear less than rows do.  Those of 52
 ``python -m virest.app.bench --only calibration`` draws them; that command prints what its captures ask for."""
 STILL_SHARED_OTHER = 0.012
 """The same for all other values: the typical one."""
-DECODED_LAG_S = 1.5e-5
-"""By how much decoded frames lag behind what was seen, rms, where points tell the offset to a few microseconds."""
 GYRO_WANDER_RAD_S = 5e-5
 """Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
 
@@ -106,9 +104,7 @@ def remaining_std(fit: TrackFit, name: str, moved: Array, gyro_mean_std_rad_s: f
     moved (k,): by how much that moved the values.  gyro_mean_std_rad_s: of the gyroscope's noise, over the capture.
     """
     own = fit.slices[name]
-    std = np.hypot(shared_std(fit, name), UNSURE * moved)
-    if name == "time_offset":
-        return np.hypot(std, DECODED_LAG_S)
+    std = np.hypot(np.hypot(shared_std(fit, name), UNSURE * moved), fit.by_coding[own])
     if name == "gyro_bias":
         wander = np.hypot(GYRO_WANDER_RAD_S, gyro_mean_std_rad_s)
         return np.asarray(np.hypot(np.hypot(std, wander), SHARED_RELIEF * fit.by_relief[own]))

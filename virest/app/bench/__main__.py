@@ -25,6 +25,7 @@ from typing import Any
 from virest import __version__
 from virest.app.bench.broken import broken_section
 from virest.app.bench.calibration import calibration_section
+from virest.app.bench.coding import coding_section
 from virest.app.bench.commands import commands_section
 from virest.app.bench.compare import NOISE, compare_text, read_report
 from virest.app.bench.cost import cost_section
@@ -62,6 +63,7 @@ SECTIONS: dict[str, Section] = {
     "diagnosis": diagnosis_section,
     "field": fields_section,
     "calibration": calibration_section,
+    "coding": coding_section,
     "soak": soak_section,
     "broken": broken_section,
     "real": real_section,
