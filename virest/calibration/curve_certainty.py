@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.calibration.curve_families import Family
-from virest.camera.response import ResponseCurve
 
 Array = NDArray[np.float64]
 SHARED_LEVELS = 0.25
@@ -54,8 +53,8 @@ class CurvePosterior:
 def curve_posterior(
     family: Family,
     parameters: Array,
-    correction_ev: Array,
-    residual: Callable[[ResponseCurve, Array], Array],
+    left: Array,
+    slopes: Array,
     sigma: Array,
     grey: Array,
     used: NDArray[np.bool_],
@@ -63,21 +62,17 @@ def curve_posterior(
 ) -> CurvePosterior:
     """The posterior at a fit.
 
-    residual(curve, correction_ev): (samples, pictures) grey levels; sigma, grey, used of the same shape: each grey's
-    deviation by noise, its level, and whether it is neither censored nor an outlier; belief_ev: (pictures,).
+    left (samples, pictures): the fit's residuals, grey levels; slopes (pictures, samples, k): their change per
+    parameter and per correction.  sigma, grey, used (samples, pictures): each grey's deviation by noise, its level, and
+    whether it is neither censored nor an outlier; belief_ev: (pictures,).
     """
     shape = len(parameters)
-    start = np.concatenate([parameters, correction_ev])
-    shared, sharing = _shared_variance(grey, residual(family.build(parameters), correction_ev), used)
+    shared, sharing = _shared_variance(grey, left, used)
     weight = np.where(used, 1.0 / np.sqrt(sigma**2 + sharing * shared), 0.0)
-
-    def rows(q: Array) -> Array:
-        return (residual(family.build(q[:shape]), q[shape:]) * weight)[used]
-
-    data = _derivatives(rows, start, family.upper)
+    data = (slopes * weight.T[..., None]).reshape(-1, slopes.shape[-1])
     precision = data.T @ data + np.diag(np.concatenate([np.full(shape, PRIOR_SPREAD**-2.0), belief_ev**-2.0]))
     if family.smoothness:
-        rough = _derivatives(family.smoothness, parameters, family.upper) / EXPONENT_CHANGE
+        rough = derivatives(family.smoothness, parameters, family.upper) / EXPONENT_CHANGE
         precision[:shape, :shape] += rough.T @ rough
     covariance = np.linalg.inv(precision)
     change = _curve_derivatives(family, parameters, grey[used])
@@ -101,14 +96,18 @@ def _shared_variance(grey: Array, left: Array, used: NDArray[np.bool_]) -> tuple
     return max(float(excess.mean()) if many.any() else 0.0, SHARED_LEVELS**2), count[cell].astype(np.float64)
 
 
-def _derivatives(rows: Callable[[Array], Array], at: Array, upper: Array) -> Array:
+def derivatives(rows: Callable[[Array], Array], at: Array, upper: Array) -> Array:
     """(rows, parameters), by differences taken inside the upper bounds."""
     base = rows(at)
     columns = np.empty((len(base), len(at)))
-    for i in range(len(at)):
-        h = -STEP if i < len(upper) and at[i] + STEP > upper[i] else STEP
+    for i, h in enumerate(inner_steps(at, upper)):
         columns[:, i] = (rows(at + h * np.eye(1, len(at), i)[0]) - base) / h
     return columns
+
+
+def inner_steps(at: Array, upper: Array) -> Array:
+    """Steps (k,) of difference quotients that stay below upper bounds (k,)."""
+    return np.where(at + STEP > upper, -STEP, STEP)
 
 
 def _curve_derivatives(family: Family, parameters: Array, grey: Array) -> Array:
@@ -120,6 +119,6 @@ def _curve_derivatives(family: Family, parameters: Array, grey: Array) -> Array:
     def levels(q: Array) -> Array:
         return 255.0 * family.build(q).encode(light)
 
-    change = _derivatives(levels, parameters, family.upper)
+    change = derivatives(levels, parameters, family.upper)
     slope = (255.0 * curve.encode(light * (1 + STEP)) - levels(parameters)) / STEP
     return change - np.outer(slope, slope @ change) / max(float(slope @ slope), 1e-12)

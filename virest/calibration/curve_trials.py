@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from virest.calibration.bracket_samples import BracketSamples
-from virest.calibration.curve_certainty import CurvePosterior, curve_posterior
+from virest.calibration.curve_certainty import CurvePosterior, curve_posterior, derivatives, inner_steps
 from virest.calibration.curve_families import Family, LogLookup, log_lookup, make_family
 from virest.calibration.exposure_check import CONTRADICTS_EV, LN2, FirstCurve, outlying
 from virest.calibration.grey_levels import FAIR_SIGMA
@@ -24,7 +24,6 @@ FREE_EV = 4.0
 OUTLIER_LEVELS = 20.0
 WIDEST_EV = 20.0
 """Corrections of listed exposures are sought up to this; cameras' shutters span less."""
-STEP = 1e-4
 SMOOTH_WEIGHT = 5.0
 """Of a table's roughness in the fit, against samples that count as if their errors were independent."""
 SCORE_CAP = 16.0
@@ -52,8 +51,17 @@ def project(lookup: LogLookup, samples: BracketSamples, log_t: Array, rounds: in
 
 def residual_of(lookup: LogLookup, samples: BracketSamples, correction_ev: Array) -> Array:
     """Grey levels by which measurement and model differ, (samples, pictures); censored ones where they contradict."""
+    return _left(lookup.level(_seen_light(lookup, samples, correction_ev)), samples)
+
+
+def _seen_light(lookup: LogLookup, samples: BracketSamples, correction_ev: Array) -> Array:
+    """Log light (samples, pictures) that reaches the curve."""
     log_t = np.log(samples.exposure) + LN2 * correction_ev
-    level = lookup.level((project(lookup, samples, log_t) + log_t[:, None]).T)
+    return np.asarray((project(lookup, samples, log_t) + log_t[:, None]).T)
+
+
+def _left(level: Array, samples: BracketSamples) -> Array:
+    """What a curve's levels (samples, pictures) leave of the measured ones."""
     left = samples.grey - level
     lowest, highest = samples.limits
     slack = 0.0 if samples.fair is None else FAIR_SIGMA * samples.sigma
@@ -61,6 +69,29 @@ def residual_of(lookup: LogLookup, samples: BracketSamples, correction_ev: Array
     both = np.where(samples.grey <= lowest, np.minimum(lowest + slack - level, 0.0), high)
     inside = (samples.grey > lowest) & (samples.grey < highest)
     return np.where(inside & ~samples.measured, 0.0, both)
+
+
+def slopes_of(family: Family, parameters: Array, correction_ev: Array, samples: BracketSamples) -> Array:
+    """Change (pictures, samples, k) of :func:`residual_of` per parameter of the curve, then per correction.
+
+    Each place's light follows: it stays the weighted mean of what its greys ask for (Kaufman 1975,
+    doi:10.1007/BF01932995, for variable projection), so that only the curve is looked up anew for each parameter.
+    """
+    here, shape = log_lookup(family.build(parameters)), len(parameters)
+    at = _seen_light(here, samples, correction_ev)
+    level, slope = here.level(at), here.rise(at)
+    pull = np.where(samples.measured, slope / samples.sigma**2, 0.0)
+    share = pull / np.maximum((pull * slope).sum(axis=1), 1e-9)[:, None]
+    moves = samples.measured | (_left(level, samples) != 0)
+    slopes = np.empty((samples.grey.shape[1], len(samples.grey), shape + samples.grey.shape[1]))
+    for i, h in enumerate(inner_steps(parameters, family.upper)):
+        raised = (log_lookup(family.build(parameters + h * np.eye(1, shape, i)[0])).level(at) - level) / h
+        slopes[..., i] = ((slope * (share * raised).sum(axis=1)[:, None] - raised) * moves).T
+    for n in range(samples.grey.shape[1]):
+        raised = LN2 * slope[:, n]
+        slopes[..., shape + n] = (slope * (share[:, n] * raised)[:, None] * moves).T
+        slopes[n, :, shape + n] -= raised * moves[:, n]
+    return slopes
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,22 +142,21 @@ def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDA
     rows = _trend_rows(samples.exposure, suspect)[: 1 + family.bends]
     no_trend = np.eye(len(suspect)) - rows.T @ rows
 
-    def miss(q: Array, lookup: LogLookup | None = None) -> Array:
-        lookup = lookup or log_lookup(family.build(q[:shape]))
-        correction = no_trend @ q[shape:]
-        parts = [(residual_of(lookup, samples, correction) / samples.sigma).ravel() / 2.0, q[shape:] / belief]
+    def miss(q: Array) -> Array:
+        left = residual_of(log_lookup(family.build(q[:shape])), samples, no_trend @ q[shape:])
+        parts = [(left / samples.sigma).T.ravel() / 2.0, q[shape:] / belief]
         if family.smoothness:
             parts.append(SMOOTH_WEIGHT * family.smoothness(q[:shape]))
         return np.concatenate(parts)
 
     def jacobian(q: Array) -> Array:
-        here = log_lookup(family.build(q[:shape]))
-        base = miss(q, here)
-        columns = np.empty((len(base), len(q)))
-        for i in range(len(q)):
-            h = -STEP if i < shape and q[i] + STEP > family.upper[i] else STEP
-            columns[:, i] = (miss(q + h * np.eye(1, len(q), i)[0], None if i < shape else here) - base) / h
-        return columns
+        slopes = slopes_of(family, q[:shape], no_trend @ q[shape:], samples) / (2.0 * samples.sigma.T[..., None])
+        slopes[..., shape:] = slopes[..., shape:] @ no_trend
+        parts = [slopes.reshape(-1, len(q)), np.eye(len(q))[shape:] / belief[:, None]]
+        if family.smoothness:
+            rough = derivatives(family.smoothness, q[:shape], family.upper)
+            parts.append(SMOOTH_WEIGHT * np.pad(rough, ((0, 0), (0, len(suspect)))))
+        return np.concatenate(parts)
 
     wide = np.full(len(suspect), WIDEST_EV)
     bounds = (np.concatenate([family.lower, -wide]), np.concatenate([family.upper, wide]))
@@ -233,12 +263,8 @@ def refined(trial: Trial, samples: BracketSamples, may_be_wrong: NDArray[np.bool
 
 def posterior_of(trial: Trial, samples: BracketSamples, scatter_ev: float) -> CurvePosterior:
     """What the samples leave open of a fit; exposures are believed no better than they agree."""
-
-    def residual(curve: ResponseCurve, correction_ev: Array) -> Array:
-        return residual_of(log_lookup(curve), samples, correction_ev)
-
-    left = residual(trial.curve, trial.correction_ev)
+    left = residual_of(log_lookup(trial.curve), samples, trial.correction_ev)
     used = samples.measured & (np.abs(left) < 6.0 * np.maximum(samples.sigma, rms_levels(left[samples.measured])))
     belief = np.where(trial.suspect, FREE_EV, max(TRUSTED_EV, scatter_ev))
-    return curve_posterior(trial.family, trial.parameters, trial.correction_ev, residual, samples.sigma, samples.grey,
-                           used, belief)  # fmt: skip
+    slopes = slopes_of(trial.family, trial.parameters, trial.correction_ev, samples)
+    return curve_posterior(trial.family, trial.parameters, left, slopes, samples.sigma, samples.grey, used, belief)
