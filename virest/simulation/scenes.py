@@ -395,16 +395,17 @@ def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArr
     height, width = labels.shape
     texture = _one_over_f(rng, _TEXTURE_SIDE)
     strength = (rng.gamma(2.0, 0.07, len(colour))).astype(np.float32)
-    shift = rng.integers(0, _TEXTURE_SIDE, (2, len(colour)), dtype=np.int32)
+    down, right = rng.integers(0, _TEXTURE_SIDE, (2, len(colour)), dtype=np.int32)
     shade = np.exp(0.25 * _smooth_field(rng, width, height))
     light = np.empty((height, width, 3), np.float32)
     columns = np.arange(width, dtype=np.int32)
     for top in range(0, height, 256):
         leaf = labels[top : top + 256]
         rows = np.arange(top, top + leaf.shape[0], dtype=np.int32)[:, None]
-        cut = texture[(rows + shift[0][leaf]) % _TEXTURE_SIDE, (columns + shift[1][leaf]) % _TEXTURE_SIDE]
-        factor = np.exp(strength[leaf] * cut) * shade[top : top + 256]
-        light[top : top + 256] = colour[leaf] * factor[..., None]
+        place = (rows + down[leaf]) % _TEXTURE_SIDE * _TEXTURE_SIDE + (columns + right[leaf]) % _TEXTURE_SIDE
+        cut = texture.take(place)
+        factor = np.exp(strength.take(leaf) * cut) * shade[top : top + 256]
+        light[top : top + 256] = colour.take(leaf, axis=0) * factor[..., None]
     return light
 
 
