@@ -77,9 +77,12 @@ def test_rows_that_lie_wrong_promise_less():
 
 def test_a_promise_of_next_to_nothing_still_has_a_deviation():
     """Rows that may lie anywhere within half a pixel: the mean gain is small, what it may be is not."""
-    deviation_db = ConfirmedGain(1.0, 0.2, 0.02, 4).of_change_db(5.0, 5.0, 5.0, _misplaced(40.0, 50.0))[1]
-    in_place_db = ConfirmedGain(1.0, 0.2, 0.02, 4).of_change_db(5.0, 5.0, 5.0)[1]
-    assert deviation_db > in_place_db > 0
+    found = ConfirmedGain(1.0, 0.2, 0.02, 4)
+    off, in_place = (
+        found.of_change_db(5.0, 5.0, 5.0, misplaced) for misplaced in (_misplaced(40.0, 50.0), Misplaced())
+    )
+    assert 0 < off[0] < in_place[0]
+    assert off[1] > in_place[1] > 0
 
 
 def test_a_weaker_restoration_loses_less_by_its_place():

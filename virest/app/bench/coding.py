@@ -19,6 +19,7 @@ import numpy as np
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, simulated
 from virest.app.diagnose import open_source
+from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.capture.video import GrayReader, probe_movie
 from virest.image_formation.point_model import TrackTable, ground, predict
 from virest.inference.coded_motion import DRAWN_PER_PX, drawn_px, step_slopes
@@ -28,7 +29,6 @@ from virest.inference.profile_terms import TIME_OFFSET
 from virest.inference.track_fit import fit_tracks
 
 Row = dict[str, Any]
-READ = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
 BITS_PER_PX = (0.5, 0.2, 0.1)
 SCENES = ("leaves", "text", "board", "photographs")
 FIRST_SEED, FRAMES, MOST_POINTS = 9101, 84, 7000
@@ -37,7 +37,7 @@ FIRST_SEED, FRAMES, MOST_POINTS = 9101, 84, 7000
 def coding_section(work: Path, scale: Scale) -> tuple[Row, str]:
     """Measure captures of all scenes, read and coded in all ways; quick: of one."""
     scenes = list(enumerate(SCENES))[:: len(SCENES) if scale.quick else 1]
-    rows = [_row(work, *one) for one in product(scenes, READ, BITS_PER_PX)]
+    rows = [_row(work, *one) for one in product(scenes, READOUT_DIRECTIONS, BITS_PER_PX)]
     return {"captures": rows}, _text(rows)
 
 
@@ -60,23 +60,22 @@ def _row(work: Path, scene: tuple[int, str], read: str, bits_per_px: float) -> R
 
     known = ground(capture.imu, profile, translation=False)
     slopes = step_slopes(known, seen, None, predict(known, seen, None))
-    way = READ.index(read) < len(READ) // 2
-    drawn = drawn_px(slopes, seen.noise_px[seen.pair])[int(way)] / DRAWN_PER_PX[int(way)]
+    in_use, axis = DRAWN_PER_PX, 0 if profile.shutter.reads_columns else 1
+    drawn = drawn_px(slopes, seen.noise_px[seen.pair])[axis] / in_use[axis]
     lag_s = offset_s(seen)
     unit_s = offset_s(replace(seen, second_px=seen.second_px + drawn)) - lag_s
     return {"scene": name, "read": read, "bits_per_px": bits_per_px, "noise_px": float(np.median(seen.noise_px)),
-            "offset_s": lag_s, "drawn_per_px": lag_s / unit_s}  # fmt: skip
+            "offset_s": lag_s, "drawn_per_px": lag_s / unit_s, "in_use": in_use[axis]}  # fmt: skip
 
 
 def _text(rows: list[Row]) -> str:
     lines = []
-    for read, bits in product(READ, BITS_PER_PX):
+    for read, bits in product(READOUT_DIRECTIONS, BITS_PER_PX):
         some = [row for row in rows if row["read"] == read and row["bits_per_px"] == bits]
         offset_us, asked = (np.array([row[key] for row in some]) for key in ("offset_s", "drawn_per_px"))
-        in_use = DRAWN_PER_PX[int(READ.index(read) < len(READ) // 2)]
         lines.append(
             [read, f"{bits:g}", f"{np.mean([row['noise_px'] for row in some]):.3f}", f"{1e6 * np.mean(offset_us):+.0f}",
-             f"{np.mean(asked):+.1f}", f"{np.sqrt(np.mean(asked**2)):.1f}", f"{in_use:g}"]
+             f"{np.mean(asked):+.1f}", f"{np.sqrt(np.mean(asked**2)):.1f}", f"{some[0]['in_use']:g}"]
         )  # fmt: skip
     header = ["read", "bits/px", "noise px", "offset off by µs", "asked 1/px", "rms", "in use"]
     return "CODING: points drawn to the motion of the blocks above and to the left\n" + table(header, lines)

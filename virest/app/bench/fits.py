@@ -187,13 +187,11 @@ def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straig
 
 
 def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
-    left, gone = (
-        np.exp([row["logarithms"] for row in rows] @ coefficients),
-        np.array([row["removed"] for row in rows]),
-    )
+    left = np.exp([row["logarithms"] for row in rows] @ coefficients)
+    gone = np.array([row["removed"] for row in rows])
     blurred, restored, weight = np.array([row["misplaced"] for row in rows]).transpose(1, 0, 2)
-    gains_db = 10 * np.log10(((left + gone)[:, None] + blurred) / (left[:, None] + restored))
-    return np.asarray(np.sum(weight * gains_db, axis=1))
+    before, after = confirmation.errors(left[:, None], gone[:, None], blurred, restored)
+    return np.asarray(np.sum(weight * 10 * np.log10(before / after), axis=1))
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:

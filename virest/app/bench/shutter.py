@@ -9,9 +9,9 @@ import numpy as np
 
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, recorded_frames, run_process, simulated, truth_frame
+from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.evaluation.fidelity import point_distances_px
 
-DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
 SIZES = {"640x480": (640, 480), "720x1280": (720, 1280)}
 
 
@@ -19,7 +19,7 @@ def shutter_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     """Median and 90th percentile of the distance between a truth's corners and the same points of the picture, px."""
     sizes = dict(list(SIZES.items())[:1]) if scale.quick else SIZES
     frames = 3 if scale.quick else 8
-    results = [_measure(work, size, direction, frames) for size in sizes for direction in DIRECTIONS]
+    results = [_measure(work, size, direction, frames) for size in sizes for direction in READOUT_DIRECTIONS]
     header = ["size", "readout", "points", "recorded median", "straightened median", "straightened 90 %"]
     rows = [
         [r["size"], r["direction"], str(r["points"])]

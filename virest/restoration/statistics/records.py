@@ -73,9 +73,9 @@ class Misplaced:
     weight: Array = field(default_factory=lambda: np.ones(1))
 
     def errors(self, removed: float) -> tuple[Array, Array]:
-        """(n,) each, before and after a restoration that removes so much of the squared error of rows in their place.
+        """Errors (n,) by misplaced rows before and after a restoration, by the squared error that it removes elsewhere.
 
-        One that removes less than the ideal filter sharpens by less, and loses as much less by misplaced edges.
+        A restoration that removes less than the ideal filter sharpens less, and loses less by edges beside their place.
         """
         part = min(removed / self.removed, 1.0) if self.removed > 0 else 1.0
         return self.blurred, self.blurred + part * (self.restored - self.blurred)
@@ -225,9 +225,7 @@ class PictureStatistics:
         place and 2 R (1 − J₀(2π f |δ|)) for the move, in the mean over a ring; √|K|² for R where nothing was
         restored.  The square of a normal δ is distributed exponentially (Gauss–Laguerre quadrature).
         """
-        distance_px = std_px * np.sqrt(2 * _LIKELY_SQUARES)
-        off = 2 - 2 * _bessel_j0(2 * np.pi * np.outer(distance_px, self.frequency).ravel())
-        off = off.reshape(len(distance_px), -1)
+        off = 2 - 2 * _bessel_j0(2 * np.pi * np.outer(std_px * np.sqrt(2 * _LIKELY_SQUARES), self.frequency))
         passed, power = self.passed + further, self._area() * self.signal
         restored, blurred = passed * self.signal / (passed * self.signal + self.noise), np.sqrt(self.passed)
         removed = float(power @ ((1 - blurred) ** 2 - (1 - restored) ** 2))
@@ -273,4 +271,4 @@ def unknown_picture() -> PictureStatistics:
 
 def _bessel_j0(x: Array) -> Array:
     angle = (np.arange(64) + 0.5) * np.pi / 64
-    return np.cos(x[:, None] * np.sin(angle)).mean(axis=1)
+    return np.asarray(np.cos(x[..., None] * np.sin(angle)).mean(axis=-1))
