@@ -13,7 +13,7 @@ from virest.simulation.effects import EffectContext, effect_names, hide_effects
 from virest.simulation.hand_motion import random_hand_motion
 from virest.simulation.hidden import Hidden, shaded
 from virest.simulation.phone_gyro import before_low_pass, low_passed_rate
-from virest.simulation.session import nominal_camera
+from virest.simulation.session import SessionSettings, nominal_camera, plan_session, render_truth
 
 CHANGES = {
     "time_offset": "imu.time_offset_s",
@@ -254,3 +254,19 @@ def test_a_shadow_passes_at_its_time_over_its_place():
     before, there = (shaded(hidden, light, stamp_s)[..., 0] for stamp_s in (0.5, 1.5))
     np.testing.assert_allclose(before, np.array([[1.0], [0.75], [0.5]]) * np.ones((1, 4)))
     np.testing.assert_allclose(there, before * (1, 1, 0.25, 0.25))
+
+
+@pytest.mark.parametrize("longer", [0.5, 2.2])
+def test_another_focal_length_is_no_defocus(longer):
+    """The lens blurs by pixels of its own, however much of the scene one of them sees."""
+    nominal = nominal_camera(200, 150)
+    lens = nominal.intrinsics
+    other = dataclasses.replace(lens, fx_px=longer * lens.fx_px, fy_px=longer * lens.fy_px)
+    settings = SessionSettings(scene="board", frames=8, seed=3)
+
+    def steepest_step(true_lens):
+        session = plan_session(nominal, dataclasses.replace(nominal, intrinsics=true_lens), settings)
+        pictures = np.array([render_truth(session, slot) for slot in range(settings.frames)], float)
+        return max(np.abs(np.diff(pictures, axis=axis)).max() for axis in (1, 2)) / np.ptp(pictures)
+
+    assert steepest_step(other) == pytest.approx(steepest_step(lens), rel=0.05)

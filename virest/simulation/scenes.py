@@ -211,11 +211,13 @@ def make_scene(
     depth_m: float = np.inf,
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0),
     oversampling: float = 2.0,
+    lens_sigma_px: float = LENS_SIGMA_PX,
 ) -> Scene:
     """Draw a scene of one of KINDS for a camera of ``focal_px``.
 
     half_extent: how far x/z and y/z reach from the middle of the chart.  oversampling: chart pixels per picture pixel
-    at the middle; it is lowered (with a log message) where the chart would exceed MAX_CHART_PX.
+    at the middle; it is lowered (with a log message) where the chart would exceed MAX_CHART_PX.  lens_sigma_px: blur
+    of lens and pixel, in that camera's picture pixels.
     """
     if kind not in KINDS:
         raise SettingsError(f"scene '{kind}' is not known", hint=f"use one of {', '.join(KINDS)}")
@@ -227,7 +229,7 @@ def make_scene(
     chart_focal = focal_px * oversampling
     width, height = (2 * int(np.ceil(extent * chart_focal)) for extent in half_extent)
     drawing = _DRAWINGS[kind](rng, width, height, oversampling)
-    sigma = LENS_SIGMA_PX * oversampling
+    sigma = lens_sigma_px * oversampling
     chart = cv2.GaussianBlur(drawing, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
     return Scene(chart, chart_focal, depth_m, normal)
 

@@ -27,7 +27,7 @@ from virest.simulation.hidden import NOTHING, Hidden, defocused, gyro_reading, s
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
-from virest.simulation.scenes import Scene, hang_before, make_scene, move_things_before
+from virest.simulation.scenes import LENS_SIGMA_PX, Scene, hang_before, make_scene, move_things_before
 from virest.simulation.sensor import eight_bit, grey_of_light, noisy_levels, round_levels, sensor_light
 
 Array = NDArray[np.float64]
@@ -214,7 +214,7 @@ def plan_session(
         )
     shows = shown_captures(true, settings)
     if scene is None:
-        scene = _draw_scene(nominal, motion, settings, duration)
+        scene = _draw_scene(nominal, true, motion, settings, duration)
         if np.isfinite(depth):
             tilt = Rotation.from_rotvec([*settings.tilt_rad, 0.0]).as_matrix()[:, 2]
             scene = _at_median_depth(scene.at_plane(depth, tuple(tilt.tolist())), motion, true, settings, shows)
@@ -386,24 +386,35 @@ def _plan_exposures(settings: SessionSettings, shows: NDArray[np.int64]) -> Expo
     return plan_exposures(settings.exposure_s, settings.auto_exposure, count, settings.fps, rng)
 
 
-def _draw_scene(nominal: CameraProfile, motion: HandMotion, settings: SessionSettings, duration_s: float) -> Scene:
-    """Draw a chart that covers all that the motion shows, half a second before and after too."""
-    lens = nominal.intrinsics
-    if lens is None:
+def _draw_scene(
+    nominal: CameraProfile, true: CameraProfile, motion: HandMotion, settings: SessionSettings, duration_s: float
+) -> Scene:
+    """Draw a chart that covers all that the motion shows, half a second before and after too.
+
+    What is drawn follows the nominal camera, so a small hidden effect leaves the scene as it is.  The lens and the
+    pixels that blur it are the true camera's: one with twice the focal length resolves twice as much of the scene.
+    """
+    lens, true_lens = nominal.intrinsics, true.intrinsics
+    if lens is None or true_lens is None:
         raise SettingsError("a simulated camera needs a focal length", hint="set intrinsics.fx_px")
-    x, y = pixel_rays(lens)
-    x, y = np.abs(x).max() * _SCENE_MARGIN, np.abs(y).max() * _SCENE_MARGIN
+    x, y = (
+        max(np.abs(rays).max() * _SCENE_MARGIN, np.abs(true_rays).max())
+        for rays, true_rays in zip(pixel_rays(lens), pixel_rays(true_lens), strict=True)
+    )
     corners = np.array([[i, j, 1.0] for i in (-x, 0, x) for j in (-y, 0, y)])
     turns = motion.rotation(np.linspace(-0.5, duration_s + 0.5, 400)).as_matrix()
     rays = np.einsum("tij,kj->tki", turns, corners)
     plane = np.abs(rays[..., :2] / np.maximum(rays[..., 2:], 0.3)).max(axis=(0, 1))
     extent = np.minimum(plane, 3.0)
+    focal_px, true_focal_px = (max(one.fx_px, one.fy_px) for one in (lens, true_lens))
+    longer = true_focal_px / focal_px
     return make_scene(
         settings.scene,
         np.random.default_rng([settings.seed, 0]),
-        focal_px=max(lens.fx_px, lens.fy_px),
+        focal_px=focal_px,
         half_extent=(float(extent[0]), float(extent[1])),
-        oversampling=settings.oversampling,
+        oversampling=settings.oversampling * max(1, round(longer)),
+        lens_sigma_px=LENS_SIGMA_PX / longer,
     )
 
 
