@@ -391,8 +391,9 @@ def _draw_scene(
 ) -> Scene:
     """Draw a chart that covers all that the motion shows, half a second before and after too.
 
-    What is drawn follows the nominal camera, so a small hidden effect leaves the scene as it is.  The lens and the
-    pixels that blur it are the true camera's: one with twice the focal length resolves twice as much of the scene.
+    The detail that is drawn follows the nominal camera, so a small hidden effect leaves the scene as it is, or a whole
+    multiple of its focal length where the true one is that long.  The lens and the pixels that blur it are the true
+    camera's: one with twice the focal length resolves twice as much of the scene.
     """
     lens, true_lens = nominal.intrinsics, true.intrinsics
     if lens is None or true_lens is None:
@@ -407,14 +408,14 @@ def _draw_scene(
     plane = np.abs(rays[..., :2] / np.maximum(rays[..., 2:], 0.3)).max(axis=(0, 1))
     extent = np.minimum(plane, 3.0)
     focal_px, true_focal_px = (max(one.fx_px, one.fy_px) for one in (lens, true_lens))
-    longer = true_focal_px / focal_px
+    fine_px = focal_px * max(1, round(true_focal_px / focal_px))
     return make_scene(
         settings.scene,
         np.random.default_rng([settings.seed, 0]),
-        focal_px=focal_px,
+        focal_px=fine_px,
         half_extent=(float(extent[0]), float(extent[1])),
-        oversampling=settings.oversampling * max(1, round(longer)),
-        lens_sigma_px=LENS_SIGMA_PX / longer,
+        oversampling=settings.oversampling,
+        lens_sigma_px=LENS_SIGMA_PX * fine_px / true_focal_px,
     )
 
 
