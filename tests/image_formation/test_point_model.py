@@ -152,7 +152,8 @@ def test_mean_orientation_is_the_mean_over_the_exposure() -> None:
     recording = recorded(replace(FAR["portrait, read from the right"], rate_rad_s=1.5))
     trajectory = integrate_gyro(recording.imu, recording.profile)
     middle_s, exposure_s = np.array([0.21, 0.4, 0.77]), np.array([0.04, 0.03, 0.04])
-    found = Rotation.from_matrix(trajectory.mean_orientation(middle_s, exposure_s))
+    mean, still = (trajectory.mean_orientation(middle_s, e) for e in (exposure_s, 0 * exposure_s))
+    found = Rotation.from_matrix(mean.knot @ mean.since)
     nodes = np.linspace(-0.5, 0.5, 401)[:-1] + 0.5 / 400
     truth = Rotation.concatenate(
         [
@@ -164,7 +165,12 @@ def test_mean_orientation_is_the_mean_over_the_exposure() -> None:
     bend = (plain.inv() * truth).magnitude()
     assert bend.min() > 1e-4
     assert ((found.inv() * truth).magnitude() < 0.05 * bend).all()
-    np.testing.assert_allclose(trajectory.mean_orientation(middle_s, 0 * exposure_s), plain.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(still.knot @ still.since, plain.as_matrix(), atol=1e-12)
+    rays = np.array([[0.1, -0.2, 1.0], [0.3, 0.1, 1.0], [-0.2, 0.0, 1.0]])
+    np.testing.assert_allclose(mean.to_world(rays), found.apply(rays), atol=1e-14)
+    np.testing.assert_allclose(mean.to_camera(mean.to_world(rays)), rays, atol=1e-14)
+    by_world = np.stack([mean.to_camera(np.tile(axis, (3, 1))) for axis in np.eye(3)], axis=-1)
+    np.testing.assert_allclose(mean.per_world(np.tile(np.eye(3), (3, 1, 1))), by_world, atol=1e-14)
 
 
 # ── times of rows ────────────────────────────────────────────────────────────────────────────────────────────────

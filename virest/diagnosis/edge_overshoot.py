@@ -34,12 +34,11 @@ from virest.diagnosis.local_blur import STILL_PX, look_for_steps, time_blocks
 from virest.diagnosis.local_blur_model import across, path_tensors
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader
 from virest.diagnosis.selection import EDGE_LEVELS
-from virest.image_formation.point_model import turned
 from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.time_blocks import halves
-from virest.motion.trajectory import Trajectory
+from virest.motion.trajectory import Trajectory, turned
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from virest.motion.integration import integrate_gyro
 from virest.motion.measured_rate import MeasuredRate, measured_rate
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
-from virest.motion.trajectory import Trajectory
+from virest.motion.trajectory import Orientations, Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -128,10 +128,10 @@ class Poses:
     first_exposure_s: Array
     """(n,) about those times, over which everything that moves is seen at its mean."""
     second_exposure_s: Array
-    before: Array
-    """(n, 3, 3) R_world_cam at the first sight."""
-    back: Array
-    """(n, 3, 3) R_cam_world at the second."""
+    before: Orientations
+    """At the first sight."""
+    after: Orientations
+    """At the second."""
 
     def again(self, lens: MovingLens, rays: Array) -> Array:
         """Pixels (n, 2) at which a lens shows rays (n, 3), camera axes, at the second sight."""
@@ -243,13 +243,13 @@ def predict(
     """
     poses, sights = _poses(known, table, like), _sights(known.lens, table, like)
     at_rest = known.lens.rays_at_rest(table.first_px, poses.first_s) if sights is None else sights.rays
-    world = turned(poses.before, known.lens.from_rest(at_rest, poses.first_s, poses.first_exposure_s))
+    world = poses.before.to_world(known.lens.from_rest(at_rest, poses.first_s, poses.first_exposure_s))
     if scene is None or isinstance(scene, DirectedMotion):
-        rays = turned(poses.back, world)
+        rays = poses.after.to_camera(world)
         expected = poses.again(known.lens, rays)
         if scene is None:
             return Prediction(expected, poses, sights=sights)
-        per_step = _lens_slope(known.lens, rays, poses, expected) @ poses.back
+        per_step = poses.after.per_world(_lens_slope(known.lens, rays, poses, expected))
         step = scene.direction[scene.group(table.pair)]
         along = np.squeeze(per_step @ step[..., None], -1)
         return Prediction(expected, poses, along, per_step=per_step, sights=sights)
@@ -289,7 +289,7 @@ def _poses(known: IntegratedMotion, table: TrackTable, like: Prediction | None) 
             return old
     exposures = scale * table.first_exposure_s, scale * table.second_exposure_s
     before, after = map(known.trajectory.mean_orientation, (first_s, second_s), exposures)
-    return Poses(known.trajectory, scale, first_s, second_s, *exposures, before, np.swapaxes(after, -1, -2))
+    return Poses(known.trajectory, scale, first_s, second_s, *exposures, before, after)
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,14 +336,13 @@ def _paths(known: IntegratedMotion, table: TrackTable, scene: InertialMotion, po
 
 
 def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Moved) -> Prediction:
-    back = poses.back
-    rays = turned(back, world + moved.step * moved.inverse_depth[:, None])
+    rays = poses.after.to_camera(world + moved.step * moved.inverse_depth[:, None])
     rays[:, 2] = np.maximum(rays[:, 2], SMALLEST_DEPTH)
     expected = poses.again(known.lens, rays)
     if moved.per_entry is None:
-        ahead = rays + RAY_STEP * turned(back, moved.step)
+        ahead = rays + RAY_STEP * poses.after.to_camera(moved.step)
         return Prediction(expected, poses, (poses.again(known.lens, ahead) - expected) / RAY_STEP, None, moved)
-    per_world = _lens_slope(known.lens, rays, poses, expected) @ back
+    per_world = poses.after.per_world(_lens_slope(known.lens, rays, poses, expected))
     along = np.squeeze(per_world @ moved.step[..., None], -1)
     return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
 
@@ -386,8 +385,3 @@ def centre(
     """Camera centre (n, 3) from its place at origin_s, world axes, and its changes per bias (n, 3, 3), delay (n, 3)."""
     path = Paths(time_s - origin_s, *displacement.at(time_s, origin_s))
     return path.centre(scene, velocity), path.per_bias, path.per_delay
-
-
-def turned(rotation: Array, rays: Array) -> Array:
-    """Apply rotations (n, 3, 3) to rays (n, 3)."""
-    return np.einsum("nij,nj->ni", rotation, rays)

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.image_formation.point_model import IntegratedMotion, TrackTable, seen_s, turned
+from virest.image_formation.point_model import IntegratedMotion, TrackTable, seen_s
 from virest.inference.tracking import TrackingSettings, shrink_factor
+from virest.motion.trajectory import turned
 
 Array = NDArray[np.float64]
 UNSURE = 0.35

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, Poses, TrackTable, predict, turned
+from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, Poses, TrackTable, predict
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
@@ -154,8 +154,8 @@ def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, p
     assert moved.paths is not None
     centre_1 = moved.paths[0].centre(scene, scene.velocity_m_s[table.window])
     rays, expected = known.lens.rays(table.first_px, poses.first_s, poses.first_exposure_s), moved.inverse_depth
-    way = turned(poses.before, rays)
-    view = _Parallax(known.lens, turned(poses.back, way), turned(poses.back, moved.step), table, poses)
+    way = poses.before.to_world(rays)
+    view = _Parallax(known.lens, poses.after.to_camera(way), poses.after.to_camera(moved.step), table, poses)
     depth, std, across = view.inverse_depths(expected, passes, reach)
     safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
     points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], poses.first_s, depth, std)

@@ -51,7 +51,7 @@ class Trajectory:
         angle = turned_angle(self.rate_polynomials.take(interval, axis=2), since)
         return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*angle))
 
-    def mean_orientation(self, middle_s: Array, exposure_s: Array) -> Array:
+    def mean_orientation(self, middle_s: Array, exposure_s: Array) -> Orientations:
         """R_world_cam averaged over exposures about the times (n,): R exp(ω' E² / 24), to second order.
 
         The two turns since the knot are put together as exp(u) exp(v) ≈ exp(u + v + ½ u × v): v is some 1e-4 rad.
@@ -62,13 +62,41 @@ class Trajectory:
         a, b, c, _ = pieces
         bend = ((3 * a * since + 2 * b) * since + c) * (exposure_s**2 / 24)
         both = angle + bend + 0.5 * _cross(angle, bend)
-        return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*both))
+        return Orientations(self.rotation_world_cam.take(interval, axis=0), _exponential(*both))
 
     def _locate(self, time_s: Array) -> tuple[NDArray[np.intp], Array]:
         """Interval of each time (...), and the seconds since its knot (...). Outside the knots the ends are held."""
         held = np.clip(time_s, self.time_s[0], self.time_s[-1])
         interval = np.clip(np.searchsorted(self.time_s, held, side="right") - 1, 0, len(self.time_s) - 2)
         return interval, held - self.time_s[interval]
+
+
+@dataclass(frozen=True, slots=True)
+class Orientations:
+    """R_world_cam at n times, as the knot's and the rotation since: rotating twice costs less than their product."""
+
+    knot: Array
+    """(n, 3, 3)."""
+    since: Array
+    """(n, 3, 3)."""
+
+    def to_world(self, rays: Array) -> Array:
+        """Rays (n, 3) in camera axes, in world axes."""
+        return turned(self.knot, turned(self.since, rays))
+
+    def to_camera(self, rays: Array) -> Array:
+        """Rays (n, 3) in world axes, in camera axes."""
+        in_knot = np.einsum("nji,nj->ni", self.knot, rays)
+        return np.asarray(np.einsum("nji,nj->ni", self.since, in_knot))
+
+    def per_world(self, slopes: Array) -> Array:
+        """Slopes (n, k, 3) by camera axes, as slopes by world axes."""
+        return np.asarray(slopes @ np.swapaxes(self.since, -1, -2) @ np.swapaxes(self.knot, -1, -2))
+
+
+def turned(rotation: Array, rays: Array) -> Array:
+    """Apply rotations (n, 3, 3) to rays (n, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", rotation, rays))
 
 
 def turned_angle(pieces: Array, since_s: Array) -> Array:
