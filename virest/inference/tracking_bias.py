@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.inference.blur_bias import UNSURE
+from virest.inference.blur_bias import RELATIVE_STD
 from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ def remaining_std(fit: TrackFit, name: str, moved: Array, gyro_mean_std_rad_s: f
     moved (k,): by how much that moved the values.  gyro_mean_std_rad_s: of the gyroscope's noise, over the capture.
     """
     own = fit.slices[name]
-    std = np.hypot(np.hypot(shared_std(fit, name), UNSURE * moved), fit.by_coding[own])
+    std = np.hypot(np.hypot(shared_std(fit, name), RELATIVE_STD * moved), fit.by_coding[own])
     if name == "gyro_bias":
         wander = np.hypot(GYRO_WANDER_RAD_S, gyro_mean_std_rad_s)
         return np.asarray(np.hypot(np.hypot(std, wander), SHARED_RELIEF * fit.by_relief[own]))
