@@ -164,7 +164,7 @@ def _csv_row(row: list[str], header: list[str], where: str, names: list[str]) ->
         exposure_s = math.nan
     if not (math.isfinite(exposure_s) and exposure_s > 0):
         value = _shown(cells["exposure_s"])
-        raise CaptureError(f"{where}: exposure_s {value!r} is not a positive number", hint="write seconds, as 0.008")
+        raise CaptureError(f"{where}: exposure_s {value!r} is not above zero", hint="write seconds, such as 0.008")
     return name, exposure_s
 
 

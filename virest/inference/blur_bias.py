@@ -30,7 +30,7 @@ RELATIVE_STD = 0.35
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
 """Samples of the frequency plane; HIGHEST in cycles per pixel: the pixel aperture suppresses higher frequencies."""
 NODES = 15
-"""Quadrature nodes along a path: e is accurate to 1 % up to 8 px of blur in both directions, and to 25 % up to 12 px."""
+"""Quadrature nodes along a path: e is exact to 1 % up to 8 px of blur in both directions, and to 25 % up to 12 px."""
 MOST_SHIFT_PX = 0.3
 """Larger e are clipped to this: the first order holds for shifts that are small relative to a corner's detail."""
 LEAST_BLUR_PX = 0.3

@@ -62,7 +62,7 @@ class CovarianceModel:
     is modelled."""
 
     def by_relief(self, slope: Array) -> Array:
-        """Covariance (..., m, m), from fixed relief, of quantities that change by slope (..., m, k) per unit of the values.
+        """Covariance (..., m, m), from fixed relief, of what changes by slope (..., m, k) per unit of the values.
 
         The error cancels for a camera that moves to and fro, but not for one that keeps moving in one direction.
         """
