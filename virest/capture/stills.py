@@ -157,7 +157,7 @@ def _csv_row(row: list[str], header: list[str], where: str, names: list[str]) ->
     cells = dict(zip(header, row, strict=True))
     name = cells["file"]
     if name not in names:
-        raise CaptureError(f"{where}: no picture {_shown(name)!r} in the folder", hint="give file names as in the folder")
+        raise CaptureError(f"{where}: no picture {_shown(name)!r} in the folder", hint="use the folder's file names")
     try:
         exposure_s = float(cells["exposure_s"])
     except ValueError:

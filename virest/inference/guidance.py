@@ -150,7 +150,7 @@ def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure
 
 
 def map_between(first_of: Callable[[Array], Array], shape: tuple[int, int], factor: int) -> MapBetween:
-    """Interpolate a map from stored pixels (n, 2) to the first frame's; for pictures (height, width) after reduction."""
+    """Interpolate a map of stored pixels (n, 2) to the first frame, for pictures (height, width) after reduction."""
     at_px = _nodes_px(shape, factor)
     shift = (first_of(at_px) - at_px).reshape(NODES, NODES, 2) / factor
     return MapBetween(np.einsum("ki,lj,ijc->klc", _weights(), _weights(), shift), shape)

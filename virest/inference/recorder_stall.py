@@ -34,7 +34,7 @@ DECISIVE_CHI2 = 37.0
 """Smallest chi-square advantage of the best position over any other: exp(−37 / 2) is 1e-8, and 1e-6 if rotations
 scatter 15 % more than in the neighbouring frames."""
 OTHER_SIGMA, MOST_REST = 3.0, 0.2
-"""Reject a stall whose lag differs from a whole number of captures by more standard deviations and periods than this."""
+"""Reject a lag that differs from a whole number of captures by more than these standard deviations and periods."""
 MOST_RMS_RATIO = 1.5
 """Largest rms residual inside the stall relative to its surroundings for the rotations to count as explained."""
 

@@ -28,7 +28,7 @@ class Term:
     prior_std: tuple[float, ...]
     """(k,) prior standard deviation of the total change from the starting profile; inf: no prior."""
     slopes: Callable[[CameraProfile, TrackTable, Callable[[CameraProfile], Array]], Array] | None = None
-    """All slopes (n, 2, k) at once, if that is faster, from a profile, the points, and a function that gives the points'
+    """All slopes (n, 2, k) at once, if that is faster, from a profile, the points, and a function that gives their
     displacement (n, 2) for another profile; None: by difference quotients."""
 
     def __len__(self) -> int:
@@ -38,7 +38,7 @@ class Term:
 def slopes_of(
     term: Term, profile: CameraProfile, table: TrackTable, moved_by: Callable[[CameraProfile], Array]
 ) -> Array:
-    """Change (n, 2, k) of the predicted points per unit of a term's values; moved_by: displacement (n, 2) by profile."""
+    """Change (n, 2, k) of predicted points per unit of a term's values; moved_by: displacement for another profile."""
     if term.slopes is not None:
         return term.slopes(profile, table, moved_by)
     columns = []

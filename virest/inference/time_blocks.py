@@ -18,7 +18,7 @@ def even_blocks(number: Index, total: int, blocks: int) -> Index:
 
 
 def varied_blocks(position: Array | Index, lengths: Sequence[float] | Array) -> Index:
-    """Block (n,) of each position in time; block lengths cycle through ``lengths`` to avoid beats with periodic motion."""
+    """Block (n,) of each position in time; lengths cycle through ``lengths`` to avoid beats with periodic motion."""
     if not len(position):
         return np.zeros(0, np.intp)
     in_turn = np.asarray(lengths, float)
