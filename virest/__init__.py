@@ -1,10 +1,10 @@
-"""virest: deblur and straighten phone captures by the phone's own gyroscope.
+"""virest: deblur phone videos and correct their rolling shutter with the phone's own gyroscope.
 
 >>> import virest
 >>> capture = virest.open("sample_data/leaves")
 >>> restored = capture.restore(5)
 
-The functions below are the stable interface; they load what they need when they are first used.
+The functions below are the stable interface; their modules are imported on first use.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Load a name of the interface when it is first used."""
+    """Import a public name on first use."""
     if name not in __all__:
         raise AttributeError(f"module 'virest' has no attribute '{name}'")
     from importlib import import_module

@@ -1,17 +1,17 @@
 """The error tree.
 
-    VirestError                    exit  1   a fault of ours, unless a subclass says otherwise
+    VirestError                    exit  1   an internal error, unless a subclass says otherwise
     ├── SettingsError              exit  3   settings or camera profile
     ├── CaptureError               exit  4   the capture cannot be used
     │   ├── VideoError             exit  4   the movie
     │   ├── ImuError               exit  4   gyroscope or accelerometer
-    │   └── ClockError             exit  4   times that do not fit together
-    ├── CalibrationError           exit  6   the data do not determine what was asked
+    │   └── ClockError             exit  4   inconsistent times
+    ├── CalibrationError           exit  6   the data do not determine the requested values
     ├── RestorationError           exit  7   the restoration of a frame failed
     └── OutputError                exit  8   exists, locked, disk full, not writable
 
 Exit codes are a stable interface; 0 done, 2 usage, 9 part of a batch failed, 10 ``diagnose --check``, 130 interrupted.
-Every error says what, where and how much in its message, and what to do next in its hint.
+The message of every error says what, where and how much; its hint says what to do next.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class VirestError(Exception):
         return f"{self.message}; {self.hint}" if self.hint else self.message
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Keep hint and facts when the error crosses a process border."""
+        """Keep hint and facts when the error is sent between processes."""
         return _rebuild, (type(self), self.message, self.hint, self.facts)
 
 
@@ -55,7 +55,7 @@ class CaptureError(VirestError):
 
 
 class VideoError(CaptureError):
-    """The movie is missing, cut, not decodable, or not the one that the time stamps belong to."""
+    """The movie is missing, truncated, not decodable, or not the one that the timestamps belong to."""
 
 
 class ImuError(CaptureError):
@@ -63,11 +63,11 @@ class ImuError(CaptureError):
 
 
 class ClockError(CaptureError):
-    """Times that fall, repeat, lost their precision, or come from different clocks."""
+    """Times that decrease, repeat, lost their precision, or come from different clocks."""
 
 
 class CalibrationError(VirestError):
-    """The data do not determine what was asked for."""
+    """The data do not determine the requested values."""
 
     exit_code = 6
 

@@ -112,7 +112,7 @@ def test_stamps_of_another_movie_are_refused_with_numbers(writer):
     writer.write()
     writer.stamps_ns = [START_NS + round(i * 1.05 * PERIOD_NS) for i in range(30)]
     writer.write_stamps()
-    with pytest.raises(ClockError, match=r"part at frame 1 by 1670\.0 µs"):
+    with pytest.raises(ClockError, match=r"first differ at frame 1, by 1670\.0 µs"):
         read_capture(writer.folder)
 
 

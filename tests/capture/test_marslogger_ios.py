@@ -144,7 +144,7 @@ def test_faults_end_in_one_line(tmp_path):
     (tmp_path / "a/other.mp4").unlink()
     rows = [f"{stamps[0] + k * 41_000_000}, 75, 75, 47, 31, 8300000" for k in range(COUNT)]
     (tmp_path / "a/movie_metadata.csv").write_text("\n".join([FRAME_HEAD, *rows]) + "\n")
-    with pytest.raises(ClockError, match="part at frame"):
+    with pytest.raises(ClockError, match="first differ at frame"):
         read_capture(tmp_path / "a")
     (tmp_path / "a/IMG_0042.MOV").unlink()
     with pytest.raises(VideoError, match="no movie"):

@@ -265,7 +265,7 @@ def test_a_diagnosis_is_told_with_values_deviations_and_rivals():
     found = {"verdict": "explained", "causes": [cause], "unexplained": {"p_value": 0.6, "strongest_along": "row"}}
     told = text_of(report_page([CaptureRecord("trip", None, DiagnosisRecord(found))], "1"))
     for words in ("0 ms → 4.20 ± 0.11 ms", "1.41 → 0.22 points, px", "99%", "timestamp reference (0.23)",
-                  "camera and gyroscope clocks stand apart", "Found: time offset."):  # fmt: skip
+                  "camera and IMU clocks differ by an offset", "Found: time offset."):  # fmt: skip
         assert words in told
     assert "more than chance" in text_of(
         report_page([CaptureRecord("t", None, DiagnosisRecord({**found, "verdict": "unexplained"}))], "1")

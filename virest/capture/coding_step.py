@@ -1,4 +1,4 @@
-"""How coarsely a movie's coder quantised a frame, as its decoder tells."""
+"""The encoder's quantisation step of a frame, as the decoder reports it."""
 
 from __future__ import annotations
 
@@ -9,29 +9,28 @@ import numpy as np
 from av.sidedata.sidedata import SideDataContainer
 
 VP9_PARAMETERS, H264_PARAMETERS = 0, 1
-"""AVVideoEncParamsType; FFmpeg tells MPEG-4's too, but true noise was 2 to 30 times what its step leaves."""
+"""AVVideoEncParamsType.  MPEG-4's is not used: measured noise was 2 to 30 times what its step leaves."""
 QP_PLACE = 4
-"""Where a block's QP stands after its place and size."""
+"""Index of a block's QP, after its position and size."""
 STEP_AT_QP_0, QP_OF_TWICE = 0.625, 6.0
-"""Of H.264 (ITU-T H.264, 8.5.9): its quantiser's step in grey levels, and how much more QP doubles it."""
+"""H.264 (ITU-T H.264, 8.5.9): quantiser step at QP 0, grey levels, and the increase of QP that doubles it."""
 VP9_RISES = "94 25 17 13 10 9 7 6 6 5 5 4 4 4 3 3 3 3 3 2 3 2 2 2 2 2 2 2 2 2 1 2 1 2 1"
-"""How often in a row VP9's step rises by 1, 2, 3 ... from one index to the next, after a first rise by 4."""
+"""Run lengths over the index: VP9's step first rises by 4, then this many times by 1, by 2, by 3 ..."""
 VP9_STEPS = (4 + np.cumsum([0, 4, *np.repeat(np.arange(1, 36), [int(n) for n in VP9_RISES.split()])])) / 8
-"""(256,) by VP9's index, grey levels (VP9 bitstream specification, 8.6.1, ac_qlookup, which counts eighths)."""
+"""(256,) VP9's step by index, grey levels (VP9 bitstream specification, 8.6.1, ac_qlookup, in eighths)."""
 
 
 def coding_step(frame: Any) -> float | None:
-    """The step of the coder's quantiser, grey levels: mean over the blocks of a decoded frame; None: not told.
+    """The encoder's quantisation step, grey levels: mean over the blocks of a decoded frame; None: not reported.
 
-    FFmpeg's decoders tell it for H.264 and VP9 (``AVVideoEncParams``: a head, then blocks with what their QP is more),
-    not for HEVC.  Steps are those of a transform that keeps the sum of squares.  Not read from
-    ``frame.side_data``: the frame keeps what that returns, which keeps the frame, and a circle of a whole picture stays
-    in memory until Python happens to look for circles.
+    FFmpeg's decoders report it for H.264 and VP9 (``AVVideoEncParams``: a header, then the QP difference of each
+    block), not for HEVC.  Steps are those of an orthonormal transform.  ``frame.side_data`` is not used: it stores its
+    result in the frame, a reference cycle that keeps a whole picture in memory until the garbage collector runs.
     """
-    for told in SideDataContainer(frame):  # type: ignore[call-arg]  # which its stub leaves out
-        if told.type.name != "VIDEO_ENC_PARAMS":
+    for side_data in SideDataContainer(frame):  # type: ignore[call-arg]  # missing from its stub
+        if side_data.type.name != "VIDEO_ENC_PARAMS":
             continue
-        data = bytes(told)
+        data = bytes(side_data)
         count, start, size, kind, qp = struct.unpack_from("=I4xQQii", data)
         if start + count * size > len(data):
             continue

@@ -1,4 +1,4 @@
-"""What kind of recording a folder holds, told by its files and their headers, never by a name or a version.
+"""The kind of recording in a folder, detected from its files and their headers, never from a name or a version.
 
 EuRoC / ASL       mav0/ with cam*/data.csv and imu0/data.csv; the sequence, its mav0, or one camera of it
 ARKit app         frames.csv, imu.csv and the movie
@@ -9,7 +9,7 @@ OpenCamera-Sensors  VID_*gyro.csv and VID_*timestamps.csv
 Stray Scanner     camera_matrix.csv, odometry.csv, imu.csv and rgb.mp4
 MARSLogger        movie.mp4, gyro_accel.csv, …
 pictures          pictures with stamps, gyro_accel.csv or imu.csv
-telemetry         nothing but a movie: GoPro, Sony, Insta360 keep the samples inside
+telemetry         only a movie: GoPro, Sony and Insta360 keep the samples inside
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def read_source(folder: Path, notes: list[Note]) -> Source:
 
 
 def choose_reader(folder: Path) -> Reader:
-    """The reader of the folder's kind. Raises CaptureError, saying what is there, if it is of none."""
+    """The reader of the folder's kind. Raises CaptureError with the folder's content if no kind fits."""
     names = list_names(folder)
     reader = _choose(folder, set(names))
     if reader is not None:
@@ -75,7 +75,7 @@ def is_capture(folder: Path) -> bool:
 
 
 def partial_readers(folder: Path) -> dict[Path, Callable[[Path], Any]]:
-    """Readers of the single files of a folder that cannot be used as a whole, to say what there is."""
+    """Readers of the single files of a folder that cannot be used as a whole, to report what is there."""
     try:
         reader = _choose(folder, set(list_names(folder)))
     except CaptureError:
@@ -115,7 +115,7 @@ def _choose(folder: Path, names: set[str]) -> Reader | None:
 
 
 def _kind(folder: Path, name: str) -> str:
-    """What a file's first lines say that it is, '' if they cannot be read."""
+    """The kind of a file by its first lines, '' if they cannot be read."""
     path = folder / name
     try:
         if not path.is_file():

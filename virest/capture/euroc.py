@@ -5,9 +5,9 @@
     mav0/imu0/data.csv      #timestamp [ns],gyroscope x y z [rad/s],accelerometer x y z [m/s^2]
     dso/cam0/times.txt      name, time in s, exposure in ms (TUM-VI), where it is there
 
-A path to the sequence or to its mav0 means its first camera, a path to mav0/cam1 that one.  Of a rolling shutter the
-format says nothing; two keys more are understood and written: ``line_delay_nanoseconds`` (as Kalibr has it), or
-``readout_time_s`` with ``readout_direction``.
+A path to the sequence or to its mav0 means its first camera, a path to mav0/cam1 that camera.  The format lacks the
+rolling shutter; two more keys are read and written: ``line_delay_nanoseconds`` (as in Kalibr), or ``readout_time_s``
+with ``readout_direction``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SENSOR, LIST, TIMES = "sensor.yaml", "data.csv", "times.txt"
 CHAINS = ("camchain-imucam.yaml", "camchain.yaml", "dso/camchain.yaml")
 DISTORTIONS = {"radial-tangential": "radtan", "radtan": "radtan", "equidistant": "fisheye", "none": "none"}
 COEFFICIENTS = {"radtan": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4"), "none": ()}
-"""In EuRoC's order; radial-tangential has four or five of them."""
+"""In EuRoC's order; radial-tangential has four or five."""
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -67,12 +67,12 @@ class EurocPlace:
 
     @property
     def pictures(self) -> Path:
-        """The list of the camera's pictures, or their folder where there is not a list."""
+        """The list of the camera's pictures, or their folder if there is no list."""
         return self.camera / LIST if is_present(self.camera / LIST) else self.camera / "data"
 
 
 def find_euroc(folder: Path) -> EurocPlace | None:
-    """The sequence that a folder is, or is a part of; None where it is none."""
+    """The sequence that a folder is or belongs to; None if there is none."""
     try:
         if (folder / "mav0").is_dir():
             return _first_camera(folder, folder / "mav0")
@@ -104,7 +104,7 @@ def read_euroc(folder: Path, notes: list[Note]) -> Source:
     """Read a sequence, or one camera of it. Raises CaptureError for what is missing or cannot be used."""
     place = find_euroc(folder)
     if place is None:
-        raise CaptureError(f"{label(folder)}: is no EuRoC sequence", hint="pass the folder that holds mav0")
+        raise CaptureError(f"{label(folder)}: is not a EuRoC sequence", hint="pass the folder that holds mav0")
     listed = read_picture_list(place.pictures)
     gyro = read_imu_rows(place.imu / LIST)
     movie = index_pictures(place.pictures, listed)
@@ -124,9 +124,9 @@ def read_euroc(folder: Path, notes: list[Note]) -> Source:
 
 
 def note_missing_pictures(dropped: dict[str, int], name: str, notes: list[Note]) -> None:
-    """Say where a list names pictures that are not there."""
+    """Note how many listed pictures are missing."""
     if missing := dropped.get("picture is missing"):
-        notes.append(Note("warning", "pictures-missing", f"{name}: {missing} listed pictures are not there"))
+        notes.append(Note("warning", "pictures-missing", f"{name}: {missing} listed pictures are missing"))
 
 
 def read_imu_rows(path: Path) -> GyroTable:
@@ -146,14 +146,14 @@ def read_exposure_times(path: Path) -> MetadataTable | None:
     table = read_rows(path, (1, 2), separator=r"\s+", error=CaptureError)
     if not len(table.time_ns) or not np.isfinite(table.values[:, 1]).any():
         return None
-    # the first column is the picture's name, a time itself in TUM-VI; else the seconds stand in the second
+    # in TUM-VI the first column is the picture's name, which is its time in ns; otherwise use the seconds in the second
     named = len(str(int(table.time_ns[0]))) < 15
     time_ns = np.rint(table.values[:, 0] * 1e9).astype(np.int64) if named else table.time_ns
     return make_metadata_table(time_ns, table.rows, table.dropped, exposure_s=table.values[:, 1] * 1e-3)
 
 
 def _profile(place: EurocPlace, movie: MovieIndex, notes: list[Note]) -> tuple[CameraProfile | None, list[Path]]:
-    """What sensor.yaml says of the camera, else a Kalibr camera chain beside the sequence, and the files of it."""
+    """The camera of sensor.yaml, else of a Kalibr camera chain beside the sequence, and the files read for it."""
     path = place.camera / SENSOR
     found: CameraProfile | None = None
     files: list[Path] = []
@@ -164,7 +164,7 @@ def _profile(place: EurocPlace, movie: MovieIndex, notes: list[Note]) -> tuple[C
         found, files = _from_chain(chain, place.camera.name, movie, notes), [chain]
     if found is None:
         found = CameraProfile(movie.width, movie.height, readout_known=False, r_cam_imu=IDENTITY)
-        text = f"no {SENSOR}: the camera's axes are taken for the sensor's own; give camera.yaml"
+        text = f"no {SENSOR}: assuming that camera and IMU axes agree; give camera.yaml"
         notes.append(Note("warning", "axes-unknown", text))
     return found, files
 
@@ -173,19 +173,19 @@ def _mapping(path: Path) -> dict[str, Any]:
     try:
         return load_yaml_mapping(path)
     except SettingsError as fault:
-        raise CaptureError(f"{label(path)}: {fault.message}", hint="repair it, or take it away") from None
+        raise CaptureError(f"{label(path)}: {fault.message}", hint="repair or remove it") from None
 
 
 def _from_chain(chain: Path, camera: str, movie: MovieIndex, notes: list[Note]) -> CameraProfile | None:
     try:
         profile = parse_camchain(_mapping(chain), label(chain), camera)
     except SettingsError as fault:
-        raise CaptureError(str(fault), hint="repair it, or take it away") from None
+        raise CaptureError(str(fault), hint="repair or remove it") from None
     return _of_size(profile, movie, label(chain), notes)
 
 
 def _imu_from_body(place: EurocPlace) -> Array:
-    """T_imu_body of imu0/sensor.yaml; the body is the sensor where nothing is said."""
+    """T_imu_body of imu0/sensor.yaml; the identity if it has none."""
     path = place.imu / SENSOR
     pose = _pose(_mapping(path).get("T_BS"), label(path)) if is_present(path) else None
     return np.eye(4) if pose is None else _inverse(pose)
@@ -194,13 +194,13 @@ def _imu_from_body(place: EurocPlace) -> Array:
 def parse_sensor(
     content: dict[str, Any], imu_from_body: Array, name: str, movie: MovieIndex, notes: list[Note]
 ) -> CameraProfile | None:
-    """Turn a camera's sensor.yaml into a profile, the time offset and all that it does not know unknown.
+    """Turn a camera's sensor.yaml into a profile; the time offset and everything that the file lacks stay unknown.
 
-    imu_from_body: (4, 4).  Raises CaptureError for what is not usable.
+    imu_from_body: (4, 4).  Raises CaptureError for unusable values.
     """
     pose = _pose(content.get("T_BS"), name)
     if pose is None:
-        notes.append(Note("warning", "axes-unknown", f"{name}: no T_BS: the camera's axes are taken for the sensor's"))
+        notes.append(Note("warning", "axes-unknown", f"{name}: no T_BS: assuming that camera and IMU axes agree"))
         pose = _inverse(imu_from_body)
     size = content.get("resolution", [movie.width, movie.height])
     if not isinstance(size, list) or len(size) != 2:
@@ -226,19 +226,19 @@ def parse_sensor(
 
 
 def _of_size(profile: CameraProfile, movie: MovieIndex, name: str, notes: list[Note]) -> CameraProfile:
-    """The profile where it is of these pictures; without its lens, and with a note, where it is of others."""
+    """The profile if its picture size matches the movie's; else without its lens, and with a note."""
     if (profile.width, profile.height) == (movie.width, movie.height):
         return profile
     text = (
-        f"{name}: describes {profile.width}x{profile.height} pictures, these are {movie.width}x{movie.height}: its "
-        "lens is not used; give camera.yaml"
+        f"{name}: describes {profile.width}x{profile.height} pictures, but these are {movie.width}x{movie.height}: its "
+        "lens is ignored; give camera.yaml"
     )
     notes.append(Note("warning", "sensor-size", text))
     return replace(profile, width=movie.width, height=movie.height, intrinsics=None)
 
 
 def _lens(content: dict[str, Any], name: str, notes: list[Note]) -> dict[str, Any]:
-    """The ``intrinsics`` of a profile; empty (with a note) for models that are neither pinhole nor known."""
+    """The ``intrinsics`` of a profile; empty, with a note, for unsupported camera models."""
     values = content.get("intrinsics")
     if values is None:
         notes.append(Note("warning", "fx-unknown", f"{name}: no intrinsics"))
@@ -268,7 +268,7 @@ def _number(value: Any, name: str) -> float:
 
 
 def _pose(block: Any, name: str) -> Array | None:
-    """(4, 4) of EuRoC's matrix, or of four rows; None where there is none."""
+    """(4, 4) pose from EuRoC's matrix or from four rows; None if there is none."""
     if block is None:
         return None
     values = block.get("data") if isinstance(block, dict) else block
@@ -277,10 +277,10 @@ def _pose(block: Any, name: str) -> Array | None:
     except (TypeError, ValueError, OverflowError):
         matrix = np.full((4, 4), np.nan)
     rotation = matrix[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # rows so long that their products are no numbers
+    with np.errstate(over="ignore", invalid="ignore"):  # products of huge entries overflow
         is_rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-2
     if not (is_rigid and np.isfinite(matrix).all() and np.allclose(matrix[3], (0, 0, 0, 1))):
-        raise CaptureError(f"{name}: T_BS is no rigid motion of 4x4 numbers", hint="repair it")
+        raise CaptureError(f"{name}: T_BS is not a 4x4 rigid transform", hint="repair it")
     return matrix
 
 
@@ -288,12 +288,12 @@ def _pose(block: Any, name: str) -> Array | None:
 
 
 def format_picture_list(time_ns: list[int]) -> str:
-    """EuRoC's cam0/data.csv, whose pictures are called by their time."""
+    """EuRoC's cam0/data.csv; pictures are named by their time."""
     return "#timestamp [ns],filename\n" + "".join(f"{time},{time}.png\n" for time in time_ns)
 
 
 def format_imu_rows(time_ns: NDArray[np.int64], gyro_rad_s: Array, accel_m_s2: Array) -> str:
-    """EuRoC's imu0/data.csv; numbers so that reading gives the same ones."""
+    """EuRoC's imu0/data.csv, with digits enough to read back the same numbers."""
     values = np.hstack([gyro_rad_s, accel_m_s2]).tolist()
     rows = (f"{time},{','.join(map(repr, row))}\n" for time, row in zip(time_ns.tolist(), values, strict=True))
     return IMU_HEADER + "\n" + "".join(rows)
@@ -340,7 +340,7 @@ def format_camera_sensor(profile: CameraProfile, rate_hz: float, comments: list[
 
 
 def format_imu_sensor(noise: ImuNoise, comments: list[str]) -> str:
-    """The inertial sensor's sensor.yaml, unknown densities left out."""
+    """The inertial sensor's sensor.yaml, without densities that are unknown."""
     content: dict[str, Any] = {
         "sensor_type": "imu",
         "comment": "phone",

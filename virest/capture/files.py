@@ -1,4 +1,4 @@
-"""Opening what a stranger's phone left behind: regular files only, bounded reads, never a hang on a pipe."""
+"""Open untrusted files: regular files only, bounded reads, so that no pipe hangs and no file fills the memory."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from virest.errors import CaptureError
 
 CHUNK_BYTES = 1 << 20
 MAX_LINE_BYTES = 1 << 16
-"""The longest honest row has some 200 bytes; a longer one than this is damage, or an attack on the memory."""
+"""Real rows have up to about 200 bytes; a line above this limit is damage, or an attack on the memory."""
 MAX_TABLE_BYTES = 4 << 30
 """Four days of 500 Hz samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class TextScan:
-    """What a cheap look over a text file found."""
+    """Result of a bounded scan of a text file."""
 
     lines: int
-    """Line ends, plus one for a last line without."""
+    """Line ends, plus one for an unterminated last line."""
     head: str
     """The first lines, at most MAX_LINE_BYTES, undecodable bytes replaced."""
     ends_with_newline: bool
@@ -33,7 +33,7 @@ def label(path: Path) -> str:
 
 
 def require_regular_file(path: Path, error: type[CaptureError] = CaptureError, hint: str = "") -> int:
-    """Size in bytes of a regular file. Raises ``error`` for what is missing, a folder, a pipe or a loop of links."""
+    """Size in bytes of a regular file. Raises ``error`` for a missing file, a folder, a pipe or a loop of links."""
     name = label(path)
     try:
         status = path.stat()
@@ -43,13 +43,13 @@ def require_regular_file(path: Path, error: type[CaptureError] = CaptureError, h
         reason = getattr(fault, "strerror", None) or str(fault)
         raise error(f"{name}: {reason}", hint="check the path, its links and its permissions") from None
     if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
         raise error(f"{name}: is {kind}", hint="a capture consists of plain files")
     return status.st_size
 
 
 def is_present(path: Path) -> bool:
-    """Whether anything stands under this name, be it usable or not."""
+    """Whether anything of this name exists, usable or not."""
     try:
         path.lstat()
     except (OSError, ValueError):
@@ -58,9 +58,9 @@ def is_present(path: Path) -> bool:
 
 
 def scan_text(path: Path, error: type[CaptureError] = CaptureError, hint: str = "") -> TextScan:
-    """Look over a text file in bounded chunks, before anything reads it by lines.
+    """Scan a text file in bounded chunks before anything reads it line by line.
 
-    Raises ``error`` for no regular file, too many bytes, a line longer than MAX_LINE_BYTES, or bytes that are no text.
+    Raises ``error`` if it is not a regular file, has too many bytes or a line above MAX_LINE_BYTES, or is not text.
     """
     size = require_regular_file(path, error, hint)
     name = label(path)
@@ -83,7 +83,7 @@ def scan_text(path: Path, error: type[CaptureError] = CaptureError, hint: str = 
 def _check_chunk(chunk: bytes, run: int, name: str, error: type[CaptureError]) -> int:
     """Length of the unfinished line at the chunk's end; refuses NUL bytes and endless lines."""
     if b"\0" in chunk:
-        raise error(f"{name}: has NUL bytes, it is no plain text", hint="copy the original from the phone again")
+        raise error(f"{name}: has NUL bytes, so it is not plain text", hint="copy the original from the phone again")
     start = 0
     while (end := chunk.find(b"\n", start)) >= 0:
         if run + end - start > MAX_LINE_BYTES:
@@ -100,7 +100,7 @@ def _check_chunk(chunk: bytes, run: int, name: str, error: type[CaptureError]) -
 
 
 def read_small_text(path: Path, max_bytes: int = 1 << 20, error: type[CaptureError] = CaptureError) -> str:
-    """A small text file whole, undecodable bytes replaced. Raises ``error`` if it is no regular file or too large."""
+    """Content of a small text file, undecodable bytes replaced. Raises ``error`` if it is irregular or too large."""
     size = require_regular_file(path, error)
     if size > max_bytes:
         raise error(f"{label(path)}: {size} bytes, more than {max_bytes}", hint="is it the logger's file?")

@@ -1,7 +1,7 @@
-"""A capture folder, of any kind: join its files by time, say what is missing, and hand on one `Capture`.
+"""Read a capture folder of any kind: join its files by time, note what is missing, and return one `Capture`.
 
-Which kind it is, `detect` tells by its files and their headers; from then on there is one way for all.  Frames are
-joined by time, and whatever is left out is counted and explained.
+`detect` finds the kind from the files and their headers; the rest is the same for all kinds.  Frames are joined by
+time, and everything skipped is counted and explained.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ __all__ = [
 
 GUESSED_FOCAL = 0.8
 LARGE_RATE_RAD_S = 35.0
-"""2000 °/s, where phone gyroscopes end."""
+"""2000 °/s, the full scale of phone gyroscopes."""
 PLAUSIBLE_ACCEL_M_S2 = (5.0, 20.0)
-"""Median length of the specific force: phones' accelerometers are off by a few percent, and hands shake evenly."""
+"""Median magnitude of the specific force: accelerometers are off by a few percent, and hand shake averages out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +77,8 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     """Read, join and check a capture folder.
 
     ``look_at_pictures``: decode the first two seconds to find repeated pictures (start-up lag).
-    Raises VideoError, ImuError, ClockError or CaptureError where the capture cannot be used; what can be used in part
-    comes back with notes, counts and a reason on each frame left out.
+    Raises VideoError, ImuError, ClockError or CaptureError if the capture cannot be used; a partly usable capture is
+    returned with notes, counts and a reason on each skipped frame.
     """
     folder = require_folder(path)
     notes: list[Note] = []
@@ -127,12 +127,12 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
 
 
 def unpack_hint(path: str | Path) -> str:
-    """What to do with a bag that was given in place of a capture; empty for anything else."""
+    """Hint for a bag given in place of a capture; empty for anything else."""
     return "unpack it first: virest import BAG FOLDER" if str(path).lower().endswith(BAG_ENDINGS) else ""
 
 
 def require_folder(path: Path) -> Path:
-    """The folder, resolved, so that `.` has a name. Raises CaptureError if it is missing or no folder."""
+    """The folder, resolved, so that `.` has a name. Raises CaptureError if it is missing or not a folder."""
     try:
         folder = locate(path).resolve(strict=True)
         if folder.is_dir():
@@ -148,7 +148,7 @@ def require_folder(path: Path) -> Path:
 def _note_movie(files: Source, notes: list[Note]) -> None:
     found, promised = len(files.movie), files.movie.declared_frames
     if 0 < found < promised:
-        text = f"{files.names.movie}: its index promises {promised} frames, {found} are there: the copy was cut"
+        text = f"{files.names.movie}: its index lists {promised} frames but it holds {found}: the copy is incomplete"
         notes.append(Note("warning", "movie-cut", text))
 
 
@@ -177,18 +177,18 @@ def _join(files: Source, notes: list[Note]) -> _Joined:
 def _note_alignment(alignment: Alignment, frames: int, rows: int, movie: str, what: str, notes: list[Note]) -> None:
     if alignment.slid:
         matched = int((alignment.rows >= 0).sum())
-        text = f"{movie} has {frames} frames, {what} {rows} rows: {matched} frames joined by sliding PTS over the rows"
+        text = f"{movie} has {frames} frames, {what} {rows} rows: {matched} frames joined by a common shift of PTS"
         notes.append(Note("warning" if matched < frames or rows != frames else "info", "stamps-slid", text))
     if alignment.drift_ns:
         text = (
-            f"PTS of {movie} and {what} part slowly, by {alignment.drift_ns / 1e6:+.3f} ms over {frames} frames: "
-            f"joined row by row, the times of {what} count"
+            f"PTS of {movie} and {what} drift apart by {alignment.drift_ns / 1e6:+.3f} ms over {frames} frames: "
+            f"joined row by row, with the times of {what}"
         )
         notes.append(Note("warning", "stamps-drift", text))
     if alignment.rivals:
         text = (
-            f"{alignment.rivals} other positions of the movie among the rows of {what} fit as well (even spacing): the "
-            "frames' times may be off by whole frames; estimate the time offset before trusting them"
+            f"{alignment.rivals} other alignments of the movie with the rows of {what} fit as well (even spacing): "
+            "frame times may be off by whole frames; estimate the time offset before trusting them"
         )
         notes.append(Note("warning", "stamps-ambiguous", text))
 
@@ -201,7 +201,7 @@ def _note_metadata(
         raise ClockError(
             f"{name} covers {meta_ns[0] / 1e9:.3f}–{meta_ns[-1] / 1e9:.3f} s, the frames "
             f"{stamps_ns[0] / 1e9:.3f}–{stamps_ns[-1] / 1e9:.3f} s: no row joins",
-            hint="the files are of different sessions; remove the metadata to go on without exposures",
+            hint="the files come from different sessions; remove the metadata to continue without exposures",
         )
     if lost:
         text = f"{lost} of {len(joined)} frames have no row in {name}"
@@ -212,7 +212,7 @@ def _note_metadata(
 
 
 def _unix_lag_s(files: Source, alignment: Alignment, joined: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Encoder output − capture result of each frame, from the two Unix columns; None where either is missing."""
+    """Encoder output − capture result of each frame, from the two Unix columns; None if either is missing."""
     if files.stamps is None or files.metadata is None:
         return None
     out_ns, in_ns = files.stamps.unix_ns, files.metadata.unix_ns
@@ -263,7 +263,7 @@ def _differences(files: Source, frames: Iterable[int], count: int) -> NDArray[np
 
 
 def _later_repeats(files: Source, look: int, motion_px: NDArray[np.float64]) -> tuple[int, ...]:
-    """Frames beyond the start-up that repeat their predecessor: those that took few bytes are decoded."""
+    """Frames after the start-up that repeat their predecessor; only frames of few bytes are decoded."""
     size = files.movie.packet_bytes
     if size is None or len(size) != len(motion_px):
         return ()
@@ -272,7 +272,7 @@ def _later_repeats(files: Source, look: int, motion_px: NDArray[np.float64]) -> 
     for reach in (
         1,
         2 * start.REPEATS_APART,
-    ):  # a key frame takes its bytes, repeated or not: others tell where to look
+    ):  # a repeated key frame is as large as any other, so search the neighbourhood of small frames
         around = sorted({n for k in wanted for n in range(max(k - reach, look), k + reach + 1) if n < len(size)})
         found = start.find_repeats(_differences(files, around, len(size)), motion_px) if around else ()
         wanted = list(found)
@@ -283,8 +283,8 @@ def _stall_note(stalls: tuple[tuple[int, int], ...], repeats: tuple[int, ...]) -
     runs = ", ".join(f"{first}–{last}" for first, last in stalls[:8]) + (" …" if len(stalls) > 8 else "")
     seen = f"; frames {', '.join(map(str, repeats))} repeat their predecessor" if repeats else ""
     text = (
-        f"the encoder stalled: frames {runs} may show pictures later than their stamps and are left out, unless "
-        f"tracked points tell when they were taken{seen}"
+        f"the encoder stalled: frames {runs} may show later content than their timestamps and are skipped, unless "
+        f"tracked points determine when they were taken{seen}"
     )
     return Note("warning", "encoder-stall", text)
 
@@ -293,11 +293,11 @@ def _startup_note(began: start.Startup) -> Note:
     seen = []
     if began.unix_lag_s and began.unix_lag_s[0] > began.unix_lag_s[1]:
         first, steady = began.unix_lag_s
-        seen.append(f"capture to encoder (Unix columns) falls from {first * 1e3:.0f} to {steady * 1e3:.0f} ms")
+        seen.append(f"capture-to-encoder delay (Unix columns) falls from {first * 1e3:.0f} to {steady * 1e3:.0f} ms")
     if began.repeats:
-        seen.append(f"frames {', '.join(map(str, began.repeats))} repeat their predecessor while the phone turns")
+        seen.append(f"frames {', '.join(map(str, began.repeats))} repeat their predecessor while the phone rotates")
     text = (
-        f"the first {began.frames} frames show pictures later than their stamps, frame 0 by at least "
+        f"the first {began.frames} frames show later content than their timestamps, frame 0 by at least "
         f"{began.lag_s or 0.0:.2f} s: {'; '.join(seen)}"
     )
     return Note("warning", "content-lag", text)
@@ -350,7 +350,7 @@ def _frames(
 
 
 def _exposures_s(files: Source, joined: _Joined, time_s: NDArray[np.float64], notes: list[Note]) -> list[float | None]:
-    """Exposure of each frame; one that was not logged lies between its neighbours', which an automatic one follows."""
+    """Exposure of each frame; missing ones are interpolated, since automatic exposure changes gradually."""
     if files.metadata is None:
         return [None] * len(time_s)
     rows = joined.metadata_rows
@@ -361,7 +361,7 @@ def _exposures_s(files: Source, joined: _Joined, time_s: NDArray[np.float64], no
     missing = np.flatnonzero(~known)
     if len(missing):
         shown = ", ".join(map(str, missing[:12])) + (" …" if len(missing) > 12 else "")
-        text = f"{len(missing)} of {len(known)} frames have no exposure time, their neighbours' serve: {shown}"
+        text = f"{len(missing)} of {len(known)} frames have no exposure time; it is interpolated: {shown}"
         notes.append(Note("warning", "exposure-interpolated", text))
     return [float(value) for value in np.interp(time_s, time_s[known], logged[known])]
 
@@ -369,7 +369,7 @@ def _exposures_s(files: Source, joined: _Joined, time_s: NDArray[np.float64], no
 def _focal_scales(
     files: Source, joined: _Joined, time_s: NDArray[np.float64], notes: list[Note]
 ) -> NDArray[np.float64] | None:
-    """Focal length of each frame over the median, where it is logged and changes."""
+    """Focal length of each frame over the median; None if it is not logged or does not change."""
     if files.metadata is None:
         return None
     rows, half_diagonal = joined.metadata_rows, 0.5 * float(np.hypot(files.movie.width, files.movie.height))
@@ -377,7 +377,7 @@ def _focal_scales(
     if scales is not None:
         text = (
             f"the focal length in {files.names.metadata} changes from {scales.min() - 1:+.2%} to "
-            f"{scales.max() - 1:+.2%} of its median (the lens focuses): it is followed frame by frame"
+            f"{scales.max() - 1:+.2%} of its median (the lens refocuses): it is followed frame by frame"
         )
         notes.append(Note("info", "focal-varies", text))
     return scales
@@ -399,32 +399,32 @@ def _note_imu(imu: ImuSamples, gaps: tuple[tuple[float, float], ...], notes: lis
         notes.append(Note("info", "no-accelerometer", "no accelerometer values: camera velocity cannot be estimated"))
     peak = float(np.abs(imu.gyro_rad_s).max())
     if peak > LARGE_RATE_RAD_S:
-        text = f"turning rates up to {peak:.0f} rad/s, beyond what phones measure: are they in degrees?"
+        text = f"angular rates of up to {peak:.0f} rad/s exceed the range of phone gyroscopes: are they in degrees?"
         notes.append(Note("warning", "gyro-large", text))
 
 
 def _note_accelerometer(imu: ImuSamples, notes: list[Note]) -> None:
-    """Gravity is most of what a phone's accelerometer reads: without it the values are of another kind or unit."""
+    """Check the size of gravity, most of what a phone's accelerometer reads, to detect another quantity or unit."""
     typical = float(np.nanmedian(np.linalg.norm(imu.accel_m_s2, axis=1)))
     if not PLAUSIBLE_ACCEL_M_S2[0] <= typical <= PLAUSIBLE_ACCEL_M_S2[1]:
         text = (
-            f"the accelerometer reads {typical:.2g} m/s^2 in the median, gravity alone is 9.8: is it in g, without "
-            "gravity, or are its columns swapped with the gyroscope's?"
+            f"the accelerometer's median magnitude is {typical:.2g} m/s^2, but gravity alone is 9.8: is it in g, "
+            "without gravity, or are its columns swapped with the gyroscope's?"
         )
         notes.append(Note("warning", "accel-implausible", text))
 
 
 def _note_frames(frames: tuple[Frame, ...], notes: list[Note]) -> None:
-    """Say which frames the IMU does not cover. Raises ImuError if it covers none."""
+    """Note the frames that the IMU data do not cover. Raises ImuError if they cover none."""
     outside = [frame.index for frame in frames if {NO_IMU, IMU_GAP} & set(frame.skip_codes)]
     if len(outside) == len(frames):
         raise ImuError(
-            f"none of the {len(frames)} frames lies inside the IMU's time: frame {outside[0]} {frames[0].skip_reason}",
+            f"none of the {len(frames)} frames is covered by IMU data: frame {outside[0]} {frames[0].skip_reason}",
             hint="the gyroscope was not logged while the camera ran; see `virest inspect`",
         )
     if outside:
         shown = ", ".join(map(str, outside[:12])) + (" …" if len(outside) > 12 else "")
-        text = f"{len(outside)} of {len(frames)} frames are not covered by the IMU and left out: {shown}"
+        text = f"{len(outside)} of {len(frames)} frames are not covered by IMU data and are skipped: {shown}"
         notes.append(Note("warning", "frames-without-imu", text))
 
 

@@ -1,13 +1,13 @@
-"""Gyroflow's text log beside a movie: a header of ``key,value`` lines, then rows of whole counts and their scales.
+"""Gyroflow's text log beside a movie: a header of ``key,value`` lines, then rows of integer counts to be scaled.
 
     GYROFLOW IMU LOG          or CAMERA IMU LOG
-    orientation,YxZ           which column is Gyroflow's X, Y, Z; a small letter: with the other sign
-    tscale,0.001              seconds a count; gscale: rad/s; ascale: g
+    orientation,YxZ           which column is Gyroflow's X, Y, Z; lower case: sign reversed
+    tscale,0.001              seconds per count; gscale: rad/s; ascale: g
     frame_readout_time,15.23  ms; frame_readout_direction 0 … 3: down, up, right, left
     t,gx,gy,gz[,ax,ay,az[,mx,my,mz]]
 
-Gyroflow's axes are X up, Y left, Z back, seen by the camera that films: the device axes of a phone held in landscape.
-The log's clock starts with the movie, within what a recorder needs to begin, so the time offset is left to be found.
+Gyroflow's axes are X up, Y left, Z back, as seen from the camera: the device axes of a phone held in landscape.
+The log's clock starts with the movie only to within the recorder's start-up time, so the time offset is unknown.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ GCSV = ".gcsv"
 FIRST_LINES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
 G_M_S2 = 9.80665
 SCALES = {"tscale": 0.001, "gscale": 1.0, "ascale": 1.0}
-"""And what Gyroflow takes where the header has none."""
+"""Scales by key, with Gyroflow's defaults."""
 DIRECTIONS = {
     **dict.fromkeys(("0", "toptobottom"), "top_to_bottom"),
     **dict.fromkeys(("1", "180", "bottomtotop"), "bottom_to_top"),
@@ -42,7 +42,7 @@ DIRECTIONS = {
 
 
 def read_gyroflow(folder: Path, notes: list[Note]) -> Source:
-    """Read a .gcsv and the movie that it belongs to. Raises CaptureError for what is missing or cannot be used."""
+    """Read a .gcsv and the movie that it belongs to. Raises CaptureError for missing or unusable files."""
     path = _find_log(folder)
     header = read_header(path)
     gyro = read_log(path, header)
@@ -70,15 +70,15 @@ def film_profile(movie: MovieIndex, device: str, readout_s: float | None, direct
 
 
 def note_unknown_exposure(name: str, notes: list[Note]) -> None:
-    """Say what such a recording never holds."""
-    text = f"{name} holds no exposure times and no focal length: no deblurring unless a profile and stamps have them"
+    """Note that such a recording never holds exposure times or a focal length."""
+    text = f"{name} holds no exposure times and no focal length: no deblurring unless a profile and stamps give them"
     notes.append(Note("warning", "exposure-unknown", text))
 
 
 def _note_mirror(header: dict[str, str], path: Path, notes: list[Note]) -> None:
     letters = header.get("orientation", "XYZ")
     if np.linalg.det(orientation_matrix(letters, label(path))) < 0:
-        text = f"{path.name}: orientation {letters} is a mirror image: right only for a logger with left-handed axes"
+        text = f"{path.name}: orientation {letters} is a reflection: right only for a logger with left-handed axes"
         notes.append(Note("warning", "mirrored-axes", text))
 
 
@@ -91,23 +91,23 @@ def _find_log(folder: Path) -> Path:
 
 
 def read_header(path: Path) -> dict[str, str]:
-    """The header's keys, in small letters. Raises ImuError where it is no such log."""
+    """The header's values by lower-case key. Raises ImuError if it is not such a log."""
     scan = scan_text(path, ImuError, "copy the log that lies beside the movie")
     lines = [line.strip() for line in scan.head.splitlines()]
     if not lines or lines[0] not in FIRST_LINES:
         text = f"{label(path)}: begins with {lines[0][:40] if lines else ''!r}, not {FIRST_LINES[0]}"
-        raise ImuError(text, hint="is it a log of Gyroflow's kind?")
+        raise ImuError(text, hint="is it a Gyroflow log?")
     header: dict[str, str] = {}
     for line in lines[1:]:
         key, _, value = line.partition(",")
         if key.strip().lower() in ("t", "time"):
             return header
         header[key.strip().lower()] = value.strip()
-    raise ImuError(f"{label(path)}: has no line t,gx,gy,gz", hint="the log was cut; copy it again")
+    raise ImuError(f"{label(path)}: has no line t,gx,gy,gz", hint="the log is truncated; copy it again")
 
 
 def read_log(path: Path, header: dict[str, str]) -> GyroTable:
-    """Samples in Gyroflow's axes, rad/s and m/s², on the clock that the first frame's ORIGIN_NS stands for."""
+    """Samples in Gyroflow's axes, rad/s and m/s², on a clock that reads ORIGIN_NS at the first frame."""
     step_s, per_rad_s, per_g = (_scale(header, key, usual, path) for key, usual in SCALES.items())
     rows = read_rows(path, range(1, 7), times=scaled_times_ns(step_s), required=3)
     turn = orientation_matrix(header.get("orientation", "XYZ"), label(path))
@@ -120,8 +120,8 @@ def read_log(path: Path, header: dict[str, str]) -> GyroTable:
 def orientation_matrix(letters: str, name: str = "orientation") -> NDArray[np.float64]:
     """(3, 3) that takes logged columns to Gyroflow's X, Y, Z: letter i names the column that is axis i.
 
-    A mirror image is accepted as Gyroflow does: there are loggers with left-handed axes.  Raises ImuError for letters
-    that are no axes.
+    A reflection is accepted, as in Gyroflow: some loggers have left-handed axes.  Raises ImuError for letters that do
+    not name the three axes.
     """
     text = letters.strip()
     matrix = np.zeros((3, 3))
@@ -157,5 +157,5 @@ def _readout_s(header: dict[str, str], path: Path) -> float | None:
 
 
 def _direction(header: dict[str, str]) -> str:
-    said = header.get("frame_readout_direction", "0").lower().replace("_", "").replace(" ", "")
-    return DIRECTIONS.get(said, "top_to_bottom")
+    word = header.get("frame_readout_direction", "0").lower().replace("_", "").replace(" ", "")
+    return DIRECTIONS.get(word, "top_to_bottom")

@@ -17,7 +17,7 @@ class ImuSamples:
     gyro_rad_s: NDArray[np.float64]
     """(n, 3) angular rate."""
     accel_m_s2: NDArray[np.float64]
-    """(n, 3) specific force, +9.8 upwards at rest; NaN where there is no accelerometer."""
+    """(n, 3) specific force, +9.8 upwards at rest; NaN without an accelerometer."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -28,7 +28,7 @@ class ImuSamples:
         return bool(np.isfinite(self.accel_m_s2).all(axis=1).any())
 
     def between(self, start_s: float, end_s: float, margin_samples: int = 4) -> ImuSamples:
-        """The samples that cover [start_s, end_s], with a few more on both sides."""
+        """The samples that cover [start_s, end_s], plus a margin on both sides."""
         first = max(int(np.searchsorted(self.time_s, start_s)) - margin_samples, 0)
         last = min(int(np.searchsorted(self.time_s, end_s)) + margin_samples, len(self.time_s))
         return ImuSamples(self.time_s[first:last], self.gyro_rad_s[first:last], self.accel_m_s2[first:last])

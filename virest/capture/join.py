@@ -1,4 +1,4 @@
-"""Join what was recorded apart, movie frames, stamps, metadata and inertial samples, by time and never by index."""
+"""Join movie frames, timestamps, metadata and inertial samples by time, never by index."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from virest.errors import ClockError
 
 TICK_90KHZ_NS = 1e9 / 90_000
 STAMP_STEP_NS = 1000
-"""Stamps are cut to whole microseconds."""
+"""Timestamps are truncated to whole microseconds."""
 COARSEST_TICK_NS = 1e6
-"""A movie clock coarser than this says nothing about which stamp is meant."""
+"""A movie clock coarser than this cannot identify a timestamp."""
 MOST_DRIFT = 1e-3
-"""Part by which a movie's nominal frame rate may differ from the sensor's; crystals differ by a twentieth of it."""
+"""Largest relative difference of a movie's nominal frame rate from the sensor's; crystals differ by 1/20 of it."""
 MIN_MATCHED_FRACTION = 0.8
-"""Below this share of frames with a stamp, movie and stamps are taken as different recordings."""
+"""If fewer of the frames match a timestamp, movie and timestamps come from different recordings."""
 MAX_CANDIDATES = 20_000
 SCORED_FRAMES = 500
 GAP_PERIODS = 5.0
 GAP_FLOOR_S = 0.030
-"""Hand motion has little power above 10 Hz: interpolation still follows it over 30 ms, a third of that period."""
+"""Hand motion has little power above 10 Hz, so interpolation still follows it over 30 ms, a third of that period."""
 
 Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Which stamp belongs to which frame."""
+    """Which timestamp belongs to which frame."""
 
     rows: Int64
-    """(n,) row of the stamps for each movie frame, −1 for none."""
+    """(n,) row of the timestamps for each movie frame, −1 for none."""
     offset_ns: int
-    """Stamp of the movie's PTS 0."""
+    """Timestamp of the movie's PTS 0."""
     slid: bool
     """False: row i is frame i, as the logger writes it."""
     rivals: int = 0
-    """Other offsets that fit as well."""
+    """Number of other offsets that fit equally well."""
     drift_ns: float = 0.0
-    """How far PTS and stamps part slowly from first to last frame, where they do."""
+    """Slow drift between PTS and timestamps from the first to the last frame; 0: none."""
 
 
 def pts_tolerance_ns(tick_ns: float) -> float:
-    """How far PTS and stamps may differ: a tick of 90 kHz, or of the movie's own coarser clock, and a microsecond."""
+    """Largest difference of PTS and timestamps: a tick of 90 kHz, or of a coarser movie clock, plus 1 µs."""
     return max(TICK_90KHZ_NS, min(tick_ns, COARSEST_TICK_NS)) + STAMP_STEP_NS
 
 
@@ -61,7 +61,7 @@ def match_times(wanted_ns: Int64, rows_ns: Int64, tolerance_ns: float) -> Int64:
 
 
 def floor_us(times_ns: Int64) -> Int64:
-    """Nanoseconds cut to whole microseconds, as the encoder's time stamps are."""
+    """Nanoseconds truncated to whole microseconds, like the encoder's timestamps."""
     return times_ns // STAMP_STEP_NS * STAMP_STEP_NS
 
 
@@ -73,10 +73,10 @@ def join_metadata(stamps_ns: Int64, metadata_ns: Int64) -> Int64:
 def align_frames(
     pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float, witness_ns: Int64 | None = None, what: str = "stamps"
 ) -> Alignment:
-    """Find the stamp of each movie frame: row by row if all agree, else the shift of PTS that matches most frames.
+    """Find the timestamp of each movie frame: row by row if all agree, else by the PTS shift that matches most frames.
 
-    pts_ns (n,) from 0, stamps_ns (m,), both rising.  ``witness_ns``: further times (metadata rows) that decide between
-    shifts that match as many stamps.  Raises ClockError if no shift finds stamps for MIN_MATCHED_FRACTION of frames.
+    pts_ns (n,) from 0, stamps_ns (m,), both rising.  ``witness_ns``: further times (metadata rows) that break ties
+    between shifts.  Raises ClockError if no shift matches MIN_MATCHED_FRACTION of the frames.
     """
     if len(pts_ns) == len(stamps_ns):
         difference = stamps_ns - stamps_ns[0] - pts_ns
@@ -97,9 +97,9 @@ def align_frames(
 
 
 def _drifts_slowly(difference_ns: Int64, pts_ns: Int64, tolerance_ns: float) -> bool:
-    """Whether stamps part from PTS smoothly: no step, and no more than another clock's rate makes of it.
+    """Whether timestamps and PTS drift apart smoothly: no step, and no faster than MOST_DRIFT.
 
-    A recorder that writes its nominal rate into the movie does so; a lost frame is a step of a period.
+    They do if the recorder writes its nominal frame rate into the movie; a lost frame is a step of one period.
     """
     if len(pts_ns) < 3:
         return False
@@ -111,7 +111,7 @@ def _drifts_slowly(difference_ns: Int64, pts_ns: Int64, tolerance_ns: float) -> 
 
 
 def _best_offsets(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float) -> tuple[Int64, Int64]:
-    """Distinct shifts, smallest first, that match the most frames, and how many that is (the same for all)."""
+    """Distinct shifts, smallest first, that match the most frames, and the number of matches (the same for all)."""
     if not len(stamps_ns) or not len(pts_ns):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     anchors = sorted({0, len(pts_ns) // 2, len(pts_ns) - 1})
@@ -132,10 +132,10 @@ def _misfit(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float, matched: int, 
         difference = np.abs(stamps_ns[:common] - stamps_ns[0] - pts_ns[:common])
         first = int(np.argmax(difference > tolerance_ns))
         text += (
-            f"; PTS and {what} part at frame {first} by {difference[first] / 1e3:.1f} µs"
-            f" (allowed {tolerance_ns / 1e3:.1f}), at most by {difference.max() / 1e6:.3f} ms"
+            f"; PTS and {what} first differ at frame {first}, by {difference[first] / 1e3:.1f} µs"
+            f" (tolerance {tolerance_ns / 1e3:.1f} µs), at most by {difference.max() / 1e6:.3f} ms"
         )
-    hint = "movie and stamps are of different recordings, or the movie was re-encoded"
+    hint = "movie and timestamps come from different recordings, or the movie was re-encoded"
     return ClockError(text, hint=hint, matched=matched)
 
 
@@ -143,7 +143,7 @@ def _misfit(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float, matched: int, 
 
 
 def overlap_s(camera_ns: Int64, imu_ns: Int64, shift_ns: int = 0) -> float:
-    """Seconds that both clocks' spans share once ``shift_ns`` is added to the camera's; negative: they lie apart."""
+    """Overlap of both clocks' spans, s, once ``shift_ns`` is added to the camera's; negative: the gap between them."""
     start = max(int(camera_ns[0]) + shift_ns, int(imu_ns[0]))
     return (min(int(camera_ns[-1]) + shift_ns, int(imu_ns[-1])) - start) / 1e9
 
@@ -151,24 +151,24 @@ def overlap_s(camera_ns: Int64, imu_ns: Int64, shift_ns: int = 0) -> float:
 def clock_shift_ns(
     camera_ns: Int64, imu_ns: Int64, epochs: EdgeEpochs, name: str = "gyro_accel.csv"
 ) -> tuple[int, str]:
-    """What to add to camera stamps to bring them to the IMU's clock, and a remark ('' if all is as it should be).
+    """Shift, ns, that brings camera timestamps to the IMU's clock, and a remark ('' if there is nothing to remark).
 
-    REALTIME: nothing.  UNKNOWN: the mean difference of edge_epochs.  No difference known: nothing, if the spans share
-    time.  Raises ClockError with both spans if they lie apart.
+    REALTIME: 0.  UNKNOWN: the mean difference of edge_epochs.  No difference known: 0 if the spans overlap.
+    Raises ClockError with both spans if they do not overlap.
     """
     known = epochs.mean_difference_ns if epochs.source == "UNKNOWN" else None
     shift, remark = known or 0, ""
     if known is None and epochs.source == "UNKNOWN":
-        remark = "edge_epochs.txt has no row of differences; the clocks share time, so stamps are taken as they are"
+        remark = "edge_epochs.txt lists no clock difference; the clocks overlap, so timestamps are not shifted"
     if overlap_s(camera_ns, imu_ns, shift) >= 0:
         return shift, remark
     if known is not None and overlap_s(camera_ns, imu_ns) >= 0:
-        return 0, f"edge_epochs.txt asks for {shift / 1e9:.3f} s, but only unshifted stamps meet the IMU; not applied"
+        return 0, f"edge_epochs.txt gives {shift / 1e9:.3f} s, but only unshifted timestamps meet the IMU; not applied"
     camera = f"{(int(camera_ns[0]) + shift) / 1e9:.3f}–{(int(camera_ns[-1]) + shift) / 1e9:.3f} s"
     imu = f"{int(imu_ns[0]) / 1e9:.3f}–{int(imu_ns[-1]) / 1e9:.3f} s"
     raise ClockError(
         f"{name} covers {imu}, the frames {camera}: {-overlap_s(camera_ns, imu_ns, shift):.3f} s apart",
-        hint="the files are of different sessions, or edge_epochs.txt is missing or wrong",
+        hint="the files come from different sessions, or edge_epochs.txt is missing or wrong",
         source=epochs.source,
     )
 
@@ -195,10 +195,10 @@ def outside_reason(
     gaps_s: tuple[tuple[float, float], ...],
     period_s: float | None = None,
 ) -> tuple[str, str] | None:
-    """(code, text) of why the IMU does not cover [start_s, end_s], None if it does.
+    """(code, text) of the reason why the IMU data do not cover [start_s, end_s], None if they do.
 
-    One period beyond either end of the IMU still counts as covered: the last rate is held that long.  period_s: of the
-    samples, where it is known already.
+    One period beyond either end counts as covered: the last rate is held that long.  period_s: the median sampling
+    period, if already known.
     """
     period = median_period_s(time_s) if period_s is None else period_s
     if start_s < time_s[0] - period:

@@ -1,9 +1,8 @@
-"""Where files lie: a folder of this machine, or an address such as ``s3://bucket/trips/one`` that fsspec opens.
+"""Where files are: a local folder, or a URL such as ``s3://bucket/trips/one`` that fsspec opens.
 
-`locate` is the one door.  It gives a plain `Path` for what is local, ``file://`` included, so that local files are
-read as ever.  For the rest it gives a `RemotePath`, which has those methods of `Path` that this program uses.  An
-object store knows no folders: one without files is not there, and making one is nothing to do.  A file is written by
-one request, so it appears whole or not at all.
+`locate` is the only entry point.  It returns a plain `Path` for local files, ``file://`` included, and a `RemotePath`
+for the rest, which has the methods of `Path` that this program uses.  An object store has no folders: a folder without
+files does not exist, and mkdir does nothing.  A file is written by one request, so it appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.\-]*)://(.*)", re.DOTALL)
 HERE = ("file", "local")
 EXTRA = "pip install 'virest[cluster]'"
 BLOCK_BYTES = 1 << 18
-"""What one request for a movie's bytes brings: some eight frames of a phone's movie."""
+"""Bytes of a movie that one request fetches: about eight frames of a phone's movie."""
 KEPT_BLOCKS = 32
-"""Blocks of a movie that stay at hand, for a reader that goes to and fro between the table of contents and the data."""
+"""Blocks of a movie that are cached, because its reader jumps between the index and the data."""
 STREAM_BYTES = 1 << 23
-"""What one request brings where a file is read from end to end."""
+"""Bytes that one request fetches where a file is read from end to end."""
 AT_ONCE = 64
-"""Small files fetched together."""
+"""Small files fetched concurrently."""
 
 
 def locate(text: str | os.PathLike[str]) -> Path:
-    """The place that a path or an address names; to the reader of types every place is a `Path`.
+    """The location that a path or a URL names; its static type is always `Path`.
 
-    Raises SettingsError for an address that no installed package opens.
+    Raises SettingsError for a URL that no installed package opens.
     """
     if isinstance(text, RemotePath | Path):
         return cast(Path, text)
@@ -52,13 +51,13 @@ def locate(text: str | os.PathLike[str]) -> Path:
     _file_system(protocol)
     if not rest.strip("/") or {".", ".."} & set(rest.split("/")):
         raise SettingsError(
-            f"{text}: is not a full address", hint=f"write {protocol}://BUCKET/FOLDER, without . and .."
+            f"{text}: is not a complete URL", hint=f"write {protocol}://BUCKET/FOLDER, without . and .."
         )
     return cast(Path, RemotePath(protocol, PurePosixPath("/", rest).as_posix().lstrip("/")))
 
 
 def unreachable(path: RemotePath, fault: OSError) -> VideoError:
-    """The error of an address that gives no bytes: no damage of the recording, so no frame is to be called failed."""
+    """The error of an unreachable URL: the recording may be sound, so no frame counts as failed."""
     text = f"{path}: cannot be reached ({fault.strerror or fault})"
     return VideoError(text, hint="check the network and the store, then continue with --resume", unreachable=True)
 
@@ -69,13 +68,13 @@ def is_unreachable(error: BaseException) -> bool:
 
 
 def is_remote(path: os.PathLike[str]) -> bool:
-    """Whether a place lies behind an address."""
+    """Whether a location is a URL."""
     return isinstance(path, RemotePath)
 
 
 @lru_cache
 def _file_system(protocol: str) -> Any:
-    """What opens addresses of a kind; nothing that it lists is kept, since others write there too."""
+    """The fsspec file system of a protocol; listings are not cached, since others write there too."""
     try:
         import fsspec
 
@@ -84,20 +83,20 @@ def _file_system(protocol: str) -> Any:
         text = f"{protocol}:// needs a package that is not installed ({' '.join(str(fault).split())[:80]})"
         raise SettingsError(text, hint=EXTRA) from None
     except ValueError:
-        text = f"{protocol}://: no such kind of address"
-        raise SettingsError(text, hint="s3://, gs:// and file:// are known") from None
+        text = f"{protocol}://: unknown protocol"
+        raise SettingsError(text, hint="use s3://, gs:// or file://") from None
 
 
 @contextmanager
 def _plain_errors(path: RemotePath) -> Iterator[None]:
-    """Whatever a store's package raises becomes an OSError with its number and one line of text."""
+    """Turn whatever a store's package raises into an OSError with a number and one line of text."""
     try:
         yield
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path)) from None
     except PermissionError as fault:
         raise PermissionError(errno.EACCES, _line(fault) or "access denied", str(path)) from None
-    except Exception as fault:  # botocore, aiohttp and google each have a tree of their own
+    except Exception as fault:  # botocore, aiohttp and google each have their own exceptions
         raise OSError(errno.EIO, f"{type(fault).__name__}: {_line(fault)}", str(path)) from None
 
 
@@ -107,17 +106,17 @@ def _line(fault: BaseException) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RemotePath:
-    """A place behind an address; plain data, so that it travels to a worker."""
+    """A location behind a URL; plain data, so that it can be sent to a worker."""
 
     protocol: str
     key: str
-    """Bucket and names, parted by /, none of them empty."""
+    """Bucket and names, separated by /, none of them empty."""
 
     def __str__(self) -> str:
         return f"{self.protocol}://{self.key}"
 
     def __fspath__(self) -> str:
-        """The address, which pandas opens by itself."""
+        """The URL, which pandas opens by itself."""
         return str(self)
 
     def __truediv__(self, name: str | os.PathLike[str]) -> RemotePath:
@@ -145,19 +144,19 @@ class RemotePath:
 
     @property
     def parent(self) -> RemotePath:
-        """The folder; a bucket is its own."""
+        """The folder; a bucket is its own parent."""
         return RemotePath(self.protocol, self.key.rpartition("/")[0] or self.key)
 
     def with_name(self, name: str) -> RemotePath:
-        """A neighbour."""
+        """A sibling."""
         return self.parent / name
 
     def absolute(self) -> RemotePath:
-        """Itself: an address is never relative."""
+        """Itself: a URL is never relative."""
         return self
 
     def resolve(self, *, strict: bool = False) -> RemotePath:
-        """Itself; with ``strict`` it has to be there."""
+        """Itself; with ``strict`` it must exist."""
         if strict:
             self.stat()
         return self
@@ -184,15 +183,15 @@ class RemotePath:
             return False
 
     def exists(self) -> bool:
-        """Whether a file, or a folder with files, is there."""
+        """Whether it is a file, or a folder with files."""
         return self.is_file() or self.is_dir()
 
     def is_file(self) -> bool:
-        """Whether a file is there."""
+        """Whether it is a file."""
         return self._has_mode(stat.S_IFREG)
 
     def is_dir(self) -> bool:
-        """Whether files lie below."""
+        """Whether it is a folder with files."""
         return self._has_mode(stat.S_IFDIR)
 
     def is_symlink(self) -> bool:
@@ -200,15 +199,15 @@ class RemotePath:
         return False
 
     def iterdir(self) -> Iterator[RemotePath]:
-        """What lies directly below; nothing, where nothing is there."""
+        """The direct children; none if there is no such folder."""
         try:
             with _plain_errors(self):
                 found = self._store.ls(self.key, detail=False)
         except FileNotFoundError:
             return
         for name in sorted(found):
-            if (place := str(name).strip("/")) != self.key:
-                yield self / PurePosixPath(place).name
+            if (key := str(name).strip("/")) != self.key:
+                yield self / PurePosixPath(key).name
 
     # ── reading ──────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -219,7 +218,7 @@ class RemotePath:
         return _Stream(self, block_size=STREAM_BYTES, cache_type="readahead")
 
     def open_at_random(self) -> io.RawIOBase:
-        """A stream for a reader that jumps: a few blocks are kept, and no more is asked for than is read."""
+        """A stream for random access: a few blocks are cached, and nothing beyond what is read is fetched."""
         blocks = {"maxblocks": KEPT_BLOCKS}
         return _Stream(self, block_size=BLOCK_BYTES, cache_type="blockcache", cache_options=blocks)
 
@@ -235,15 +234,15 @@ class RemotePath:
     # ── writing ──────────────────────────────────────────────────────────────────────────────────────────────────
 
     def write_whole(self, data: bytes) -> None:
-        """Put a file there by one request, over what was there."""
+        """Write the file by one request, replacing what was there."""
         with _plain_errors(self):
             self._store.pipe_file(self.key, data)
 
     def mkdir(self, *, parents: bool = False, exist_ok: bool = False) -> None:
-        """Nothing to do: a folder is there as soon as a file is."""
+        """Does nothing: a folder exists as soon as a file in it does."""
 
     def rmdir(self) -> None:
-        """Nothing to do: a folder goes with its last file."""
+        """Does nothing: a folder disappears with its last file."""
 
     def unlink(self, *, missing_ok: bool = False) -> None:
         """Remove the file."""
@@ -256,7 +255,7 @@ class RemotePath:
 
 
 class _Stream(io.RawIOBase):
-    """A store's stream, whose faults are OSErrors."""
+    """A store's stream that raises only OSError."""
 
     def __init__(self, path: RemotePath, **options: Any) -> None:
         super().__init__()
@@ -293,7 +292,7 @@ class _Stream(io.RawIOBase):
 
 
 def read_each(paths: Iterable[Path]) -> Iterator[bytes]:
-    """The files' contents, in order; of those behind an address some are fetched together."""
+    """The files' contents, in order; remote files are fetched AT_ONCE at a time."""
     waiting = iter(paths)
     while batch := list(islice(waiting, AT_ONCE)):
         if is_remote(batch[0]):
@@ -303,7 +302,7 @@ def read_each(paths: Iterable[Path]) -> Iterator[bytes]:
 
 
 def _fetch(paths: list[RemotePath]) -> Iterator[bytes]:
-    if len(paths) == 1:  # for one, fsspec gives the bytes themselves
+    if len(paths) == 1:  # for a single path, fsspec returns bytes instead of a dict
         yield paths[0].read_bytes()
         return
     with _plain_errors(paths[0]):
@@ -312,7 +311,7 @@ def _fetch(paths: list[RemotePath]) -> Iterator[bytes]:
 
 
 def remove_files(paths: Sequence[Path]) -> None:
-    """Remove files, those behind an address together; one that is gone already is as good."""
+    """Remove files, remote ones together; files that are already gone are ignored."""
     remote = [cast(RemotePath, path) for path in paths if is_remote(path)]
     for path in paths:
         if not is_remote(path):

@@ -1,7 +1,7 @@
-"""The focal length frame by frame, where a recorder logs one that changes: a lens that focuses breathes.
+"""The focal length of each frame, if the recorder logs a changing one: a lens that refocuses breathes.
 
-Android's logger works it out from the focus distance, iOS has it from the system.  What counts is each frame's length
-over the recording's median: it holds whatever pixels the logger counts in, and whatever profile states the median.
+Android's logger computes it from the focus distance, iOS reports it.  Only the ratio to the recording's median is used:
+it depends neither on the pixels that the logger counts in nor on the profile that states the median.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 VISIBLE_PX = 0.1
-"""Less at the picture's corner is below what tracked points tell."""
+"""Smaller displacements of the picture's corner are below the tracking noise."""
 ONE_LENS = (0.5, 2.0)
-"""Of the median; beyond it is a fault of the log."""
+"""Plausible range relative to the median; values outside it are logging errors."""
 MOST_DECIMALS = 9
 
 
 def focal_scales(logged_px: Array, time_s: Array, half_diagonal_px: float) -> Array | None:
-    """(n,) focal length of each frame over the median; None where none is logged or no change is to be seen.
+    """(n,) focal length of each frame over the median; None if none is logged or it does not visibly change.
 
-    logged_px: (n,), NaN: not logged; such a frame's lies between its neighbours'.  A change counts beyond two steps of
-    the numbers as they are written, and where it moves the picture's corner by VISIBLE_PX.
+    logged_px: (n,), NaN: not logged, which is interpolated.  A change counts if it exceeds two steps of the numbers as
+    written and moves the picture's corner by VISIBLE_PX.
     """
     known = np.isfinite(logged_px)
     if known.sum() < 2:
@@ -35,7 +35,7 @@ def focal_scales(logged_px: Array, time_s: Array, half_diagonal_px: float) -> Ar
 
 
 def written_step(values: Array) -> float:
-    """The step of numbers written with a number of decimals, 1 for whole ones."""
+    """The step of numbers written with a fixed number of decimals, 1 for integers."""
     distinct = np.unique(values)
     for decimals in range(MOST_DECIMALS):
         if np.allclose(distinct, np.round(distinct, decimals), rtol=0.0, atol=1e-9):
@@ -44,7 +44,7 @@ def written_step(values: Array) -> float:
 
 
 def corners(time_s: Array, values: Array) -> tuple[Array, Array]:
-    """The points of a line over time between which it is straight: where it rests, two stand for many."""
+    """The vertices of a line over time; of a constant stretch only its two ends are kept."""
     if len(values) < 3:
         return time_s, values
     rests = (values[1:-1] == values[:-2]) & (values[1:-1] == values[2:])

@@ -1,11 +1,11 @@
-"""Readers for the files of MARSLogger on Android, every variant, told apart by the header and never by the version.
+"""Readers for the files of MARSLogger on Android; variants are distinguished by the header, never by the version.
 
 gyro_accel.csv        7, 8 or 11 columns, or the build that adds the position (8 fields before a fix, 12 after)
 movie_metadata.csv    11 or 12 columns, two pre-release spellings, the fork with OIS for AF mode
 frame_timestamps.txt  1 or 2 columns; pre-release: no header, microseconds
 edge_epochs.txt       the camera's clock against the IMU's
 
-Times are whole nanoseconds and stay int64.  Each reader returns its table and, by reason, the rows that it dropped.
+Times are integer nanoseconds and stay int64.  Each reader returns its table and counts the dropped rows by reason.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MICROSECOND_GAP_LIMIT = 1_000_000
-"""Stamps without a header: a median step below this is in microseconds (no camera runs at 1000 frames/s here)."""
+"""Timestamps without a header are in microseconds if their median step is below this (1000 frames/s in ns)."""
 
 CLOCK_STEP_NS = 1_000_000_000
-"""A clock that counts through zero has its next positive time within this."""
+"""A clock that passes through zero has its next positive time within this."""
 
 GYRO, METADATA, STAMPS, POSITION, IOS_METADATA, IOS_ARKIT, NO_SENSOR, BARE_STAMPS, UNKNOWN = (
     "gyro_accel.csv",
@@ -65,13 +65,13 @@ GYRO, METADATA, STAMPS, POSITION, IOS_METADATA, IOS_ARKIT, NO_SENSOR, BARE_STAMP
 
 
 def normalised_columns(line: str) -> tuple[str, ...]:
-    """Column names without spaces and capitals, units in one spelling."""
+    """Column names in lower case without spaces, units in one spelling."""
     names = (re.sub(r"\s+", "", name).strip('"').lower() for name in line.strip().split(","))
     return tuple(name.replace("[ns]", "[nanosec]") for name in names)
 
 
 def identify(head: str) -> str:
-    """Which of the loggers' files begins like this."""
+    """Which of the loggers' files begins with this head."""
     line = next((text for text in head.splitlines() if text.strip()), "")
     names = set(normalised_columns(line))
     if "may not have a gyroscope" in head[:400] or "has gyroscope?" in head[:400].lower():
@@ -106,12 +106,12 @@ def _require_kind(scan: TextScan, path: Path, expected: str, error: type[Capture
         raise ClockError(f"{name}: columns are separated by {mark}, not commas", hint=EXCEL_HINT)
     if kind == NO_SENSOR:
         raise ImuError(
-            f"{name}: the logger says that the phone has no gyroscope or no accelerometer",
-            hint="without a gyroscope nothing can be estimated; record with another phone",
+            f"{name}: the logger reports that the phone has no gyroscope or no accelerometer",
+            hint="nothing can be estimated without a gyroscope; record with another phone",
         )
     shown = line.strip()[:60]
     if kind == UNKNOWN:
-        raise error(f"{name}: its first line '{shown}' is no header of {expected}", hint="is it the logger's file?")
+        raise error(f"{name}: its first line '{shown}' is not a header of {expected}", hint="is it the logger's file?")
     raise error(f"{name}: holds the columns of {kind}, not of {expected}", hint="were two files swapped?")
 
 
@@ -121,7 +121,7 @@ def _require_kind(scan: TextScan, path: Path, expected: str, error: type[Capture
 def _split_rows(
     chunk: pd.DataFrame, first_column: str, min_fields: int, path: Path, dropped: Counter[str]
 ) -> tuple[pd.DataFrame, Int64]:
-    """Rows that begin with a whole time, and those times; refuses times that lost their precision."""
+    """Rows that begin with an integer time, and those times. Raises ClockError for times that lost their precision."""
     text = chunk[0].str.strip()
     lowered = text.str.lower().str.replace(r"\s+", "", regex=True).str.replace("[ns]", "[nanosec]", regex=False)
     is_header = (lowered == first_column).to_numpy()
@@ -131,7 +131,7 @@ def _split_rows(
     damaged = text.str.fullmatch(DAMAGED_TIME).to_numpy() | text.str.contains("\t", regex=False).to_numpy()
     if damaged.any():
         shown = "<tab>".join(" ".join(part.split()) for part in text[damaged].iloc[0][:40].split("\t"))
-        raise ClockError(f"{label(path)}: time '{shown}' is no whole number of nanoseconds", hint=EXCEL_HINT)
+        raise ClockError(f"{label(path)}: time '{shown}' is not a whole number of nanoseconds", hint=EXCEL_HINT)
     enough = (chunk[min_fields - 1] != "").to_numpy()
     times = np.zeros(len(chunk), np.int64)
     times[whole] = text[whole].astype("int64").to_numpy()
@@ -142,7 +142,7 @@ def _split_rows(
 
 
 def _count_rows(times: Int64, dropped: Counter[str]) -> int:
-    """Data rows of the file: those read and those dropped; its own header is neither."""
+    """Number of data rows, read and dropped, without the header."""
     dropped["header repeated"] = max(dropped["header repeated"] - 1, 0)
     return len(times) + sum(dropped.values())
 
@@ -150,8 +150,8 @@ def _count_rows(times: Int64, dropped: Counter[str]) -> int:
 def _keep_times(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.bool_]:
     """Mask of times that rise strictly.
 
-    A time of zero or below is none, a sensor's first word, unless the clock itself counts through zero: its next
-    positive time is then near.  Raises ClockError where most rows would go.
+    Times of zero or below are invalid first samples, unless the clock passes through zero: the next positive time is
+    then near.  Raises ClockError if most rows would be dropped.
     """
     low = times <= 0
     if low.any() and not low.all() and times[~low].min() - times[low].max() <= CLOCK_STEP_NS:
@@ -166,7 +166,7 @@ def _keep_times(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.b
 
 
 def read_gyro_accel(path: Path) -> GyroTable:
-    """Read gyro_accel.csv in any variant: the first seven fields mean the same in all.
+    """Read gyro_accel.csv in any variant: the first seven fields are the same in all.
 
     Raises ImuError (missing, empty, foreign, no gyroscope, no rows), ClockError (times without their nanoseconds).
     """
@@ -185,7 +185,7 @@ def read_gyro_accel(path: Path) -> GyroTable:
         last_is_good = len(table) > 0 and table.index[-1] == chunk.index[-1]
         times.append(time_ns)
         values.append(np.stack([numbers(table[column]) for column in range(1, 7)], axis=1))
-    dropped["cut or unreadable row"] += max(scan.lines - seen, 0)  # rows with too many fields never arrive
+    dropped["cut or unreadable row"] += max(scan.lines - seen, 0)  # pandas skips rows with too many fields
     time_ns, samples = np.concatenate(times), np.concatenate(values)
     rows = _count_rows(time_ns, dropped)
     twice = _written_twice(time_ns, samples)
@@ -193,14 +193,14 @@ def read_gyro_accel(path: Path) -> GyroTable:
     time_ns, samples = time_ns[~twice], samples[~twice]
     keep = _keep_times(time_ns, path, dropped)
     if last_is_good and not scan.ends_with_newline and len(keep) and keep[-1]:
-        keep[-1] = False  # its last number may be cut and still read as one
+        keep[-1] = False  # a truncated last number may still parse
         dropped["last line without its end"] += 1
     time_ns, samples = time_ns[keep], samples[keep]
     return make_gyro_table(path, time_ns, samples, rows, dict(+dropped))
 
 
 def _written_twice(time_ns: Int64, samples: Float64) -> NDArray[np.bool_]:
-    """Rows that say again what their predecessor says, time and all; equal times alone are lost precision."""
+    """Rows that repeat their predecessor, time included; equal times alone would be lost precision."""
     again = np.zeros(len(time_ns), bool)
     same = (samples[1:] == samples[:-1]) | (np.isnan(samples[1:]) & np.isnan(samples[:-1]))
     again[1:] = (np.diff(time_ns) == 0) & same.all(axis=1)

@@ -1,4 +1,4 @@
-"""A folder of MARSLogger on Android: which of its files there are, and what replaces those that are not."""
+"""A folder of MARSLogger on Android: which of its files exist, and what replaces missing ones."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _read_metadata(folder: Path, notes: list[Note]) -> MetadataTable | None:
 
 
 def _read_stamps(folder: Path, metadata: MetadataTable | None, notes: list[Note]) -> StampTable | None:
-    """The stamps; None (with a note) where they were never written and the metadata can stand in."""
+    """The timestamps; None, with a note, if they were never written and the metadata can replace them."""
     path, why = folder / STAMPS, ""
     if not is_present(path):
         why = "is missing"
@@ -61,6 +61,6 @@ def _read_stamps(folder: Path, metadata: MetadataTable | None, notes: list[Note]
     if metadata is None:
         text = f"{folder.name}/{STAMPS}: {why}, and there is no {METADATA}"
         raise ClockError(text, hint="frames have no times without either")
-    text = f"{STAMPS} {why} (written only at a clean Stop): PTS were slid over the rows of {METADATA} instead"
+    text = f"{STAMPS} {why} (written only at a clean Stop): PTS were aligned with the rows of {METADATA} instead"
     notes.append(Note("warning", "no-stamps", text))
     return None

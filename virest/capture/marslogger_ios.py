@@ -6,9 +6,9 @@ Objective-C app   movie_metadata.csv  Timestamp, fx, fy, cx, cy, exposure durati
 ARKit app         frames.csv          seconds of nine significant digits, intrinsics, image size
                   imu.csv             gravity and user acceleration in g, pointing down at rest; bias-free rates
 
-All times are the phone's host time (seconds since boot), so there is one clock.  Times that were printed too coarsely
-are made exact by the movie's own: its time stamps begin at the first row.  Pictures are stored as the sensor reads
-them, in landscape, and the movie's display rotation is not applied, so that the intrinsics hold.
+All times are the phone's host time (seconds since boot), so there is one clock.  Times printed too coarsely are
+refined by the movie's PTS, which begin at the first row.  Pictures are stored as the sensor reads them, in landscape,
+and the movie's display rotation is not applied, so that the intrinsics hold.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ from virest.errors import CaptureError, ImuError
 RAW_GYRO, ARKIT_FRAMES, ARKIT_IMU = "raw_accel_gyro.csv", "frames.csv", "imu.csv"
 G_M_S2 = 9.80665
 APP_G_M_S2 = 9.80
-"""What the Objective-C app multiplies g by."""
+"""The value of g in the Objective-C app."""
 KNOWN_FOCAL_PX = 1.5
-"""The app writes 1.00 for a focal length that it does not know, and 0.50 for the principal point."""
+"""Smallest known focal length: the app writes 1.00 for an unknown one, and 0.50 for an unknown principal point."""
 FLOAT32_STEP = 2.0**-23
 PRINTED_DIGITS = 9
 COARSE_NS = 1e5
-"""Times on a coarser grid than this are worth a note."""
+"""Note times on a coarser grid than this."""
 ONE = EdgeEpochs(ONE_CLOCK, ())
 
 
 @dataclass(frozen=True, slots=True)
 class _Lens:
-    """Intrinsics of each frame, pixels of the sensor's picture; NaN: not known."""
+    """Intrinsics of each frame, pixels of the sensor's picture; NaN: unknown."""
 
     fx_px: Float64
     fy_px: Float64
@@ -92,7 +92,7 @@ def read_ios_marslogger(folder: Path, notes: list[Note]) -> Source:
 
 
 def _read_gyro(path: Path) -> GyroTable:
-    """Read samples in m/s² by the app's g of 9.80, brought to the standard one; nanoseconds, or seconds."""
+    """Read samples in m/s², rescaled from the app's g of 9.80 to the standard one; times in nanoseconds or seconds."""
     scan = scan_text(path, ImuError, "copy it from the app's folder")
     if "timestamp[sec]" not in scan.head[:400].lower().replace(" ", ""):
         table = read_gyro_accel(path)
@@ -143,7 +143,7 @@ def read_ios_arkit(folder: Path, notes: list[Note]) -> Source:
     grid_ns = printed_grid_ns(float(rows.time_ns[-1]))
     stamps = stamps_from_movie(movie, rows, grid_ns, label(folder / ARKIT_FRAMES), notes)
     if grid_ns > COARSE_NS:
-        text = f"{ARKIT_IMU}: times have steps of {grid_ns / 1e6:.1f} ms, since the phone was not restarted for long"
+        text = f"{ARKIT_IMU}: times have steps of {grid_ns / 1e6:.1f} ms, because the phone has been up for a long time"
         notes.append(Note("info", "coarse-times", text))
     time_ns = _refined(rows.time_ns, stamps.time_ns, grid_ns)
     metadata: MetadataTable = make_metadata_table(time_ns, rows.rows, rows.dropped, fx_px=lens.fx_px, fy_px=lens.fy_px)
@@ -154,7 +154,7 @@ def read_ios_arkit(folder: Path, notes: list[Note]) -> Source:
 
 
 def printed_grid_ns(time_ns: float) -> float:
-    """Step of a number of seconds that is printed with nine significant digits."""
+    """Step of a time in seconds printed with nine significant digits."""
     return 1e9 * 10.0 ** (np.floor(np.log10(max(time_ns / 1e9, 1.0))) + 1 - PRINTED_DIGITS)
 
 
@@ -167,7 +167,7 @@ def _read_motion(path: Path) -> GyroTable:
 
 
 def _read_arkit_frames(path: Path, movie: MovieIndex) -> tuple[Rows, _Lens]:
-    """Read times and intrinsics; where the movie has another size than ARKit's picture, scaled to it."""
+    """Read times and intrinsics, scaled to the movie's size if it differs from ARKit's picture."""
     columns = _header(path, "frame_timestamp_s", CaptureError)
     entries = [f"intrinsics_m{place}" for place in ("00", "11", "20", "02", "21", "12")]
     places = [_require(columns, name, path, CaptureError) for name in (*entries, "image_width", "image_height")]
@@ -175,7 +175,7 @@ def _read_arkit_frames(path: Path, movie: MovieIndex) -> tuple[Rows, _Lens]:
     if not len(rows.time_ns):
         raise CaptureError(f"{label(path)}: has no rows", hint="the recording was not stopped, or the copy was cut")
     fx, fy, cx_a, cx_b, cy_a, cy_b, width, height = rows.values.T
-    # K's last column, whichever of the two index orders the header means: the other entries are zero
+    # K's last column in either index order of the header: the other entries are zero
     cx, cy = np.where(np.abs(cx_a) > np.abs(cx_b), cx_a, cx_b), np.where(np.abs(cy_a) > np.abs(cy_b), cy_a, cy_b)
     scale_x, scale_y = movie.width / width, movie.height / height
     lens = _Lens(fx * scale_x, fy * scale_y, (cx + 0.5) * scale_x - 0.5, (cy + 0.5) * scale_y - 0.5)
@@ -201,9 +201,9 @@ def _require(columns: tuple[str, ...], name: str, path: Path, error: type[Captur
 
 
 def stamps_from_movie(movie: MovieIndex, rows: Rows, grid_ns: float, what: str, notes: list[Note]) -> StampTable:
-    """Stamps on the movie's exact steps, brought to the rows' clock by their mean difference.
+    """Timestamps with the movie's exact steps, brought to the rows' clock by their mean difference.
 
-    grid_ns: step of the rows' times; one may belong to no frame.  Raises ClockError where movie and rows part.
+    grid_ns: step of the rows' times; a row may belong to no frame.  Raises ClockError if movie and rows disagree.
     """
     tick_ns = min(float(movie.time_base) * 1e9, COARSEST_TICK_NS)
     tolerance_ns = max(pts_tolerance_ns(tick_ns), grid_ns + tick_ns)
@@ -211,7 +211,7 @@ def stamps_from_movie(movie: MovieIndex, rows: Rows, grid_ns: float, what: str, 
     found = alignment.rows >= 0
     offset_ns = float(np.mean(rows.time_ns[alignment.rows[found]] - movie.pts_ns[found]))
     if alignment.rivals:
-        text = f"{alignment.rivals} other positions of the movie among the rows of {what} fit as well: times are unsure"
+        text = f"{alignment.rivals} other alignments of the movie with the rows of {what} fit as well: times may be off"
         notes.append(Note("warning", "stamps-ambiguous", text))
     spare = len(rows.time_ns) - int(found.sum())
     if spare:
@@ -220,7 +220,7 @@ def stamps_from_movie(movie: MovieIndex, rows: Rows, grid_ns: float, what: str, 
 
 
 def _refined(rows_ns: Int64, stamps_ns: Int64, grid_ns: float) -> Int64:
-    """Row times moved to the stamp that they were printed from; rows of no frame stay as they are."""
+    """Row times replaced by the timestamp that they were printed from; rows of no frame stay as they are."""
     nearest = np.clip(np.searchsorted(stamps_ns, rows_ns), 1, len(stamps_ns) - 1) if len(stamps_ns) > 1 else 0
     before, after = stamps_ns[np.maximum(nearest - 1, 0)], stamps_ns[nearest]
     stamp = np.where(np.abs(before - rows_ns) <= np.abs(after - rows_ns), before, after)
@@ -228,7 +228,7 @@ def _refined(rows_ns: Int64, stamps_ns: Int64, grid_ns: float) -> Int64:
 
 
 def _profile(movie: MovieIndex, lens: _Lens, device: str) -> CameraProfile:
-    """Axes of a phone, and the logged principal point where the picture is stored as the sensor read it."""
+    """A phone's axes, and the logged intrinsics if the picture is stored as the sensor reads it."""
     profile = phone_profile(movie.width, movie.height, device)
     known = np.isfinite(lens.fx_px) & np.isfinite(lens.cx_px)
     if not known.any() or movie.height > movie.width:

@@ -5,7 +5,7 @@
     <date>/VID_<date>_accel.csv     X, Y, Z (m/s²), time (ns)
     <date>/VID_<date>_timestamps.csv   time (ns) of each frame, on the sensors' clock
 
-Axes are Android's device axes; pictures are stored as the sensor reads them, in landscape.  Source: the app's README.
+Axes are Android's device axes; pictures are stored in landscape, as the sensor reads them.  Source: the app's README.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ PREFIX = "vid_"
 
 
 def is_opencamera_sensors(names: set[str]) -> bool:
-    """Whether the folder holds this app's gyroscope and time files, told by their names."""
+    """Whether the folder holds this app's gyroscope and time files, by their names."""
     return _find(names, GYRO_ENDINGS) is not None and _find(names, STAMP_ENDINGS) is not None
 
 
 def read_opencamera_sensors(folder: Path, notes: list[Note]) -> Source:
-    """Read a recording.  Raises CaptureError for what is missing or cannot be used."""
+    """Read a recording.  Raises CaptureError for missing or unusable files."""
     names = set(list_names(folder))
     gyro_name, stamps_name = _find(names, GYRO_ENDINGS), _find(names, STAMP_ENDINGS)
     if gyro_name is None or stamps_name is None:
@@ -79,7 +79,7 @@ def _find(names: set[str], endings: tuple[str, ...]) -> str | None:
 
 
 def _movie(folder: Path, gyro_name: str) -> Path:
-    """The movie in the folder, or in the one above under the sensors' name."""
+    """The movie in the folder, or in its parent under the sensors' name."""
     if any(Path(name).suffix.lower() in MOVIE_SUFFIXES for name in list_names(folder)):
         return find_movie(folder)
     stem = gyro_name[: -len("gyro.csv")].rstrip("_").lower()
@@ -107,14 +107,14 @@ def _read_sensor(path: Path) -> tuple[Int64, Float64, int]:
     time_ns, table = np.concatenate(times), np.concatenate(values)
     if len(time_ns) < 2:
         raise ImuError(
-            f"{label(path)}: {len(time_ns)} usable of {rows} rows X, Y, Z, time (ns)", hint="is it the app's?"
+            f"{label(path)}: {len(time_ns)} usable of {rows} rows X, Y, Z, time (ns)", hint="is it the app's file?"
         )
     keep = keep_rising(time_ns, path, Counter())
     return time_ns[keep], table[keep], rows
 
 
 def _read_stamps(path: Path) -> StampTable:
-    """One time in nanoseconds a line."""
+    """Read one time in nanoseconds per line."""
     times = [whole_numbers(chunk[0]) for chunk in text_chunks(path, fields=1)]
     time_ns = np.concatenate([np.zeros(0, np.int64), *times])
     known = time_ns[time_ns > 0]

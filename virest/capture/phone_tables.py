@@ -1,4 +1,4 @@
-"""What the readers of phone loggers share: separate gyroscope and accelerometer files, and the movie's own stamps."""
+"""Shared by the readers of phone loggers: separate gyroscope and accelerometer files, the movie's own timestamps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NO_EXPOSURES = "the recorder logs no exposure times: frames are straightened, no
 
 
 def at_times(time_ns: Int64, other_ns: Int64, values: Float64) -> Float64:
-    """Samples (n, 3) of another sensor at these times, by straight lines; NaN beyond its own."""
+    """Samples (n, 3) of another sensor, interpolated linearly at these times; NaN outside its span."""
     if len(other_ns) < 2:
         return np.full((len(time_ns), 3), np.nan)
     zero = int(other_ns[0])
@@ -25,15 +25,15 @@ def at_times(time_ns: Int64, other_ns: Int64, values: Float64) -> Float64:
 
 
 def movie_stamps(movie: MovieIndex, start_ns: int = ORIGIN_NS) -> StampTable:
-    """The movie's own time stamps, from a start on the inertial clock."""
+    """The movie's own timestamps, from a start on the inertial clock."""
     return StampTable(movie.pts_ns + start_ns, None, len(movie), {})
 
 
 def note_exposures(notes: list[Note]) -> None:
-    """Say that deblurring needs what these recorders do not write."""
+    """Note that deblurring needs exposure times, which these recorders do not write."""
     notes.append(Note("warning", "exposure-unknown", NO_EXPOSURES))
 
 
 def without_accelerometer(folder: Path, what: str, notes: list[Note]) -> None:
-    """Say that the accelerometer cannot be used, and why."""
+    """Note that the accelerometer cannot be used, and why."""
     notes.append(Note("warning", "accel-implausible", f"{folder.name}: {what}: the accelerometer is not used"))

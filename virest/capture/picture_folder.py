@@ -1,9 +1,9 @@
 """A folder of pictures with stamps, and inertial samples beside them.
 
 pictures    listed in data.csv, rgb.txt, timestamps.csv, … ; or in order, one stamp each, in frame_timestamps.txt;
-or called by their nanoseconds; here, or in data/, rgb/, images/, frames/, color/
+or named by their time in nanoseconds; here, or in data/, rgb/, images/, frames/, color/
 samples     gyro_accel.csv as MARSLogger writes it, or imu.csv / imu.txt as EuRoC and TUM-VI do
-metadata    movie_metadata.csv as MARSLogger writes it, where it is there
+metadata    movie_metadata.csv as MARSLogger writes it, optional
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ IMU_FILES = (GYRO, "imu.csv", "imu.txt")
 
 
 def read_picture_folder(folder: Path, notes: list[Note]) -> Source:
-    """Read pictures, their stamps and the samples. Raises CaptureError for what is missing or cannot be used."""
+    """Read pictures, their timestamps and the samples. Raises CaptureError for missing or unusable files."""
     path = find_picture_source(folder)
     if path is None:
         raise VideoError(f"{label(folder)}: no pictures with times", hint="list them in data.csv: time in ns, name")

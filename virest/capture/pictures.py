@@ -1,7 +1,7 @@
-"""Pictures in the place of a movie: a list with times and names, or names that are times; any frame at once.
+"""Picture files in place of a movie: a list of times and names, or names that are times; with random access.
 
-A source is named by one path, as a movie is: the list (EuRoC's data.csv, TUM's rgb.txt, frame_timestamps.txt), or the
-folder itself where the names are nanoseconds.  Names never lead out of the list's folder.
+One path names a source, as for a movie: the list (EuRoC's data.csv, TUM's rgb.txt, frame_timestamps.txt), or the folder
+itself if the names are nanoseconds.  Names that lead out of the list's folder are refused.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from virest.errors import CaptureError, ClockError, VideoError
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 MOVIE_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".insv", ".360")
 LISTS = ("data.csv", "rgb.txt", "timestamps.csv", "timestamps.txt", "times.txt", STAMPS)
-"""Lists that are looked for, in this order."""
+"""File names of lists, in order of preference."""
 PLACES = ("", "data", "rgb", "images", "frames", "color")
-"""Folders of the pictures, from the list's."""
+"""Folders of the pictures, relative to the list's folder."""
 MAX_BYTES = 1 << 28
 MAX_SIDE_PX = 16384
 SIXTEEN_BITS = 257.0
-"""Steps of a 16-bit picture that make one of 8 bits."""
+"""16-bit steps per 8-bit grey level."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -42,11 +42,11 @@ class PictureList:
     """Which pictures there are, and when they were taken."""
 
     base: Path
-    """Folder that the names start from."""
+    """Folder that the names are relative to."""
     time_ns: Int64
     """(n,) strictly rising."""
     names: tuple[str, ...]
-    """(n,) paths from ``base``."""
+    """(n,) paths relative to ``base``."""
     rows: int
     dropped: dict[str, int]
 
@@ -58,7 +58,7 @@ def is_picture_source(path: Path) -> bool:
 
 
 def find_picture_source(folder: Path) -> Path | None:
-    """The list of pictures in a folder, else the folder whose pictures have nanoseconds for names; None for neither."""
+    """The list of pictures in a folder, else the folder whose pictures are named by nanoseconds; None if neither."""
     for name in LISTS:
         if (folder / name).is_file() and any(_pictures(folder / place) for place in PLACES):
             return folder / name
@@ -70,9 +70,9 @@ def find_picture_source(folder: Path) -> Path | None:
 
 
 def read_picture_list(path: Path) -> PictureList:
-    """Read a list of pictures, or a folder of pictures with nanoseconds for names.
+    """Read a list of pictures, or a folder of pictures named by nanoseconds.
 
-    Raises VideoError (no pictures, names that lead elsewhere, not a picture to each stamp), ClockError (times).
+    Raises VideoError (no pictures, names outside the folder), ClockError (times, not one timestamp per picture).
     """
     if path.is_dir():
         return _from_names(path)
@@ -82,9 +82,9 @@ def read_picture_list(path: Path) -> PictureList:
     rows = _list_rows(path, scan.head)
     if rows is None:
         return _in_order(path)
-    time_ns, said, total, dropped = rows
-    place = _place(path.parent, said)
-    names = [_join(place, name, path) for name in said]
+    time_ns, listed, total, dropped = rows
+    place = _place(path.parent, listed)
+    names = [_join(place, name, path) for name in listed]
     there = _existing(path.parent, names)
     dropped["picture is missing"] += int((~there).sum())
     return _rising(
@@ -105,7 +105,7 @@ def _rising(path: Path, time_ns: Int64, names: list[str], rows: int, dropped: Co
 
 
 def _list_rows(path: Path, head: str) -> tuple[Int64, list[str], int, Counter[str]] | None:
-    """(times, names, rows, dropped) of a list; None where its rows have no names. Raises VideoError, ClockError."""
+    """(times, names, rows, dropped) of a list; None if its rows have no names. Raises VideoError, ClockError."""
     lines = [line.strip() for line in head.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     separator = "," if any("," in line for line in lines[:2]) else r"\s+"
     row = next((re.split(separator, line) for line in lines if re.match(r"[+-]?\d", line)), [])
@@ -123,25 +123,25 @@ def _list_rows(path: Path, head: str) -> tuple[Int64, list[str], int, Counter[st
     rows = 0
     for chunk in text_chunks(path, separator):
         time_ns, good = exact_times_ns(chunk[clock], path)
-        said = chunk[column].str.strip()
-        named = said.str.lower().str.endswith(SUFFIXES).to_numpy()
+        entries = chunk[column].str.strip()
+        named = entries.str.lower().str.endswith(SUFFIXES).to_numpy()
         blank = ((chunk[0].str.strip() == "") | chunk[0].str.startswith("#")).to_numpy()
         head_rows = ~good & ~named
         rows += int((~blank & ~head_rows).sum())
         dropped["cut or unreadable row"] += int((~blank & ~head_rows & ~(good & named)).sum())
         times.append(time_ns[good & named])
-        names += said[good & named].tolist()
+        names += entries[good & named].tolist()
     return np.concatenate(times), names, rows, dropped
 
 
 def _in_order(path: Path) -> PictureList:
-    """Stamps without names: row i belongs to the i-th picture in the order of the numbers in their names."""
+    """Timestamps without names: row i belongs to the i-th picture in the order of the numbers in the file names."""
     stamps = read_frame_timestamps(path)
     place = next((place for place in PLACES if _pictures(path.parent / place)), "")
     names = sorted(_pictures(path.parent / place), key=_natural)
     if len(names) != stamps.rows or len(names) != len(stamps.time_ns):
-        text = f"{label(path)}: {len(stamps.time_ns)} of {stamps.rows} stamps can be used, {len(names)} pictures"
-        raise ClockError(text, hint="one stamp belongs to each picture; a list with names says which")
+        text = f"{label(path)}: {len(stamps.time_ns)} of {stamps.rows} stamps are usable, for {len(names)} pictures"
+        raise ClockError(text, hint="give one stamp per picture, or a list with the pictures' names")
     joined = [str(PurePosixPath(place) / name) for name in names]
     return PictureList(path.parent, stamps.time_ns, tuple(joined), stamps.rows, stamps.dropped)
 
@@ -149,7 +149,7 @@ def _in_order(path: Path) -> PictureList:
 def _from_names(folder: Path) -> PictureList:
     names = [name for name in _pictures(folder) if INTEGER.fullmatch(Path(name).stem)]
     if not names:
-        text = f"{label(folder)}: is a folder without a picture that is called by its nanoseconds"
+        text = f"{label(folder)}: is a folder without pictures named by their time in nanoseconds"
         raise VideoError(text, hint="list times and names in data.csv")
     names.sort(key=lambda name: int(Path(name).stem))
     times = np.array([int(Path(name).stem) for name in names], np.int64)
@@ -157,7 +157,7 @@ def _from_names(folder: Path) -> PictureList:
 
 
 def _pictures(folder: Path) -> list[str]:
-    """Names of the plain files of a folder that are called like pictures, sorted."""
+    """Names of a folder's regular files with a picture's suffix, sorted."""
     try:
         if is_remote(folder):
             return [place.name for place in folder.iterdir() if place.name.lower().endswith(SUFFIXES)]
@@ -172,7 +172,7 @@ def _natural(name: str) -> list[Any]:
 
 
 def _place(base: Path, names: list[str]) -> str:
-    """Where the listed pictures lie: beside the list, or in one of the usual folders."""
+    """The folder of the listed pictures: the list's own, or one of PLACES."""
     for name in names[:20]:
         for place in ("data", *PLACES):
             if _is_inside(name) and _is_file(base / place / name):
@@ -196,12 +196,12 @@ def _is_inside(name: str) -> bool:
 def _join(place: str, name: str, path: Path) -> str:
     if not _is_inside(name):
         text = f"{label(path)}: picture {name[:60]!r} lies outside the folder"
-        raise VideoError(text, hint="names start from the list's folder, without .. and without drives")
+        raise VideoError(text, hint="write names relative to the list's folder, without .. and without drives")
     return str(PurePosixPath(place) / name)
 
 
 def _existing(base: Path, names: list[str]) -> NDArray[np.bool_]:
-    """(n,) which names are plain files, by one look at each folder."""
+    """(n,) which names are regular files, listing each folder once."""
     inside = {folder: set(_pictures(base / folder)) for folder in {str(PurePosixPath(n).parent) for n in names}}
     parts = [PurePosixPath(name) for name in names]
     return np.array([part.name in inside[str(part.parent)] for part in parts], bool)
@@ -211,7 +211,7 @@ def _existing(base: Path, names: list[str]) -> NDArray[np.bool_]:
 
 
 def decode_picture(path: Path) -> NDArray[np.uint8] | None:
-    """RGB (h, w, 3) or grey (h, w), 8 bits, rounded, as stored; None where the file cannot be decoded."""
+    """RGB (h, w, 3) or grey (h, w), 8 bits, rounded, as stored; None if the file cannot be decoded."""
     try:
         size = require_regular_file(path, VideoError)
         data = path.read_bytes() if size <= MAX_BYTES else b""
@@ -233,7 +233,7 @@ def decode_picture(path: Path) -> NDArray[np.uint8] | None:
 
 
 def _is_huge(data: bytes) -> bool:
-    """Whether a PNG promises more than a movie may have, whatever few bytes it takes to promise it."""
+    """Whether a PNG declares a side above MAX_SIDE_PX: a few bytes can declare any size."""
     if not data.startswith(PNG_SIGNATURE):
         return False
     return max(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) > MAX_SIDE_PX

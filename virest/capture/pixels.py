@@ -1,8 +1,8 @@
 """The colours of a decoded frame (contract, section 3).
 
-Luma and chroma become RGB by the stream's own matrix and range, rounded; an untagged
-stream is BT.601, limited range, at any size.  Chroma is taken as lying in the middle of its 2 × 2 pixels, where
-software encoders put it whatever they tag; at the price of half a pixel of chroma where an encoder means the left.
+Luma and chroma become RGB by the stream's own matrix and range, rounded; an untagged stream is BT.601, limited range,
+at any size.  A chroma sample lies vertically between its two rows; horizontally on the left of its two columns, or
+between them for codecs that centre it.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ KR_KB = {
     9: (0.2627, 0.0593),  # BT.2020
     10: (0.2627, 0.0593),
 }
-"""Weights of red and blue in luma, by the number that H.264 gives the matrix."""
+"""Weights of red and blue in luma, by H.264's number of the matrix."""
 BT601 = 6
 FULL_RANGE = 2
 PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
 FIXED_POINT = 64
-"""Steps of a grey level in the 16-bit sums: luma and chroma together stay below 2^15."""
+"""Fixed-point steps per grey level in the 16-bit sums: luma plus chroma stay below 2^15."""
 CUBIC_MIDDLE = np.array([[-3, 19, 19, -3]], np.float32) / 32
-"""Weights half way between two samples of OpenCV's cubic interpolation, as cv2.resize has them for the rows."""
+"""OpenCV's cubic interpolation weights half way between two samples, as cv2.resize uses for the rows."""
 
 
 @dataclass(frozen=True, slots=True)
 class _ColourTables:
-    """Contribution of each 8-bit luma and chroma value to each of red, green and blue, in 1/FIXED_POINT levels."""
+    """Contribution of each 8-bit luma and chroma value to red, green and blue, in 1/FIXED_POINT levels."""
 
     luma: NDArray[np.int16]
     red_v: NDArray[np.int16]
@@ -83,7 +83,7 @@ def _planes(frame: Any) -> list[NDArray[np.uint8]]:
 
 
 def to_rgb(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
-    """RGB (h, w, 3) of a decoded PyAV frame, rounded; its size, matrix and range as the stream says.
+    """RGB (h, w, 3) of a decoded PyAV frame, rounded; size, matrix and range are the stream's.
 
     centred: chroma lies between two columns of luma, not on the left one.
     """
@@ -103,15 +103,15 @@ def to_rgb(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
 
 
 def _levels(fixed: NDArray[Any]) -> NDArray[Any]:
-    """Fixed-point sums to 8 bit, rounded, both ends clipped: two cheap passes, four times faster than one in float."""
+    """Fixed-point sums to 8 bits, rounded and clipped: two integer passes, four times faster than one in float."""
     return cv2.convertScaleAbs(cv2.max(fixed, 0), alpha=1 / FIXED_POINT)  # type: ignore[call-overload]
 
 
 def _upsample(chroma: NDArray[Any], shape: tuple[int, ...], *, centred: bool) -> NDArray[Any]:
     """Chroma at the luma's size, by cubic interpolation.
 
-    A sample lies on the left one of its two columns of luma, as H.264 and its kin have it unless they say otherwise, or
-    between them (centred: JPEG and MPEG-1); always between its two rows.
+    A sample lies on the left of its two luma columns, the default of H.264 and its relatives, or between them (centred:
+    JPEG and MPEG-1); always between its two rows.
     """
     height, width = shape[:2]
     if chroma.shape[:2] == (height, width):
@@ -125,7 +125,7 @@ def _upsample(chroma: NDArray[Any], shape: tuple[int, ...], *, centred: bool) ->
 
 
 def to_gray(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
-    """Luma (h, w) of a decoded PyAV frame, scaled to the full range; centred: of the chroma, which is not used."""
+    """Luma (h, w) of a decoded PyAV frame, scaled to the full range; centred concerns chroma and is ignored."""
     del centred
     if frame.format.is_rgb:
         return cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)

@@ -1,4 +1,4 @@
-"""Where a capture's camera profile comes from: a file given, the folder's camera.yaml, or its own metadata."""
+"""The source of a capture's camera profile: a given file, the folder's camera.yaml, or its own metadata."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
 
 def default_profile(capture: Capture) -> CameraProfile:
-    """The profile that the capture's own metadata give.
+    """The profile from the capture's own metadata.
 
     Documented defaults: principal point in the middle, no distortion; portrait pictures are read right to left with
     x_cam = diag(1, −1, −1) x_imu, landscape ones top to bottom with the Android landscape map; response and time
-    offset unknown; readout unknown unless logged.  Where the recorder describes the camera itself (EuRoC's sensor.yaml,
-    a .gcsv's header), that stands in the phone's place.
+    offset unknown; readout unknown unless logged.  A recorder's own description of the camera (EuRoC's sensor.yaml, a
+    .gcsv's header) replaces these defaults.
     """
     recorded = capture.recorded_profile
     if recorded is None:
@@ -43,7 +43,7 @@ def default_profile(capture: Capture) -> CameraProfile:
 
 
 def phone_profile(width: int, height: int, device: str = "", focal_length_mm: float | None = None) -> CameraProfile:
-    """What a phone that says nothing of its axes is taken for, by the shape of its stored picture."""
+    """The default profile of a phone that does not describe its axes, by the shape of its stored picture."""
     portrait = height > width
     return CameraProfile(
         width=width,
@@ -57,7 +57,7 @@ def phone_profile(width: int, height: int, device: str = "", focal_length_mm: fl
 
 
 def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfile:
-    """Put logged values where the profile has none: focal length and readout time; each with its source."""
+    """Fill in the logged focal length and readout time if the profile has none; each with its source."""
     logged, source = capture.metadata, f"{capture.metadata_file}, median"
     if profile.intrinsics is None and (fx := logged.fx_px or logged.fy_px):
         fy = logged.fy_px or fx
@@ -71,37 +71,38 @@ def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfil
 
 
 def for_capture(profile: CameraProfile, capture: Capture) -> CameraProfile:
-    """The profile with the fields and untrusted stretches that hold for this capture.
+    """The profile with the fields and untrusted IMU intervals that apply to this capture.
 
-    What belongs to another capture goes, a field over focus distance gets this capture's log of it, or goes.
+    Those of another capture are removed.  A field over focus distance gets this capture's log, or is removed without.
     """
     focus = [(frame.time_s, frame.focus_dioptres) for frame in capture.frames if frame.focus_dioptres is not None]
     fields: list[Field] = []
     for field in profile.fields:
         if field.stamp_0_ns not in (None, capture.stamp_0_ns):
-            log.info("%s: a field of %s over %s belongs to another capture", capture.name, field.kind, field.covariates)
+            text = "%s: a field of %s over %s belongs to another capture, ignored"
+            log.info(text, capture.name, field.kind, field.covariates)
         elif "focus" not in field.covariates:
             fields.append(field)
         elif focus:
             times, values = zip(*focus, strict=True)
             fields.append(replace(field, log=(times, values)))
         else:
-            log.warning("%s: no focus distance is logged: the field over it is left out", capture.name)
+            log.warning("%s: no focus distance is logged: the field over it is ignored", capture.name)
     if profile.imu_untrusted_stamp_0_ns not in (None, capture.stamp_0_ns):
         profile = replace(profile, imu_untrusted_s=(), imu_untrusted_stamp_0_ns=None)
     return profile.with_fields(fields)
 
 
 def with_logged_focal(profile: CameraProfile, capture: Capture) -> CameraProfile:
-    """The profile with the focal length that the recorder logs frame by frame, as a field over it.
+    """The profile with the focal length that the recorder logs for each frame, as a field.
 
-    A profile that says itself how its focal length changes, by a drift or a field, is left as it is.
+    A profile that already has a focal drift or a field of the focal length is returned unchanged.
     """
     known = [frame for frame in capture.frames if frame.focal_scale is not None]
-    said = profile.extensions.focal_drift_per_s or any(field.kind == "scale" for field in profile.fields)
-    if not known or said:
+    has_own = profile.extensions.focal_drift_per_s or any(field.kind == "scale" for field in profile.fields)
+    if not known or has_own:
         return profile
-    # a frame's length holds for its middle, and is taken as straight from frame to frame
+    # a logged value applies to the middle of its frame, and is interpolated linearly between frames
     middle_s = [f.time_s + 0.5 * ((f.exposure_s or 0.0) + profile.shutter.readout_time_s) for f in known]
     scales = np.array([f.focal_scale for f in known], np.float64)
     times, values = corners(np.array(middle_s), scales)
@@ -112,7 +113,7 @@ def with_logged_focal(profile: CameraProfile, capture: Capture) -> CameraProfile
 
 
 def read_any_profile(path: Path) -> CameraProfile:
-    """Read a profile file by its kind: our own, or a Kalibr camera chain."""
+    """Read a profile file: virest's own, or a Kalibr camera chain."""
     content = load_yaml_mapping(path)
     return parse_camchain(content, path.name) if is_kalibr(content) else parse_profile(content, path.name)
 
@@ -133,6 +134,6 @@ def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[Camer
         raise SettingsError(
             f"{locate(path).name}: image {profile.width}x{profile.height}, but {capture.name}/{capture.movie.name} is "
             f"{capture.width}x{capture.height}",
-            hint="a profile holds for one stored size; scale its intrinsics, or pass the one of this mode",
+            hint="a profile applies to one stored size; scale its intrinsics, or pass the profile of this mode",
         )
     return with_logged_focal(for_capture(fill_from_metadata(profile, capture), capture), capture), str(path)

@@ -1,4 +1,4 @@
-"""What a recorder says of its camera: medians over the metadata's rows, and whether they can be."""
+"""What a recorder logs about its camera: medians over the metadata's rows, checked for plausibility."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from virest.capture.source import Source
 PLAUSIBLE_FOCAL = (0.55, 1.1)
 """fx over the long side of a phone's main camera."""
 BEARABLE_FOCAL = (0.4, 1.6)
-"""Outside, fx counts other pixels than the movie's: those of the sensor's whole array."""
+"""Outside, fx is not in pixels of the movie but of the sensor's active array."""
 
 
 def summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
-    """Medians over the rows, and what the recorder says of camera and axes where the rows say nothing.
+    """Medians over the rows; where the rows have none, the recorder's own description of camera and axes.
 
-    fx of the rows belongs to the sensor's long axis, which is vertical in a portrait picture.
+    fx in the rows belongs to the sensor's long axis, which is vertical in a portrait picture.
     """
     lens = files.profile.intrinsics if files.profile else None
     readout_s = files.profile.shutter.readout_time_s if files.profile and files.profile.readout_known else None
@@ -59,9 +59,9 @@ def _focal_plausible(fx: float | None, width: int, height: int, name: str, notes
     ratio = fx / max(width, height)
     if not BEARABLE_FOCAL[0] <= ratio <= BEARABLE_FOCAL[1]:
         text = (
-            f"fx {fx:.1f} is {ratio:.2f} of the picture's long side ({max(width, height)} px), a phone has "
-            f"{PLAUSIBLE_FOCAL[0]}–{PLAUSIBLE_FOCAL[1]}: it counts pixels of the sensor's whole array, not "
-            "the movie's; not used. Multiply it by long side / array width, or calibrate, and give fx_px in camera.yaml"
+            f"fx {fx:.1f} is {ratio:.2f} of the picture's long side ({max(width, height)} px), phones have "
+            f"{PLAUSIBLE_FOCAL[0]}–{PLAUSIBLE_FOCAL[1]}: it is in pixels of the sensor's active array, not of the "
+            "movie, and is ignored. Multiply it by long side / array width, or calibrate; give fx_px in camera.yaml"
         )
         notes.append(Note("warning", "fx-active-array", text))
         return False

@@ -23,9 +23,9 @@ class Frame:
     index: int
     """Index in the movie, from 0."""
     timestamp_ns: int
-    """As logged; on the IMU's clock once the capture is read (clock source UNKNOWN: brought there by edge_epochs)."""
+    """As logged, converted to the IMU's clock (clock source UNKNOWN: by edge_epochs)."""
     time_s: float
-    """The same, seconds from the capture's stamp_0 (row 0 of frame_timestamps.txt)."""
+    """The same in seconds from the capture's stamp_0 (row 0 of frame_timestamps.txt)."""
     exposure_s: float | None = None
     """As logged; None: unknown."""
     iso: float | None = None
@@ -40,7 +40,7 @@ class Frame:
 
     @property
     def only_startup(self) -> bool:
-        """Whether nothing but the start-up lag speaks against the frame: a frame for diagnosis and calibration."""
+        """Whether the start-up lag is the only reason to skip the frame, which diagnosis and calibration then use."""
         return self.skip_codes == (STARTUP,)
 
 
@@ -67,7 +67,7 @@ class Note:
     code: str
     """A stable short name, such as ``imu-gap`` or ``content-lag``."""
     text: str
-    """What, where, how much, what it means."""
+    """What, where, how much, and what it means."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,34 +89,34 @@ class Capture:
     clock_shift_ns: int
     """What was added to the camera's stamps to bring them to the IMU's clock."""
     clock_difference_ns: int | None = None
-    """IMU clock − the camera's other clock as edge_epochs.txt has it, applied or not; None: no such rows."""
+    """IMU clock − the camera's other clock by edge_epochs.txt, applied or not; None: no such rows."""
     imu_gaps_s: tuple[tuple[float, float], ...] = ()
-    """(start, end) of each hole in the inertial data."""
+    """(start, end) of each gap in the inertial data."""
     keyframes: tuple[int, ...] = ()
     """Indices of the frames that the decoder can start from."""
     bits_per_px: float = inf
-    """What the encoder spent on a pixel of a frame, in the mean; inf for pictures that were not encoded as a movie."""
+    """The encoder's mean bits per pixel of a frame; inf for pictures that were not encoded as a movie."""
     notes: tuple[Note, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)
     """Rows and frames read, joined, and dropped, by reason."""
     stamp_0_ns: int = 0
     """Row 0 of frame_timestamps.txt on the IMU's clock: the zero of every time_s."""
     repeats: tuple[int, ...] = ()
-    """Frames of the first two seconds that repeat their predecessor although the phone turned."""
+    """Frames of the first two seconds that repeat their predecessor although the phone rotated."""
     stalls: tuple[tuple[int, int], ...] = ()
-    """(first, last) frame of each later stall of the encoder, whose pictures may be later than their stamps."""
+    """(first, last) frame of each later encoder stall, whose content may be later than its timestamps."""
     startup_lag_s: float | None = None
-    """How much later than its stamp frame 0's picture is, at least; None: no lag seen."""
+    """Lower bound of the delay of frame 0's content after its timestamp; None: no lag seen."""
     kind: str = "MARSLogger"
-    """What recorded it, as told by its files."""
+    """The recorder, as detected from its files."""
     metadata_file: str = "movie_metadata.csv"
     """Where ``metadata`` comes from."""
     recorded_profile: CameraProfile | None = None
-    """What the recorder says of camera and axes beyond ``metadata``; None: nothing."""
+    """The recorder's description of camera and axes beyond ``metadata``; None: it has none."""
     inputs: tuple[Path, ...] = ()
-    """Files that were read: logs, lists, sensor descriptions, the movie; of listed pictures only the list."""
+    """Files that were read: logs, lists, sensor descriptions, the movie; for listed pictures only the list."""
 
     @property
     def usable(self) -> tuple[Frame, ...]:
-        """The frames that nothing speaks against."""
+        """The frames without a reason to skip them."""
         return tuple(frame for frame in self.frames if frame.skip_reason is None)

@@ -1,7 +1,7 @@
 """ROS 1 and 2 bags and MCAP files, by the package `rosbags`, without ROS: pictures, inertial samples, the lens.
 
-Topics are told by their message types: sensor_msgs Image or CompressedImage, Imu, CameraInfo.  Times are those of the
-messages' headers.  Nothing is decoded before it is asked for.
+Topics are found by their message types: sensor_msgs Image or CompressedImage, Imu, CameraInfo.  Times are those of the
+messages' headers.  Messages are decoded on demand.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class BagTopics:
 
 @dataclass(frozen=True, slots=True)
 class BagCamera:
-    """The lens as CameraInfo has it."""
+    """The lens as given by CameraInfo."""
 
     width: int
     height: int
@@ -56,11 +56,11 @@ def is_bag(path: Path) -> bool:
 
 
 class Bag:
-    """An open bag.  Use it in a ``with`` block.  Raises CaptureError for what cannot be read."""
+    """An open bag.  Use it in a ``with`` block.  Raises CaptureError if it cannot be read."""
 
     def __init__(self, path: Path, image: str | None = None, imu: str | None = None) -> None:
         self.path = path
-        self._wished = (image, imu)
+        self._requested = (image, imu)
         self._reader: Any = None
 
     def __enter__(self) -> Bag:
@@ -82,9 +82,9 @@ class Bag:
         self._reader.close()
 
     def topics(self) -> BagTopics:
-        """The topics to read; with several of a kind the one with most messages, unless one was wished for."""
-        image = self._choose(IMAGES, self._wished[0], "image")
-        imu = self._choose((IMU,), self._wished[1], "IMU")
+        """The topics to read: the requested ones, else of each kind the one with the most messages."""
+        image = self._choose(IMAGES, self._requested[0], "image")
+        imu = self._choose((IMU,), self._requested[1], "IMU")
         beside = image.rsplit("/", 1)[0].removesuffix("/compressed")
         cameras = [c.topic for c in self._reader.connections if c.msgtype == CAMERA]
         near = [topic for topic in cameras if topic.startswith(beside.rsplit("/", 1)[0])]
@@ -120,17 +120,18 @@ class Bag:
             yield time_ns, _pixels(message, label(self.path))
 
     def count(self, topic: str) -> int:
-        """Messages of a topic."""
+        """Number of messages of a topic."""
         return int(self._reader.topics[topic].msgcount)
 
-    def _choose(self, kinds: tuple[str, ...], wished: str | None, what: str) -> str:
+    def _choose(self, kinds: tuple[str, ...], requested: str | None, what: str) -> str:
         found = {c.topic: c.msgcount for c in self._reader.connections if c.msgtype in kinds}
-        if wished is not None and wished in found:
-            return wished
-        if wished is not None or not found:
+        if requested is not None and requested in found:
+            return requested
+        if requested is not None or not found:
             there = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in self._reader.connections})[:8]) or "nothing"
-            raise CaptureError(f"{label(self.path)}: has no {what} topic{f' {wished}' if wished else ''}: {there}",
-                               hint="a capture needs an image and an IMU topic")  # fmt: skip
+            missing = f"no {what} topic {requested}" if requested else f"no {what} topic"
+            text = f"{label(self.path)}: has {missing}: {there}"
+            raise CaptureError(text, hint="a capture needs an image and an IMU topic")
         return max(sorted(found), key=lambda topic: found[topic])
 
     def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:

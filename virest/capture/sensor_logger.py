@@ -1,13 +1,12 @@
-"""Sensor Logger (Android and iOS): a CSV file per sensor, and a movie below ``Camera/`` or beside them.
+"""Sensor Logger (Android and iOS): one CSV file per sensor, and a movie in ``Camera/`` or beside them.
 
     Gyroscope.csv           time (ns since 1970), seconds_elapsed, z, y, x (rad/s); columns are found by name
     TotalAcceleration.csv   the same, m/s², with gravity; else Accelerometer.csv (without gravity) + Gravity.csv
-    Metadata.csv            `platform` is android or ios; on iOS accelerations have the other sign
-    Camera/<epoch ms>.mp4   named by the start of the session, some hundred milliseconds before its first frame
+    Metadata.csv            `platform` is android or ios; on iOS accelerations have the opposite sign
+    Camera/<epoch ms>.mp4   named by the start of the session, a few hundred milliseconds before its first frame
 
 Axes are the device's: x right, y up, z out of the screen.  Source: the app's published reference pages on coordinates,
-units and video synchronisation.  The movie's start is known to a second at best, so the time offset
-is left to be found.
+units and video synchronisation.  The movie's start is known to 1 s at best, so the time offset is unknown.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ HINT = "copy the whole folder that the app exports"
 
 
 def is_sensor_logger(folder: Path, names: set[str]) -> bool:
-    """Whether the folder holds this app's gyroscope file, told by its header."""
+    """Whether the folder holds this app's gyroscope file, by its header."""
     if GYROSCOPE not in names or not (folder / GYROSCOPE).is_file():
         return False
     try:
@@ -46,7 +45,7 @@ def is_sensor_logger(folder: Path, names: set[str]) -> bool:
 
 
 def read_sensor_logger(folder: Path, notes: list[Note]) -> Source:
-    """Read an exported recording.  Raises CaptureError for what is missing or cannot be used."""
+    """Read an exported recording.  Raises CaptureError for missing or unusable files."""
     sensor = _read_sensor(folder / GYROSCOPE)
     place = folder / CAMERA if (folder / CAMERA).is_dir() else folder
     path = find_movie(place)
@@ -58,7 +57,7 @@ def read_sensor_logger(folder: Path, notes: list[Note]) -> Source:
     start_ns = named_start_ns(path)
     if start_ns is None or not gyro.time_ns[0] - 10**10 <= start_ns <= gyro.time_ns[-1]:
         start_ns = int(gyro.time_ns[0])
-        text = f"{label(path)}: its name tells no start within the recording; taken as that of {GYROSCOPE}"
+        text = f"{label(path)}: its name gives no start time within the recording; that of {GYROSCOPE} is used"
         notes.append(Note("warning", "stamps-ambiguous", text))
     note_exposures(notes)
     names = FileNames(path.name, f"the PTS of {path.name}", path.name, GYROSCOPE)
@@ -71,13 +70,13 @@ def read_sensor_logger(folder: Path, notes: list[Note]) -> Source:
 
 
 def columns_of(path: Path) -> tuple[str, ...]:
-    """Names in a CSV file's first line, in small letters.  Raises ImuError where it is no text."""
+    """Names in a CSV file's first line, in lower case.  Raises ImuError if it is not text."""
     head = scan_text(path, ImuError, HINT).head.lstrip("\ufeff").splitlines()
     return tuple(name.strip().lower() for name in head[0].split(",")) if head else ()
 
 
 def named_start_ns(movie: Path) -> int | None:
-    """The start that a movie's name tells, in nanoseconds since 1970; None where it is no such number."""
+    """The start time in a movie's name, nanoseconds since 1970; None if the name is not such a number."""
     digits = re.fullmatch(r"\d{10}(?:\d{3}){0,3}", movie.stem)
     if digits is None:
         return None
@@ -85,16 +84,17 @@ def named_start_ns(movie: Path) -> int | None:
 
 
 def _read_sensor(path: Path) -> Rows:
-    """Time and x, y, z of a sensor's file, whatever the order of its columns."""
+    """Time and x, y, z of a sensor's file, with columns in any order."""
     columns = columns_of(path)
     missing = [axis for axis in AXES if axis not in columns]
     if missing or columns[:1] != ("time",):
-        raise ImuError(f"{label(path)}: columns are {', '.join(columns)[:80]}", hint="time, seconds_elapsed, z, y, x")
+        text = f"{label(path)}: columns are {', '.join(columns)[:80]}"
+        raise ImuError(text, hint="expected time, seconds_elapsed, z, y, x")
     return read_rows(path, [columns.index(axis) for axis in AXES], required=3, hint=HINT)
 
 
 def _specific_force(folder: Path, gyro: Rows, notes: list[Note]) -> Float64:
-    """What the accelerometer feels, m/s², +9.8 upwards at rest, at the gyroscope's times; NaN where it is not known."""
+    """Specific force, m/s², +9.8 upwards at rest, at the gyroscope's times; NaN where unknown."""
     files = [name for name in (TOTAL,) if is_present(folder / name)]
     files = files or [name for name in (LINEAR, GRAVITY) if is_present(folder / name)]
     if files == [LINEAR] or files == [GRAVITY] or not files:
@@ -106,12 +106,12 @@ def _specific_force(folder: Path, gyro: Rows, notes: list[Note]) -> Float64:
 
 
 def _is_ios(folder: Path) -> bool:
-    """Whether Metadata.csv names iOS, where accelerations have the other sign."""
+    """Whether Metadata.csv names iOS, where accelerations have the opposite sign."""
     path = folder / METADATA_CSV
     if not path.is_file():
         return False
     lines = scan_text(path, ImuError, HINT).head.lstrip("\ufeff").splitlines()
     if len(lines) < 2:
         return False
-    said = dict(zip((name.strip().lower() for name in lines[0].split(",")), lines[1].split(","), strict=False))
-    return said.get("platform", "").strip().lower() == "ios"
+    entries = dict(zip((name.strip().lower() for name in lines[0].split(",")), lines[1].split(","), strict=False))
+    return entries.get("platform", "").strip().lower() == "ios"

@@ -1,4 +1,4 @@
-"""What a reader of one kind of recording hands on: the same tables for every kind, and the names of their files."""
+"""The result of every reader of recordings: the same tables for every kind, and the names of their files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ MOVIE, STAMPS, METADATA = "movie.mp4", "frame_timestamps.txt", "movie_metadata.c
 GYRO, EPOCHS, UNFINISHED = "gyro_accel.csv", "edge_epochs.txt", ".marslogger_recording_in_progress"
 ONE_CLOCK = "one clock"
 ORIGIN_NS = 1_000_000_000_000
-"""Stamp of the first frame where a recording has no clock but its own beginning: 1000 s, so that none is negative."""
+"""Timestamp of the first frame if a recording's clock starts with it: 1000 s, so that no time is negative."""
 
 
 @dataclass(frozen=True, slots=True)
 class FileNames:
-    """What messages call the files."""
+    """Names of the files in messages."""
 
     movie: str = MOVIE
     stamps: str = STAMPS
@@ -31,7 +31,7 @@ class FileNames:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A recording, read and not yet joined."""
+    """A recording that has been read but not yet joined."""
 
     kind: str
     """Such as ``MARSLogger`` or ``EuRoC``."""
@@ -44,13 +44,13 @@ class Source:
     epochs: EdgeEpochs
     names: FileNames = FileNames()
     profile: CameraProfile | None = None
-    """What the recorder says of camera and axes; None: nothing beyond the metadata."""
+    """The recorder's description of camera and axes; None: nothing beyond the metadata."""
     inputs: tuple[Path, ...] = ()
     """Files that were read."""
 
 
 def list_names(folder: Path) -> list[str]:
-    """Names in a folder, sorted. Raises CaptureError where it cannot be listed."""
+    """Names in a folder, sorted. Raises CaptureError if it cannot be listed."""
     try:
         return sorted(entry.name for entry in folder.iterdir())
     except OSError as fault:
@@ -71,5 +71,5 @@ def find_movie(folder: Path, stem: str | None = None) -> Path:
 
 
 def present(folder: Path, *names: str) -> tuple[Path, ...]:
-    """Those of the names that stand in the folder."""
+    """Paths of those names that exist in the folder."""
     return tuple(folder / name for name in names if is_present(folder / name))

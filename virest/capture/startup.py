@@ -1,8 +1,8 @@
-"""Start-up content lag: while the recorder starts, pictures are later than the stamps that they carry.
+"""Start-up content lag: while the recorder starts, frames show later content than their timestamps.
 
-Stamps queue up while the encoder starts and are then drawn with whatever picture is current; exact repeats of pictures
-use the lead up.  Two witnesses: the Unix columns (time from capture to encoder output falls to its steady value), and
-pictures that repeat although the phone turns.  A still phone repeats too, so pictures only count under motion.
+Timestamps queue up while the encoder starts and are then paired with whatever picture is current; exact repeats of
+pictures use up the queue.  There are two kinds of evidence: the Unix columns (the capture-to-encoder delay falls to its
+steady value), and frames that repeat although the phone rotates.  Repeats of a phone at rest do not count.
 """
 
 from __future__ import annotations
@@ -14,49 +14,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 LOOK_S = 2.0
-"""The queue is drained by then in every capture seen."""
+"""In every capture examined the queue was empty by then."""
 REPEAT_MAX_DIFFERENCE = 0.6
-"""Grey levels; a repeat coded by H.264 differs by 0.31–0.36, a picture of a moving phone by 2 and more."""
+"""Grey levels; a repeat coded by H.264 differs by 0.31–0.36, a frame of a moving phone by 2 or more."""
 REPEAT_MAX_SHARE = 0.25
-"""Of the median difference among the neighbours."""
+"""Largest difference of a repeat relative to the median difference of its neighbours."""
 NEIGHBOURS = 5
 MIN_MOTION_PX = 0.5
-"""Less than this between two frames by the gyroscope: pictures may be alike without being repeats."""
+"""With less predicted motion between two frames, pictures may be alike without being repeats."""
 MOTION_WINDOW_S = (-0.05, 0.45)
-"""Where the picture's true time may lie from its stamp."""
+"""Range of a picture's true time relative to its timestamp."""
 STEADY_PERCENTILE = 5.0
 MIN_LAGS = 5
 SUSPECT_SIZE = 0.75
-"""Part of its neighbours' median size below which a coded frame may be a repeat; the repeats of honor_v10 have 0.35 to
+"""A coded frame below this fraction of its neighbours' median size may be a repeat; repeats of honor_v10 have 0.35 to
 0.65 of it."""
 MOST_SUSPECTS = 24
-"""Frames beyond the start-up that are decoded for it, the smallest first: the cost does not grow with the movie."""
+"""Most frames after the start-up to decode, smallest first, so that the cost does not grow with the movie."""
 MOST_STALLED = 0.25
-"""Where more of the frames leave the encoder late than this part, that is how it works and no stall."""
+"""If a larger fraction of the frames leaves the encoder late, that is its normal operation and not a stall."""
 REPEATS_APART = 6
-"""Repeats that use a lag up come at most this many frames apart, the first one as long after the stall's beginning."""
+"""Repeats that use up a lag are at most this many frames apart, the first at most as many after the stall's start."""
 SETTLED_FRAMES = 10
-"""Repeats come at most six frames apart; this many quiet frames must follow before the start-up counts as over."""
+"""Frames without repeats that end the start-up; repeats are at most six frames apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Startup:
-    """What was seen of the start-up lag."""
+    """Evidence of the start-up lag."""
 
     frames: int = 0
-    """Leading frames whose pictures are, or may be, later than their stamps."""
+    """Number of leading frames whose content is, or may be, later than their timestamps."""
     lag_s: float | None = None
-    """Least lag of frame 0 that explains what was seen; None without a lag."""
+    """Smallest lag of frame 0 that explains the evidence; None without a lag."""
     repeats: tuple[int, ...] = ()
     """Frames that repeat their predecessor."""
     stalls: tuple[tuple[int, int], ...] = ()
-    """(first, last) frame of each later run whose pictures may be later than their stamps."""
+    """(first, last) frame of each later run whose content may be later than its timestamps."""
     unix_lag_s: tuple[float, float] | None = None
-    """Time from capture to encoder output at the first frame, and when steady; None: no Unix columns."""
+    """Delay from capture to encoder output at the first frame and in steady state; None: no Unix columns."""
 
 
 def picture_differences(pictures: list[NDArray[np.uint8] | None]) -> NDArray[np.float64]:
-    """(n,) mean absolute difference of each picture to the one before, grey levels; NaN at the first and lost ones."""
+    """(n,) mean absolute difference of each picture to its predecessor, grey levels; NaN if either is missing."""
     differences = np.full(len(pictures), np.nan)
     for i in range(1, len(pictures)):
         before, here = pictures[i - 1], pictures[i]
@@ -66,9 +66,9 @@ def picture_differences(pictures: list[NDArray[np.uint8] | None]) -> NDArray[np.
 
 
 def find_repeats(differences: NDArray[np.float64], motion_px: NDArray[np.float64]) -> tuple[int, ...]:
-    """Frames that repeat their predecessor although the phone turned.
+    """Frames that repeat their predecessor although the phone rotated.
 
-    differences: (n,) of :func:`picture_differences`; motion_px: (n,) expected from the gyroscope, a frame, about there.
+    differences: (n,) of :func:`picture_differences`; motion_px: (n,) of :func:`expected_motion_px`.
     """
     found = []
     for i in np.flatnonzero(differences < REPEAT_MAX_DIFFERENCE):
@@ -86,7 +86,7 @@ def expected_motion_px(
     focal_px: float,
     period_s: float,
 ) -> NDArray[np.float64]:
-    """(n,) pixels a frame that the phone's mean turning rate about each frame moves the picture's middle."""
+    """(n,) motion of the picture's centre, px per frame, from the phone's mean rotation rate around each frame."""
     speed = np.linalg.norm(gyro_rad_s[:, :2], axis=1)
     total = np.concatenate([[0.0], np.cumsum(speed)])
     first = np.searchsorted(imu_time_s, frame_time_s + MOTION_WINDOW_S[0])
@@ -96,7 +96,7 @@ def expected_motion_px(
 
 
 def suspects(packet_bytes: NDArray[np.int64], keyframes: tuple[int, ...], first: int) -> list[int]:
-    """Frames from ``first`` on that an encoder spent so little on that they may repeat their predecessor, rising."""
+    """Frames from ``first`` on that are coded so small that they may repeat their predecessor, in rising order."""
     if len(packet_bytes) - first < 2 * NEIGHBOURS:
         return []
     size = packet_bytes.astype(float)
@@ -112,11 +112,11 @@ def suspects(packet_bytes: NDArray[np.int64], keyframes: tuple[int, ...], first:
 def find_stalls(
     repeats: tuple[int, ...], unix_lag_s: NDArray[np.float64] | None, first: int, period_s: float
 ) -> tuple[tuple[int, int], ...]:
-    """(first, last) of the runs of frames from ``first`` on that may show pictures later than their stamps.
+    """(first, last) of the runs of frames from ``first`` on that may show later content than their timestamps.
 
-    An encoder that pauses draws what is current when it goes on, and repeats use the lead up: from REPEATS_APART frames
-    before a repeat to the last one.  Unix columns: the time from capture to encoder output rises above its median by
-    more than two periods.
+    An encoder that resumes after a pause takes the current picture, and repeats use up the lag: a run extends from
+    REPEATS_APART frames before a repeat to the last repeat.  Unix columns: the delay from capture to encoder output
+    exceeds its median by more than two periods.
     """
     late: set[int] = set()
     for repeat in repeats:
@@ -133,7 +133,7 @@ def find_stalls(
 def judge_startup(
     unix_lag_s: NDArray[np.float64] | None, repeats: tuple[int, ...], frame_count: int, period_s: float
 ) -> Startup:
-    """Put both witnesses together.
+    """Combine both kinds of evidence.
 
     unix_lag_s: (n,) encoder output − capture result of each frame, NaN where unknown; None without Unix columns.
     """

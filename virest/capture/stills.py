@@ -1,6 +1,6 @@
-"""Bracketed pictures of a still scene, with the light that each of them got.
+"""Bracketed pictures of a static scene, with the relative light of each.
 
-Two sources: a folder of stills whose exposure times stand in a CSV (``file,exposure_s``) or in their EXIF data, and a
+Two sources: a folder of stills with exposure times in a CSV (``file,exposure_s``) or in their EXIF data, and a
 MARSLogger capture whose logged exposure × ISO changes.  Light scales with exposure × ISO / f-number².
 """
 
@@ -29,7 +29,7 @@ COLUMNS = ("file", "exposure_s")
 MAX_STILLS = 64
 MAX_STILL_BYTES = 400 << 20
 MAX_SAMPLED_PX = 4_000_000
-"""Larger pictures are reduced by a whole factor, by means over squares."""
+"""Larger pictures are reduced by an integer factor, by block means."""
 MAX_CSV_LINE = 4096
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IFD_ENTRIES = 512
@@ -44,13 +44,13 @@ class Still:
     """One picture of a bracket."""
 
     file: str
-    """Its file name; of a capture ``frame 000017``, the first frame of those taken together."""
+    """Its file name; of a capture, for example ``frame 000017``, the first of the averaged frames."""
     levels: NDArray[Any]
-    """(h, w, 3) RGB grey levels 0 to 255; uint8, or float32 where the file has 16 bits or frames were averaged."""
+    """(h, w, 3) RGB grey levels 0 to 255; uint8, or float32 if the file has 16 bits or frames were averaged."""
     exposure_s: float
     """As listed."""
     gain: float = 1.0
-    """Light that ISO and f-number add, against the bracket's first picture."""
+    """Factor of ISO and f-number, relative to the bracket's first picture."""
 
     @property
     def exposure(self) -> float:
@@ -60,7 +60,7 @@ class Still:
 
 @dataclass(frozen=True, slots=True)
 class ExifExposure:
-    """What a camera wrote about one picture; None: not said."""
+    """Exposure data of one picture; None: not given."""
 
     exposure_s: float | None = None
     f_number: float | None = None
@@ -71,7 +71,7 @@ class ExifExposure:
 
 
 def read_bracket(folder: Path, exposures_csv: Path | None = None) -> tuple[list[Still], list[str]]:
-    """The pictures of a folder with their exposures, in order of their names, and what is worth knowing.
+    """The pictures of a folder with their exposures, in order of their names, and notes.
 
     Raises CaptureError for a folder without pictures, unknown exposures, faults of the CSV, pictures that cannot be
     decoded, and pictures of different sizes.
@@ -92,14 +92,14 @@ def read_bracket(folder: Path, exposures_csv: Path | None = None) -> tuple[list[
             notes.append(f"{count} not in {exposures_csv.name} and left out ({_some(spare)})")
         names = [name for name in names if name in listed]
     if len(names) > MAX_STILLS:
-        raise CaptureError(f"{folder}: {len(names)} pictures, at most {MAX_STILLS}", hint="list fewer in a CSV")
+        raise CaptureError(f"{folder}: {len(names)} pictures, at most {MAX_STILLS} allowed", hint="list fewer in a CSV")
     stills = [_read_still(folder / name, listed[name] if listed else None) for name in names]
     _require_one_size(stills)
     return _relative_gains(stills, notes), notes
 
 
 def _is_picture(path: Path) -> bool:
-    """By its name; hidden files, such as what a Mac leaves beside each picture, are none."""
+    """By its name; hidden files, such as macOS writes beside each picture, do not count."""
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
@@ -110,13 +110,13 @@ def _some(names: list[str]) -> str:
 def read_exposures(path: Path, names: list[str]) -> dict[str, float]:
     """Exposure times from a CSV with the columns ``file,exposure_s``; every file must be one of ``names``.
 
-    Raises CaptureError with the line for a missing or unknown column, a file that is not there or comes twice, and an
-    exposure that is no positive finite number.
+    Raises CaptureError with the line number for a missing or unknown column, a file that is missing or listed twice,
+    and an exposure that is not a positive finite number.
     """
     require_regular_file(path, hint="check the path given to --exposures")
     text = read_small_text(path)
     if "\0" in text:
-        raise CaptureError(f"{label(path)}: has NUL bytes, it is no plain text", hint="write file,exposure_s")
+        raise CaptureError(f"{label(path)}: has NUL bytes, so it is not plain text", hint="write file,exposure_s")
     found: dict[str, float] = {}
     header: list[str] | None = None
     for number, line in enumerate(text.splitlines(), 1):
@@ -131,10 +131,10 @@ def read_exposures(path: Path, names: list[str]) -> dict[str, float]:
         else:
             name, exposure_s = _csv_row(row, header, where, names)
             if name in found:
-                raise CaptureError(f"{where}: {name} comes twice", hint="keep one line a picture")
+                raise CaptureError(f"{where}: {name} is listed twice", hint="keep one line per picture")
             found[name] = exposure_s
     if not found:
-        raise CaptureError(f"{label(path)}: lists no pictures", hint="write a line file,exposure_s, then one a picture")
+        raise CaptureError(f"{label(path)}: lists no pictures", hint="write a line file,exposure_s, then the pictures")
     return found
 
 
@@ -157,14 +157,14 @@ def _csv_row(row: list[str], header: list[str], where: str, names: list[str]) ->
     cells = dict(zip(header, row, strict=True))
     name = cells["file"]
     if name not in names:
-        raise CaptureError(f"{where}: no picture {_shown(name)!r} in the folder", hint="names as they stand there")
+        raise CaptureError(f"{where}: no picture {_shown(name)!r} in the folder", hint="use the folder's file names")
     try:
         exposure_s = float(cells["exposure_s"])
     except ValueError:
         exposure_s = math.nan
     if not (math.isfinite(exposure_s) and exposure_s > 0):
         value = _shown(cells["exposure_s"])
-        raise CaptureError(f"{where}: exposure_s {value!r} is no positive number", hint="write seconds, such as 0.008")
+        raise CaptureError(f"{where}: exposure_s {value!r} is not above zero", hint="write seconds, such as 0.008")
     return name, exposure_s
 
 
@@ -189,7 +189,7 @@ def _read_still(path: Path, exposure_s: float | None) -> Still:
 
 def _decode(data: bytes, path: Path) -> NDArray[Any]:
     if data[:8] == PNG_SIGNATURE and not _whole_png(data):
-        raise CaptureError(f"{label(path)}: is cut short or damaged ({len(data)} bytes)", hint="copy the picture again")
+        raise CaptureError(f"{label(path)}: is cut off or damaged ({len(data)} bytes)", hint="copy the picture again")
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
@@ -234,8 +234,8 @@ def _relative_gains(stills: list[Still], notes: list[str]) -> list[Still]:
 def read_exif_exposure(data: bytes) -> ExifExposure:
     """Exposure time, f-number and ISO from a JPEG's APP1 segment, a PNG's eXIf chunk, or a TIFF file itself.
 
-    Bounded: every offset is checked, at most MAX_IFD_ENTRIES entries of two directories are read; damage reads as
-    "not said" (EXIF 2.32, CIPA DC-008; TIFF 6.0).
+    Bounded: every offset is checked, at most MAX_IFD_ENTRIES entries of two directories are read; damaged data count as
+    "not given" (EXIF 2.32, CIPA DC-008; TIFF 6.0).
     """
     block = _exif_block(data)
     try:
@@ -255,7 +255,7 @@ def _exif_block(data: bytes) -> bytes | None:
 
 
 def _whole_png(data: bytes) -> bool:
-    """Whether all chunks up to the end's are there and unharmed: the decoder prints its own complaint of others."""
+    """Whether all chunks up to IEND are complete; for broken ones the decoder would print a warning of its own."""
     at = 8
     while at + 12 <= len(data):
         size = int.from_bytes(data[at : at + 4], "big")
@@ -299,7 +299,7 @@ def _read_tiff(block: bytes) -> ExifExposure:
 
 
 def _directory(block: bytes, start: int, order: str) -> dict[int, float]:
-    """First value of the entries of one directory that are short, long or rational."""
+    """First value of each short, long or rational entry of one directory."""
     count = min(Struct(order + "H").unpack_from(block, start)[0], MAX_IFD_ENTRIES)
     entry, found = Struct(order + "HHI"), {}
     for i in range(count):
@@ -320,11 +320,11 @@ def _directory(block: bytes, start: int, order: str) -> dict[int, float]:
 
 
 def capture_bracket(capture: Capture) -> tuple[list[Still], list[str]]:
-    """The frames of a capture of a still scene as a bracket: one mean picture for each logged exposure × ISO.
+    """The frames of a capture of a static scene as a bracket: one mean picture for each logged exposure × ISO.
 
     At most MAX_GROUPS exposures, spread over those that occur, each the mean of up to FRAMES_PER_GROUP frames.  Frames
-    of the start-up (their picture is later than their stamp) are left out.  Raises CaptureError where no exposures
-    are logged, CalibrationError where all are alike.
+    of the start-up, whose content is later than their timestamps, are skipped.  Raises CaptureError if no exposures are
+    logged, CalibrationError if all are equal.
     """
     usable = [f for f in capture.frames if f.exposure_s and not {STARTUP, NO_STAMP} & set(f.skip_codes)]
     if not usable:
@@ -334,8 +334,8 @@ def capture_bracket(capture: Capture) -> tuple[list[Still], list[str]]:
     notes = [] if iso_known else ["ISO is not logged for every frame: light counted as exposure alone"]
     groups = _groups(usable, iso_known)
     if len(groups) < 2:
-        text = f"{capture.name}: its {len(usable)} frames have one exposure × ISO: a curve needs the scene at several"
-        raise CalibrationError(text, hint="film the still scene at exposures from dark to bright, 1 EV apart")
+        text = f"{capture.name}: its {len(usable)} frames have one exposure × ISO: a response curve needs several"
+        raise CalibrationError(text, hint="film a static scene at exposures from dark to bright, 1 EV apart")
     wanted = {f.index: n for n, group in enumerate(groups) for f in group}
     sums, counts = _mean_frames(capture, wanted, len(groups))
     first_iso = groups[0][0].iso or 1.0
@@ -349,7 +349,7 @@ def capture_bracket(capture: Capture) -> tuple[list[Still], list[str]]:
         for n, group in enumerate(groups)
         if counts[n]
     ]
-    notes.append(f"{sum(counts)} frames of {len(stills)} exposures, the mean of those of one exposure taken")
+    notes.append(f"{sum(counts)} frames at {len(stills)} exposures, averaged for each exposure")
     return stills, notes
 
 

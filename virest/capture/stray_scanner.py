@@ -1,11 +1,11 @@
 """Stray Scanner (iOS, LiDAR): ``rgb.mp4``, ``camera_matrix.csv``, ``odometry.csv`` and ``imu.csv``; depth is not used.
 
     camera_matrix.csv   3 × 3 intrinsics of the stored picture
-    odometry.csv        timestamp (s), frame, x, y, z, qx, qy, qz, qw[, ...]: a row for each frame
+    odometry.csv        timestamp (s), frame, x, y, z, qx, qy, qz, qw[, ...]: one row per frame
     imu.csv             timestamp (s), a_x, a_y, a_z, alpha_x, alpha_y, alpha_z (rad/s)
 
-All times are the phone's host time.  The published format calls accelerations m/s²; recordings with values in g are
-known, so the unit is told by gravity's size.  As everywhere on iOS the sign is that of gravity, not of the force felt.
+All times are the phone's host time.  The published unit of acceleration is m/s², but recordings in g exist, so the
+unit is detected from the magnitude of gravity.  As usual on iOS, the sign is that of gravity, not of specific force.
 Pictures are stored in landscape.  Source: the app's published data specification.
 """
 
@@ -29,7 +29,7 @@ from virest.errors import CaptureError
 
 MATRIX, ODOMETRY, IMU = "camera_matrix.csv", "odometry.csv", "imu.csv"
 IN_G, IN_M_S2 = (0.5, 2.0), (5.0, 15.0)
-"""Median size of the acceleration that tells its unit."""
+"""Ranges of the median acceleration by which its unit is detected."""
 PRINTED_NS = 1e3
 HINT = "copy the app's whole folder"
 
@@ -40,7 +40,7 @@ def is_stray_scanner(names: set[str]) -> bool:
 
 
 def read_stray_scanner(folder: Path, notes: list[Note]) -> Source:
-    """Read a scan.  Raises CaptureError for what is missing or cannot be used."""
+    """Read a scan.  Raises CaptureError for missing or unusable files."""
     path = find_movie(folder, "rgb")
     movie = probe_movie(path)
     rows = read_rows(folder / ODOMETRY, [1], error=CaptureError, hint=HINT)
@@ -66,13 +66,13 @@ def _read_motion(folder: Path, notes: list[Note]) -> GyroTable:
     elif IN_M_S2[0] <= typical <= IN_M_S2[1]:
         force = -accel
     else:
-        without_accelerometer(folder, f"accelerations of {typical:.2g} in the median are neither g nor m/s^2", notes)
+        without_accelerometer(folder, f"a median acceleration of {typical:.2g} is neither in g nor in m/s^2", notes)
         force = np.full_like(accel, np.nan)
     return make_gyro_table(path, rows.time_ns, np.hstack([rows.values[:, :3], force]), rows.rows, rows.dropped)
 
 
 def _with_matrix(profile: CameraProfile, path: Path, movie: MovieIndex) -> CameraProfile:
-    """Intrinsics of the file, where it holds nine numbers that a camera can have."""
+    """The profile with the file's intrinsics. Raises CaptureError for an implausible or unreadable matrix."""
     try:
         text = scan_text(path, CaptureError, HINT).head.replace(",", " ").split()
         matrix = np.array([float(value) for value in text[:9]]).reshape(3, 3)
@@ -81,7 +81,7 @@ def _with_matrix(profile: CameraProfile, path: Path, movie: MovieIndex) -> Camer
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     if not (0.3 <= fx / movie.width <= 3.0 and 0 < cx < movie.width and 0 < cy < movie.height):
         raise CaptureError(
-            f"{label(path)}: fx {fx:.4g}, cx {cx:.4g}, cy {cy:.4g} are none of a {movie.width}x{movie.height} picture",
+            f"{label(path)}: fx {fx:.4g}, cx {cx:.4g}, cy {cy:.4g} do not fit a {movie.width}x{movie.height} picture",
             hint="give a camera.yaml",
         )
     lens = Intrinsics(movie.width, movie.height, float(fx), float(fy), float(cx), float(cy))

@@ -1,6 +1,6 @@
-"""Tables of text: rows in, columns out, whatever recorder wrote them; what is dropped is counted by its reason.
+"""Text tables of any recorder, read by rows into columns; dropped rows are counted by reason.
 
-Times are whole nanoseconds and stay int64: seconds with decimals are split at the point, never sent through a float.
+Times are integer nanoseconds and stay int64: decimal seconds are split at the point, never converted through a float.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ ROWS_AT_ONCE = 100_000
 MAX_FIELDS = 16
 MANY_FIELDS = 64
 MAX_RATE_RAD_S = 200.0
-"""Phone gyroscopes end at 35 rad/s (2000 °/s); beyond this a row is damage, not motion."""
+"""The full scale of phone gyroscopes is 35 rad/s (2000 °/s); a row above this limit is damaged."""
 
 Int64 = NDArray[np.int64]
 Float64 = NDArray[np.float64]
 
 INTEGER = re.compile(r"[+-]?(?:\d{1,18}|[0-8]\d{18}|9[01]\d{17})")
-"""A whole number that fits in 64 bits; Unix nanoseconds have 19 digits."""
+"""An integer that fits in 64 bits; Unix nanoseconds have 19 digits."""
 DAMAGED_TIME = r"[+-]?(?:\d+[.,]\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)"
 EXCEL_HINT = "a spreadsheet has re-saved the file and lost the nanoseconds; copy the original from the phone again"
 
@@ -47,7 +47,7 @@ class GyroTable:
     gyro_rad_s: Float64
     """(n, 3), no NaN."""
     accel_m_s2: Float64
-    """(n, 3), NaN where there is none."""
+    """(n, 3), NaN where missing."""
     rows: int
     """Data rows read, dropped ones included."""
     dropped: dict[str, int] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class MetadataTable:
     focal_length_mm: Float64
     focus_dioptres: Float64
     unix_ns: Int64 | None
-    """(n,) when the capture result came, 0 where unreadable; None: no such column."""
+    """(n,) time of the capture result, 0 if unreadable; None: no such column."""
     rows: int
     dropped: dict[str, int] = field(default_factory=dict)
 
@@ -80,7 +80,7 @@ class StampTable:
     time_ns: Int64
     """(n,) camera clock; MARSLogger's are whole microseconds."""
     unix_ns: Int64 | None
-    """(n,) when the encoder handed the frame over, 0 where unreadable; None: no such column."""
+    """(n,) time of the encoder's output, 0 if unreadable; None: no such column."""
     rows: int
     dropped: dict[str, int] = field(default_factory=dict)
 
@@ -90,9 +90,9 @@ class EdgeEpochs:
     """The camera's clock against the IMU's (edge_epochs.txt)."""
 
     source: str
-    """``REALTIME``, ``UNKNOWN`` or ``not logged``; ``one clock`` where the format has only one."""
+    """``REALTIME``, ``UNKNOWN`` or ``not logged``; ``one clock`` if the format has only one."""
     differences_ns: tuple[int, ...]
-    """IMU clock − camera clock, one a row."""
+    """IMU clock − camera clock, one per row."""
 
     @property
     def mean_difference_ns(self) -> int | None:
@@ -101,11 +101,11 @@ class EdgeEpochs:
 
 
 def text_chunks(path: Path, separator: str = ",", fields: int = MAX_FIELDS) -> Iterator[pd.DataFrame]:
-    r"""The file's fields as text, ``fields`` columns, a bounded number of rows at once; absent fields are ''.
+    r"""The file's fields as text in ``fields`` columns, in chunks of ROWS_AT_ONCE rows; missing fields are ''.
 
     separator: a comma, or ``\s+`` for any white space.
     """
-    import pandas as pd  # a quarter of a worker's start, and workers read no tables
+    import pandas as pd  # imported here because it takes a quarter of a worker's start, and workers read no tables
 
     options: dict[str, Any] = {
         "header": None,
@@ -146,7 +146,7 @@ def numbers(column: Any) -> Float64:
 
 
 def whole_numbers(column: Any) -> Int64:
-    """Text to int64, exactly; 0 where it is no whole number."""
+    """Text to int64, exactly; 0 where it is not an integer."""
     text = column.str.strip()
     whole = text.str.fullmatch(INTEGER).to_numpy()
     values = np.zeros(len(text), np.int64)
@@ -155,10 +155,10 @@ def whole_numbers(column: Any) -> Int64:
 
 
 def strictly_rising(times: Int64) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Mask of rows to keep so that times rise strictly, and how many were equal or fell.
+    """Mask of the rows to keep so that times rise strictly, and the number of dropped rows by reason.
 
-    The first of equal times stays.  A single time far ahead of its successors is dropped alone: where dropping what
-    falls would cost more rows, the longest rising subsequence is kept.
+    Of equal times the first is kept.  A single time far ahead of its successors is dropped alone: if dropping all later
+    smaller times would cost more rows, the longest rising subsequence is kept instead.
     """
     keep = np.ones(len(times), bool)
     if len(times) < 2:
@@ -200,7 +200,7 @@ def _longest_rising(values: Int64) -> NDArray[np.bool_]:
 
 
 def keep_rising(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.bool_]:
-    """The mask of :func:`strictly_rising`, its losses counted. Raises ClockError where most rows would go."""
+    """The mask of :func:`strictly_rising`, dropped rows counted. Raises ClockError if most rows would be dropped."""
     keep, lost = strictly_rising(times)
     if len(times) > 2 and keep.sum() * 2 <= len(times):
         raise ClockError(
@@ -215,23 +215,23 @@ def keep_rising(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.b
 # ── any table of numbers ─────────────────────────────────────────────────────────────────────────────────────────
 
 Times = Callable[[Any, Path], tuple[Int64, NDArray[np.bool_]]]
-"""Text of the first column to (whole nanoseconds, which rows have a time)."""
+"""Text of the first column to (integer nanoseconds, mask of the rows that have a time)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """A table of numbers with a time in front."""
+    """A table of numbers with the time in its first column."""
 
     time_ns: Int64
     """(n,) strictly rising."""
     values: Float64
-    """(n, columns) NaN where a field is empty or no number."""
+    """(n, columns), NaN where a field is empty or not a number."""
     rows: int
     dropped: dict[str, int]
 
 
 def exact_times_ns(text: Any, path: Path, *, whole_are_seconds: bool = False) -> tuple[Int64, NDArray[np.bool_]]:
-    """Whole nanoseconds of times written as such, or as seconds with decimals; cut, not rounded, below one.
+    """Integer nanoseconds of times written as such or as decimal seconds, truncated below 1 ns.
 
     Raises ClockError for exponents, which a spreadsheet writes after it has lost the nanoseconds.
     """
@@ -253,7 +253,7 @@ def exact_times_ns(text: Any, path: Path, *, whole_are_seconds: bool = False) ->
 
 
 def scaled_times_ns(scale_s: float) -> Times:
-    """Make a reader of times that count steps of ``scale_s`` seconds."""
+    """A reader of times counted in units of ``scale_s`` seconds."""
 
     def read(text: Any, _path: Path) -> tuple[Int64, NDArray[np.bool_]]:
         values = numbers(text) * (scale_s * 1e9)
@@ -273,9 +273,9 @@ def read_rows(
     error: type[CaptureError] = ImuError,
     hint: str = "",
 ) -> Rows:
-    """Read the numbers of ``columns``; the time stands in column 0.  Comments and headers (text for a time) are passed.
+    """Read the numbers of ``columns``; column 0 is the time.  Comments and headers (text for a time) are skipped.
 
-    required: how many of the columns a row must have.  Raises ``error`` (missing, no text), ClockError (times).
+    required: number of leading columns that a row must have.  Raises ``error`` (missing, not text), ClockError (times).
     """
     scan = scan_text(path, error, hint)
     dropped: Counter[str] = Counter()
@@ -285,8 +285,8 @@ def read_rows(
         time_ns, good = times(chunk[0], path)
         table = np.stack([numbers(chunk[column]) for column in columns], axis=1)
         enough = np.isfinite(table[:, :required]).all(axis=1)
-        said = chunk[0].str.strip()
-        is_text = ((said == "") | said.str.startswith("#")).to_numpy()
+        time_text = chunk[0].str.strip()
+        is_text = ((time_text == "") | time_text.str.startswith("#")).to_numpy()
         first = int(np.argmax(good)) if good.any() else len(good)
         head = ~good & (np.arange(len(good)) < (0 if begun else first))
         begun = begun or bool(good.any())
@@ -299,13 +299,13 @@ def read_rows(
     rows = len(time_ns) + sum(dropped.values())
     keep = keep_rising(time_ns, path, dropped)
     if last_is_good and not scan.ends_with_newline and len(keep) > 1 and keep[-1] and _looks_cut(path, separator):
-        keep[-1] = False  # its last number may be cut and still read as one
+        keep[-1] = False  # a truncated last number may still parse
         dropped["last line without its end"] += 1
     return Rows(time_ns[keep], values[keep], rows, dict(+dropped))
 
 
 def _looks_cut(path: Path, separator: str) -> bool:
-    """Whether the last line is shorter than the one before by more than numbers vary: cut in its middle."""
+    """Whether the last line has fewer fields, or a shorter last field, than the line before: a truncated file."""
     with path.open("rb") as stream:
         stream.seek(max(path.stat().st_size - 4096, 0))
         lines = stream.read().decode("utf-8", errors="replace").splitlines()
@@ -317,7 +317,7 @@ def _looks_cut(path: Path, separator: str) -> bool:
 def make_gyro_table(
     path: Path, time_ns: Int64, samples: Float64, rows: int, dropped: dict[str, int], hint: str = ""
 ) -> GyroTable:
-    """Inertial samples (n, 6), rad/s and m/s², without those that no gyroscope gave. Raises ImuError."""
+    """Inertial samples (n, 6), rad/s and m/s², without missing or impossible rates. Raises ImuError."""
     counts = Counter(dropped)
     known = np.isfinite(samples[:, :3]).all(axis=1)
     plausible = (np.abs(np.where(np.isfinite(samples[:, :3]), samples[:, :3], 0.0)) <= MAX_RATE_RAD_S).all(axis=1)
@@ -337,7 +337,7 @@ PLAUSIBLE = {
     "fx_px": (1.5, 1e6),  # 1.0 is the logger's "unknown"
     "fy_px": (1.5, 1e6),
     "exposure_s": (1e-7, 10.0),
-    "readout_time_s": (1e-6, 0.5),  # 0 is written by phones that do not know it
+    "readout_time_s": (1e-6, 0.5),  # phones write 0 for unknown
     "iso": (1e-3, 1e7),
     "focal_length_mm": (0.1, 1000.0),
     "focus_dioptres": (0.0, 100.0),
@@ -347,7 +347,7 @@ PLAUSIBLE = {
 def make_metadata_table(
     time_ns: Int64, rows: int, dropped: dict[str, int], unix_ns: Int64 | None = None, **columns: Float64
 ) -> MetadataTable:
-    """What was logged for each frame; NaN for a column that is not given and for values that no camera has."""
+    """The metadata of each frame; NaN for missing columns and implausible values."""
     values = {}
     for name, (low, high) in PLAUSIBLE.items():
         given = columns.get(name, np.full(len(time_ns), np.nan))

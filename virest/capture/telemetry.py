@@ -28,7 +28,7 @@ INSTALL = "pip install 'virest[telemetry]'"
 def read_telemetry(folder: Path, notes: list[Note]) -> Source:
     """Read a movie and the samples inside it.
 
-    Raises VideoError, and ImuError where the movie holds none or the package is not installed.
+    Raises VideoError, and ImuError if the movie holds no samples or the package is not installed.
     """
     path = find_movie(folder)
     movie = probe_movie(path)
@@ -54,7 +54,7 @@ def _parse(path: Path) -> tuple[str, list[dict[str, Any]]]:
         parser = telemetry_parser.Parser(str(path.absolute()))
         camera = " ".join(part for part in (parser.camera, parser.model) if part)
         return camera, parser.normalized_imu()
-    # the package is Rust: what it refuses comes as OSError or ValueError, what it stumbles over as a panic
+    # the package is Rust: it raises OSError or ValueError for bad input, and a panic on internal errors
     except BaseException as fault:
         if isinstance(fault, KeyboardInterrupt | SystemExit | MemoryError):
             raise
@@ -70,7 +70,7 @@ def _short(fault: BaseException) -> str:
 
 
 def gyro_table(path: Path, samples: list[dict[str, Any]]) -> GyroTable:
-    """Samples of the package as a table; a row without gyroscope is dropped, one without accelerometer is NaN there."""
+    """The package's samples as a table; rows without gyroscope are dropped, a missing acceleration is NaN."""
     time_ms = np.array([row.get("timestamp_ms", np.nan) for row in samples], float).reshape(-1)
     gyro = np.deg2rad(_vectors(samples, "gyro"))
     accel = _vectors(samples, "accl")
@@ -79,11 +79,11 @@ def gyro_table(path: Path, samples: list[dict[str, Any]]) -> GyroTable:
     dropped: Counter[str] = Counter({"no time": int((~known).sum())})
     keep = keep_rising(time_ns, path, dropped)
     values = np.hstack([gyro, accel])[known][keep]
-    hint = "the movie's telemetry has no gyroscope; was it a copy, or a mode without?"
+    hint = "the movie's telemetry has no gyroscope; is it a copy, or a mode that does not record it?"
     return make_gyro_table(path, time_ns[keep], values, len(samples), dict(+dropped), hint)
 
 
 def _vectors(samples: list[dict[str, Any]], key: str) -> Float64:
-    """(n, 3) NaN where there is none."""
+    """(n, 3), NaN where missing."""
     nothing = (np.nan, np.nan, np.nan)
     return np.array([row.get(key) or nothing for row in samples], float).reshape(-1, 3)

@@ -1,7 +1,7 @@
-"""The movie: where its frames lie, and their pixels.
+"""The movie: the index of its frames, and their pixels.
 
-A frame is known by its presentation time (PTS), never by counting.  Pictures come as stored: the display rotation is
-left alone, so that the profile's intrinsics hold.
+A frame is identified by its presentation time (PTS), never by counting.  Pictures are returned as stored: the display
+rotation is not applied, so that the profile's intrinsics hold.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ log = logging.getLogger(__name__)
 
 MAX_SIDE_PX = 16384
 MAX_PIXELS = 40_000_000
-"""8K and a margin; held against the size that the pictures themselves say, too, before memory is asked for."""
+"""8K and a margin; also checked against the coded pictures' own size before memory is allocated."""
 MAX_FRAMES = 2_000_000
-"""Eighteen hours at 30 frames/s."""
+"""18 hours at 30 frames/s."""
 MAX_BLOCK_BYTES = 1 << 28
-"""The largest piece of memory that FFmpeg may ask for: tables of contents promise millions of frames in a few bytes."""
+"""Largest block of memory that FFmpeg may allocate: an index can declare millions of frames in a few bytes."""
 CONTAINER = "mov"
-"""MP4, QuickTime and 3GP. Named, so that no playlist in a movie's clothes makes the reader open other files."""
+"""MP4, QuickTime and 3GP.  Fixed, so that a playlist named like a movie cannot make the reader open other files."""
 OTHER_MOVIES: dict[str, Callable[[bytes], bool]] = {
     "a Matroska or WebM movie": lambda head: head.startswith(b"\x1a\x45\xdf\xa3"),
     "an AVI movie": lambda head: head[:4] == b"RIFF" and head[8:12] == b"AVI ",
 }
-"""Containers that are not read, by their first bytes."""
+"""Unsupported containers, by their first bytes."""
 OWN_SUFFIXES = (".mp4", ".m4v", ".mov", ".3gp")
 MOVIE_SUFFIXES = (*OWN_SUFFIXES, ".mkv", ".webm", ".avi")
 CENTRED_CHROMA = {"mjpeg", "mpeg1video"}
-"""Codecs whose chroma lies between two columns of luma."""
+"""Codecs whose chroma samples lie between two columns of luma."""
 HDR_CURVES = {16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}
-"""Transfer curves that no response curve here describes."""
+"""Transfer curves that no supported response curve describes."""
 
 
 @dataclass(frozen=True, slots=True)
 class MovieIndex:
-    """Where the frames of a movie lie, in presentation order."""
+    """The index of a movie's frames, in presentation order."""
 
     width: int
     """Pixels of a stored row."""
@@ -70,13 +70,13 @@ class MovieIndex:
     """Decoding time of each of them, for seeking."""
     codec: str = ""
     declared_frames: int = 0
-    """What the container's table promises; more than ``len``: the file was cut. 0: not said."""
+    """Number of frames in the container's index; more than ``len``: the file is truncated. 0: not given."""
     repeated_pts: int = 0
-    """Access units left out since another one has their time."""
+    """Access units dropped because another one has the same time."""
     pictures: tuple[str, ...] = ()
-    """Of a folder of pictures: their paths, from the folder or from the list's folder; empty for a movie."""
+    """Of a folder of pictures: their paths, relative to the folder or the list's folder; empty for a movie."""
     bits_per_px: float = inf
-    """What the encoder spent on a pixel of a frame, in the mean; inf for pictures, which are taken as they are."""
+    """The encoder's mean bits per pixel of a frame; inf for picture files."""
     packet_bytes: NDArray[np.int64] | None = None
     """(n,) size of each coded frame; None for pictures."""
 
@@ -102,7 +102,7 @@ class MovieIndex:
 def probe_movie(path: Path) -> MovieIndex:
     """Index the movie by its packets, without decoding; or the pictures of a list or a folder.
 
-    Raises VideoError for a missing, cut or foreign file, no video stream, and absurd sizes.
+    Raises VideoError for a missing, truncated or foreign file, no video stream, and impossible sizes.
     """
     if is_picture_source(path):
         return index_pictures(path, read_picture_list(path))
@@ -123,7 +123,7 @@ def probe_movie(path: Path) -> MovieIndex:
 
 
 def _unopened_hint(path: Path) -> str:
-    """What to do about a file that is no readable MP4, by its first bytes."""
+    """The hint for a file that is not a readable MP4, by its first bytes."""
     try:
         with path.open("rb") as stream:
             head = stream.read(16)
@@ -136,7 +136,7 @@ def _unopened_hint(path: Path) -> str:
 
 
 def _missing_movie_hint(path: Path) -> str:
-    """Name a movie of another name that lies where movie.mp4 should."""
+    """The hint for a missing movie.mp4, with the name of another movie in the folder."""
     needs = "a capture needs its movie.mp4"
     try:
         if isinstance(path, RemotePath) or path.exists():
@@ -152,17 +152,17 @@ def _missing_movie_hint(path: Path) -> str:
 
 
 def _check_curve(stream: Any, path: Path) -> None:
-    """Raise VideoError for HDR movies: read as if they were standard ones, their light would be wrong throughout."""
+    """Raise VideoError for HDR movies: read with a standard curve, their light would be wrong throughout."""
     curve = HDR_CURVES.get(int(stream.codec_context.color_trc or 0))
     if curve is not None:
         raise VideoError(
-            f"{label(path)}: is an HDR movie with the transfer curve {curve}, which is not read",
-            hint="film with HDR off, or convert it to BT.709 with its time stamps kept",
+            f"{label(path)}: is an HDR movie with the transfer curve {curve}, which is not supported",
+            hint="film with HDR off, or convert it to BT.709, keeping its timestamps",
         )
 
 
 def index_pictures(path: Path, found: PictureList) -> MovieIndex:
-    """Index listed pictures: ticks of a nanosecond, every picture one that the decoder can start from."""
+    """Index listed pictures: ticks of 1 ns, every picture a key frame."""
     width, height = first_size(found, path)
     _check_size(width, height, path)
     every = tuple(range(len(found.names)))
@@ -175,8 +175,8 @@ def read_frames(
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     """Stream frames ``first`` to ``last`` (both included, ends clipped) as (frame index, RGB (h, w, 3) or None).
 
-    None: the frame, or one that it depends on, cannot be decoded; later ones still come.  One is in memory at a time.
-    steps: takes each frame's :func:`coding_step`, where there is one, before the frame comes.
+    None: the frame, or one that it depends on, cannot be decoded; later ones still follow.  One frame is in memory.
+    steps: filled with each frame's :func:`coding_step`, if it has one, before the frame is yielded.
     """
     yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb, steps)
 
@@ -193,7 +193,7 @@ def read_gray(
 
 @dataclass(frozen=True, slots=True)
 class GrayReader:
-    """Luma of the frames asked for: what a process needs to read a movie by itself."""
+    """Reads the luma of requested frames; plain data that a worker process can use by itself."""
 
     movie: Path
     index: MovieIndex
@@ -208,7 +208,7 @@ class GrayReader:
 
 def _reason(fault: Exception) -> str:
     if getattr(fault, "errno", None) == errno.ENOMEM:
-        return "a piece of it claims a size that cannot be"  # FFmpeg has not asked for it, see _bound_memory
+        return "a part of it claims an impossible size"  # FFmpeg has not allocated it, see _bound_memory
     return (getattr(fault, "strerror", None) or str(fault)).lower()
 
 
@@ -216,7 +216,7 @@ def _reason(fault: Exception) -> str:
 def _opened(path: Path) -> Iterator[Any]:
     """The movie's container, with bounds on memory.
 
-    Raises `unreachable` where an address gives no bytes, for the movie may be sound.
+    Raises `unreachable` for a URL that gives no bytes, since the movie may be sound.
     """
     _bound_memory()
     bounds = {"max_pixels": str(MAX_PIXELS)}
@@ -232,14 +232,14 @@ def _opened(path: Path) -> Iterator[Any]:
         except OSError as fault:
             raise unreachable(path, fault) from None
         return
-    # An absolute path cannot be taken for a protocol ("http:...").
+    # An absolute path cannot be mistaken for a protocol ("http:...").
     with av.open(str(path.absolute()), format=CONTAINER, metadata_errors="replace", options=bounds) as container:
         yield container
 
 
 @lru_cache(maxsize=1)
 def _bound_memory() -> bool:
-    """Have FFmpeg refuse blocks above MAX_BLOCK_BYTES; False where its library cannot be told apart (not Linux)."""
+    """Have FFmpeg refuse blocks above MAX_BLOCK_BYTES; False if its library cannot be found (not Linux)."""
     try:
         mapped = Path("/proc/self/maps").read_text().splitlines()
         libraries = {line.split(maxsplit=5)[-1] for line in mapped if "/libavutil" in line}  # OpenCV brings one too
@@ -255,14 +255,14 @@ def _video_stream(container: Any, path: Path) -> Any:
         raise VideoError(f"{label(path)}: has no video stream", hint="is it the movie of this capture?")
     stream = container.streams.video[0]
     if stream.codec_context is None:
-        raise VideoError(f"{label(path)}: its video codec is not known", hint="convert it to H.264, time stamps kept")
+        raise VideoError(f"{label(path)}: its video codec is unknown", hint="convert it to H.264, timestamps kept")
     return stream
 
 
 def _check_size(width: int, height: int, path: Path) -> None:
     if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and width * height <= MAX_PIXELS):
-        text = f"{label(path)}: picture size {width}x{height}, at most {MAX_SIDE_PX} px a side and {MAX_PIXELS} in all"
-        raise VideoError(text, hint="is it damaged?")
+        text = f"{label(path)}: picture size {width}x{height}; at most {MAX_SIDE_PX} px per side, {MAX_PIXELS} in all"
+        raise VideoError(text, hint="is the file damaged?")
 
 
 def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> MovieIndex:
@@ -278,7 +278,8 @@ def _index(container: Any, stream: Any, width: int, height: int, path: Path) -> 
     except av.FFmpegError as fault:
         log.warning("%s: reading stopped after %d frames: %s", label(path), len(rows), _reason(fault))
     if not rows:
-        raise VideoError(f"{label(path)}: has no frames", hint="the recording was not stopped cleanly or the copy cut")
+        hint = "the recording was not stopped cleanly, or the copy is incomplete"
+        raise VideoError(f"{label(path)}: has no frames", hint=hint)
     table = np.array(rows, np.int64)
     order = np.argsort(table[:, 0], kind="stable")
     table = table[order]
@@ -322,8 +323,8 @@ def _read(
                 stream = _video_stream(container, path)
                 stream.thread_type = "NONE"
                 stream.codec_context.thread_count = 1
-                told = {} if steps is None else {"export_side_data": "venc_params"}
-                stream.codec_context.options = {"max_pixels": str(MAX_PIXELS), **told}
+                extra = {} if steps is None else {"export_side_data": "venc_params"}
+                stream.codec_context.options = {"max_pixels": str(MAX_PIXELS), **extra}
                 for frame_index, frame in _in_order(run, _decoded(container, stream, index, run[0])):
                     usable = frame is not None and (frame.width, frame.height) == (index.width, index.height)
                     step = coding_step(frame) if usable and steps is not None else None
@@ -335,7 +336,7 @@ def _read(
 
 
 def _runs(index: MovieIndex, frames: Iterable[int]) -> Iterator[range | list[int]]:
-    """Split wanted frames where seeking to the next key frame saves decoding."""
+    """Split requested frames where seeking to the next key frame saves decoding."""
     if isinstance(frames, range) and frames.step == 1:
         if len(frames):
             yield frames
@@ -351,7 +352,7 @@ def _runs(index: MovieIndex, frames: Iterable[int]) -> Iterator[range | list[int
 
 
 def _in_order(wanted: range | list[int], decoded: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
-    """Pick the wanted frames out of those decoded; None where one never came."""
+    """Pick the requested frames from the decoded ones; None for a frame that is missing."""
     position = 0
     for frame_index, frame in decoded:
         while position < len(wanted) and wanted[position] < frame_index:
@@ -388,15 +389,15 @@ def _decoded(container: Any, stream: Any, index: MovieIndex, first: int) -> Iter
                 broken_since = frame.pts if broken_since is None else broken_since
             elif frame.key_frame and broken_since is not None and frame.pts > broken_since:
                 broken_since = None
-            # What follows a lost picture is predicted from it: wrong, up to the next key frame.
+            # Frames after a lost one are predicted from it, hence wrong up to the next key frame.
             lost = broken_since is not None and frame.pts >= broken_since
             yield lookup[int(frame.pts)], None if lost else frame
 
 
 def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    """Packets up to the end of what can be read, then the flushing one: empty, or None where the reading failed."""
+    """Packets up to the end of the readable data, then a flush packet: empty, or None after a read error."""
     try:
         yield from container.demux(stream)
     except av.FFmpegError as fault:
-        log.warning("the movie's data end early: %s", _reason(fault))
+        log.warning("the movie's data end prematurely: %s", _reason(fault))
         yield None

@@ -17,7 +17,7 @@ from virest.errors import SettingsError
 
 Array = NDArray[np.float64]
 CUTOFFS_HZ = (0.02, 20.0)
-"""A stabiliser's cutoff is held between these while it is fitted."""
+"""Bounds of a stabiliser's cutoff while it is fitted."""
 
 
 def lens_of(profile: CameraProfile) -> Intrinsics:
@@ -64,18 +64,18 @@ def scale_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
 
 
 def delay_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
-    """Add v[0] seconds to the delay of the gyroscope's low pass; a negative one is no filter's."""
+    """Add v[0] seconds to the delay of the gyroscope's low-pass filter; no physical filter has a negative delay."""
     late_s = delay_s(profile.extensions.gyro_lowpass_hz) + float(v[0])
     return extended(profile, gyro_lowpass_hz=cutoff_hz(late_s))
 
 
 def lengthen_readout(profile: CameraProfile, v: Array) -> CameraProfile:
-    """Add v[0] seconds to the readout, the first row kept where it was."""
+    """Add v[0] seconds to the readout time; the first row keeps its time."""
     return with_shutter(profile, readout_time_s=max(profile.shutter.readout_time_s + float(v[0]), 0.0))
 
 
 def keep_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
-    """Put the given readout back, the picture's middle row kept where it was."""
+    """Restore the given readout time and direction; the middle row keeps its time."""
     middle = (profile.time_offset_s or 0.0) + 0.5 * profile.shutter.readout_time_s
     readout_time_s, direction = given.shutter.readout_time_s, given.shutter.readout_direction
     back = with_shutter(profile, readout_time_s=readout_time_s, readout_direction=direction)
@@ -83,7 +83,7 @@ def keep_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
 
 
 def keep_lens(*names: str) -> Callable[[CameraProfile, CameraProfile], CameraProfile]:
-    """A function that puts these values of a given lens back; where none was given, there is none."""
+    """A function that restores these values of a given lens; without a given lens the profile has none either."""
 
     def keep(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
         lens, before = profile.intrinsics, given.intrinsics
@@ -95,12 +95,12 @@ def keep_lens(*names: str) -> Callable[[CameraProfile, CameraProfile], CameraPro
 
 
 def keep_value(name: str) -> Callable[[CameraProfile, CameraProfile], CameraProfile]:
-    """A function that puts a given value back."""
+    """A function that restores a given value."""
     return lambda profile, given: replace(profile, **{name: getattr(given, name)})
 
 
 def add_readout(profile: CameraProfile, v: Array) -> CameraProfile:
-    """Add v[0] seconds to the readout, the picture's middle row kept where it was; through 0 it turns about."""
+    """Add v[0] seconds to the readout time; the middle row keeps its time.  A negative sum reverses the direction."""
     signed = profile.shutter.readout_time_s + float(v[0])
     return with_shutter(shift_offset(profile, np.array([-0.5 * v[0]])), readout_time_s=signed)
 
@@ -143,7 +143,7 @@ def shift_principal_point(profile: CameraProfile, v: Array) -> CameraProfile:
 
 
 def principal_shift(before: CameraProfile, after: CameraProfile) -> Array:
-    """How far (2,) the principal point has moved, px."""
+    """Displacement (2,) of the principal point, px."""
     if before.intrinsics is None or after.intrinsics is None:
         return np.zeros(2)
     one, other = before.intrinsics, after.intrinsics
@@ -161,7 +161,7 @@ def drift_focal(profile: CameraProfile, v: Array) -> CameraProfile:
 
 
 def stabilise(profile: CameraProfile, v: Array) -> CameraProfile:
-    """Add v[0] to the stabiliser's fraction, multiply its cutoff by exp(v[1]), add v[2:] rad to its lean at first."""
+    """Add v[0] to the stabiliser's fraction, multiply its cutoff by exp(v[1]), add v[2:] rad to its initial lean."""
     before = profile.extensions
     lean = before.stabilisation_lean_rad
     return extended(
@@ -173,7 +173,7 @@ def stabilise(profile: CameraProfile, v: Array) -> CameraProfile:
 
 
 def stabilised_between(before: CameraProfile, after: CameraProfile) -> Array:
-    """(4,) the fraction's change; a cutoff has no nought to count from, and the lean is no part of the cause."""
+    """(4,) the fraction's change, else 0: a cutoff has no zero to count from, and the lean is not part of the cause."""
     change = after.extensions.stabilisation_fraction - before.extensions.stabilisation_fraction
     return np.array([change, 0.0, 0.0, 0.0])
 

@@ -1,4 +1,4 @@
-"""What the table of effects says of each: names, values, steps of a fit, and the words for it."""
+"""The records of the table of effects: names, values, steps of a fit, and texts."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Parameter:
     """One value of an effect, as findings and ``simulate`` name it."""
 
     name: str
-    """Its ending tells its unit: _s, _px, _hz, _rad, _rad_s, _per_s, _m; without one it is a ratio or a word."""
+    """Its ending gives the unit: _s, _px, _hz, _rad, _rad_s, _per_s, _m; without one it is a ratio or a word."""
     get: Callable[[CameraProfile, CameraProfile], Any]
-    """Its value in a profile, the first; of values that count from the profile as given, that is the second."""
+    """Its value in a profile (first argument), relative to the given profile (second) where it is a change."""
     spread: Callable[[Any, Array], Any]
-    """Its deviation, from its value and the deviations (k,) of the effect's steps."""
+    """Its standard deviation, from its value and the standard deviations (k,) of the effect's steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """How a fit of tracked points moves an effect's values: by a vector of k steps, additive or in logarithms."""
+    """How a fit of tracked points changes an effect's values: by a vector of k steps, additive or logarithmic."""
 
     change: Callable[[CameraProfile, Array], CameraProfile]
     """The profile with steps (k,) added."""
@@ -41,11 +41,11 @@ class Steps:
     limit: tuple[float, ...]
     """(k,) largest step in one iteration."""
     prior_std: tuple[float, ...]
-    """(k,) of all steps together; inf: none."""
+    """(k,) prior standard deviation of the total change; inf: no prior."""
     believable: float
-    """No phone is off by more: such steps stand in for something else."""
+    """No phone is off by more: larger steps absorb another effect."""
     starts: tuple[tuple[float, ...], ...] = ()
-    """Steps to begin from, besides none."""
+    """Further starting points of the fit, besides zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,20 +59,20 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """How ``virest calibrate`` prints, keeps and judges the value that an effect's steps are fitted to."""
+    """How ``virest calibrate`` prints, keeps and checks the value that an effect's steps change."""
 
     name: str
-    """Of the value, as in ``estimates``."""
+    """Name of the value in ``estimates``."""
     read: Callable[[CameraProfile], float | list[float] | None]
-    """None: not known, or counted from where it began."""
+    """The value; None: unknown, or a change relative to the starting profile."""
     keep: Callable[[CameraProfile, CameraProfile], CameraProfile]
-    """The first profile with this value of the second."""
+    """The first profile with this value taken from the second."""
     max_std: float
-    """Of the steps; a value known no better is not determined and stays where it was."""
+    """Standard deviation of the steps above which the value is not determined and keeps its starting value."""
     option: str = ""
-    """Of ``--with``; empty: it is always fitted."""
+    """Its word for ``--with``; empty: always fitted."""
     believable: float = np.inf
-    """Held fixed: a larger change absorbs something else, such as a stabiliser or stamps of another meaning."""
+    """A larger change absorbs another effect, such as a stabiliser or another timestamp reference: hold it fixed."""
     is_factor: bool = False
     """Steps are natural logarithms of a factor."""
 
@@ -82,33 +82,33 @@ class Effect:
     """One way in which a camera differs from its profile."""
 
     name: str
-    """Of ``simulate --effect``, ``diagnose`` and ``extended.yaml``."""
+    """Name in ``simulate --effect``, ``diagnose`` and ``extended.yaml``."""
     seen_in: str
-    """The evidence that it is judged by."""
+    """The evidence that decides on it."""
     parameters: tuple[Parameter, ...]
     place: str
-    """Keys of the profile's file; empty: none, for restoring does not undo it."""
+    """Keys in the profile's file; empty: none, because restoration does not undo the effect."""
     in_words: str
-    """What it is, for people."""
+    """Short description for users."""
     sentence: str
-    """What was found; {} is filled with the parameters."""
+    """The finding as a sentence; {} is filled with the parameters."""
     steps: Steps | None = None
     """None: not fitted to points, or not by steps of a profile."""
     choice: Choice | None = None
     calibrated: Calibrated | None = None
-    """None: no value of ``virest calibrate``."""
+    """None: not a value of ``virest calibrate``."""
     applied: Callable[[CameraProfile], str] = lambda profile: ""
-    """What restoring makes of it; empty: the profile does not have it, or states it as one of its plain values."""
+    """Log line on how restoration handles it; empty: the profile lacks it, or states it as one of its plain values."""
 
     @property
     def in_points(self) -> bool:
-        """Whether tracked points are fitted by steps or words of it."""
+        """Whether a fit of tracked points can change it, by steps or by its word."""
         return self.steps is not None or self.choice is not None
 
     def read(self, profile: CameraProfile, given: CameraProfile) -> dict[str, Any]:
-        """Its parameters in a profile, counted from the one given."""
+        """Its parameters in a profile, relative to the given one."""
         return {parameter.name: parameter.get(profile, given) for parameter in self.parameters}
 
     def spread(self, values: dict[str, Any], std: Array) -> dict[str, Any]:
-        """Deviations of its parameters from those of its steps (k,)."""
+        """Standard deviations of its parameters, from those of its steps (k,)."""
         return {parameter.name: parameter.spread(values[parameter.name], std) for parameter in self.parameters}

@@ -1,7 +1,7 @@
-"""The table of effects: one entry each, and nowhere else.
+"""The table of effects: each effect has one entry here and nowhere else.
 
-An effect is added here, in the forward model (``image_formation`` or ``motion``), and, from its definition, in the
-simulator.  Light effects are fitted by the estimators of their evidence; those that move points by their steps here.
+To add an effect, add it here, to the forward model (``image_formation`` or ``motion``) and, from its definition, to the
+simulator.  Effects on points are fitted by the steps given here, effects on light by the estimators of their evidence.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _own(value: Any, std: Array) -> float:
 
 
 def _relative(value: Any, std: Array) -> float:
-    """The step is a logarithm."""
+    """Deviation of a value whose step is a logarithm."""
     return float(std[0]) * abs(float(value))
 
 
@@ -46,7 +46,7 @@ def _of_cutoff(value: Any, std: Array) -> float:
 
 
 def _none(value: Any, std: Array) -> None:
-    """Its estimator says it."""
+    """No deviation from steps: the estimator reports it."""
 
 
 def _value(name: str, read: Read, spread: Callable[[Any, Array], Any] = _own) -> tuple[Parameter, ...]:
@@ -79,13 +79,13 @@ def _applied(size: str, text: str) -> Callable[[CameraProfile], str]:
 
 
 GYRO_SCALE_OFF = 0.15
-"""Makers trim gyroscopes to 3 % (BMI160, LSM6DSO, ICM-20602: sensitivity tolerance); five times that is a fault."""
+"""Five times the 3 % sensitivity tolerance of phone gyroscopes (BMI160, LSM6DSO, ICM-20602): beyond it is a fault."""
 ANOTHER_LENS = 1.2
-"""In logarithms: a phone's lenses lie between 0.5 and 3 times the main one."""
+"""Logarithm of the focal ratio: a phone's other lenses have 0.5 to 3 times the focal length of the main one."""
 SENSOR_TURNED = 3.2
-"""Radians: a sensor may sit any way round, and drivers swap and turn its axes."""
+"""Radians: a sensor may be mounted in any orientation, and drivers swap and flip its axes."""
 CLOCK_SKEW_OFF = 0.02
-"""Crystals keep 1e-4, recorders that write another clock's rate 0.5 %."""
+"""Above any real skew: crystals agree to 1e-4, and recorders that write another clock's rate are off by 0.5 %."""
 
 _POINTS = (
     Effect(
@@ -93,8 +93,8 @@ _POINTS = (
         GEOMETRY,
         _value("time_offset_s", lambda p: p.time_offset_s),
         "imu.time_offset_s",
-        "camera and gyroscope clocks stand apart",
-        "the inertial clock runs {time_offset_s} s off the camera's",
+        "camera and IMU clocks differ by an offset",
+        "the IMU clock is offset from the camera clock by {time_offset_s} s",
         Steps(
             by.shift_offset,
             _difference(lambda p: p.time_offset_s or 0.0),
@@ -111,8 +111,8 @@ _POINTS = (
         GEOMETRY,
         _value("clock_skew", lambda p: p.clock_skew),
         "imu.clock_skew",
-        "one of the two clocks runs faster",
-        "the two clocks drift apart by {clock_skew} s a second",
+        "camera and IMU clocks run at different rates",
+        "the camera and IMU clocks drift apart by {clock_skew} s per second",
         Steps(
             by.skew_clock,
             _difference(lambda p: p.clock_skew),
@@ -131,8 +131,8 @@ _POINTS = (
         GEOMETRY,
         _value("readout_time_s", lambda p: p.shutter.readout_time_s),
         "shutter.readout_time_s",
-        "the rows are read in another time",
-        "the rows are read within {readout_time_s} s",
+        "the readout time differs from the profile's",
+        "the readout takes {readout_time_s} s",
         Steps(
             by.lengthen_readout,
             _difference(lambda p: p.shutter.readout_time_s),
@@ -151,7 +151,7 @@ _POINTS = (
         GEOMETRY,
         _value("readout_direction", lambda p: p.shutter.readout_direction, _none),
         "shutter.readout_direction",
-        "the rows are read in another direction",
+        "the readout direction differs from the profile's",
         "the sensor is read {readout_direction}",
         choice=Choice(READOUT_DIRECTIONS, lambda p, word: by.with_shutter(p, readout_direction=word)),
     ),
@@ -160,8 +160,8 @@ _POINTS = (
         GEOMETRY,
         _value("timestamp", lambda p: p.shutter.timestamp, _none),
         "shutter.timestamp",
-        "the frame stamps mean another instant of the exposure",
-        "a frame's stamp means its {timestamp}",
+        "the frame timestamps mark another instant of the exposure",
+        "a frame's timestamp marks its {timestamp}",
         choice=Choice(tuple(STAMP_FRACTION), lambda p, word: by.with_shutter(p, timestamp=word)),
     ),
     Effect(
@@ -169,7 +169,7 @@ _POINTS = (
         BLUR,
         _value("exposure_scale", lambda p: p.shutter.exposure_scale, _relative),
         "shutter.exposure_scale",
-        "the exposure lasts longer or shorter than logged",
+        "the exposure is longer or shorter than logged",
         "the true exposure is {exposure_scale} times the logged one",
         Steps(by.scale_exposure, _log_ratio(lambda p: p.shutter.exposure_scale), (0.05,), (0.3,), (0.7,), 1.5),
         calibrated=Calibrated(
@@ -187,7 +187,7 @@ _POINTS = (
         GEOMETRY,
         _value("gyro_bias_rad_s", lambda p: list(p.gyro_bias_rad_s), _each),
         "imu.gyro_bias_rad_s",
-        "the gyroscope reads a rate at rest",
+        "the gyroscope has a bias",
         "the gyroscope reads {gyro_bias_rad_s} rad/s at rest",
         Steps(by.add_bias, _difference(lambda p: p.gyro_bias_rad_s), (1e-3,) * 3, (0.05,) * 3, (0.1,) * 3, 0.5),
         calibrated=Calibrated(
@@ -199,7 +199,7 @@ _POINTS = (
         GEOMETRY,
         _value("gyro_scale", lambda p: float(np.mean(p.gyro_scale)), _relative),
         "imu.gyro_scale",
-        "the gyroscope reads too much or too little",
+        "the gyroscope's scale is off",
         "the gyroscope's rates are {gyro_scale} times the true ones",
         Steps(by.scale_gyro, _log_ratio(lambda p: p.gyro_scale[0]), (1e-3,), (0.1,), (0.3,), 0.4),
         calibrated=Calibrated(
@@ -217,8 +217,8 @@ _POINTS = (
         GEOMETRY,
         _value("gyro_lowpass_hz", _extension("gyro_lowpass_hz"), _of_cutoff),
         "extensions.gyro_lowpass_hz",
-        "the gyroscope reads late, and fast turns too small",
-        "the gyroscope's rates pass a filter of {gyro_lowpass_hz} Hz: they come late, and fast ones too small",
+        "the gyroscope low-pass filters its rates: they are late, fast ones also too small",
+        "the gyroscope low-pass filters its rates at {gyro_lowpass_hz} Hz: they are late, fast ones also too small",
         Steps(
             by.delay_gyro,
             _difference(lambda p: delay_s(p.extensions.gyro_lowpass_hz)),
@@ -228,15 +228,15 @@ _POINTS = (
             0.1,
             ((0.006,), (0.02,)),
         ),
-        applied=_applied("gyro_lowpass_hz", "gyroscope's low pass of {e.gyro_lowpass_hz:g} Hz: undone"),
+        applied=_applied("gyro_lowpass_hz", "gyroscope's low-pass filter of {e.gyro_lowpass_hz:g} Hz: undone"),
     ),
     Effect(
         "imu_rotation",
         GEOMETRY,
         (Parameter("rotation_rad", lambda p, given: by.rotation_between(given, p).tolist(), _each),),
         "imu.T_cam_imu",
-        "the gyroscope's axes are turned against the camera's",
-        "the inertial sensor sits turned by {rotation_rad} rad against the camera",
+        "the rotation between IMU and camera differs from the profile's",
+        "the IMU is rotated against the camera by {rotation_rad} rad",
         Steps(by.rotate_imu, by.rotation_between, (1e-3,) * 3, (0.1,) * 3, (INF,) * 3, SENSOR_TURNED),
         calibrated=Calibrated("rotation_rad", lambda p: None, by.keep_value("r_cam_imu"), 0.01),
     ),
@@ -245,7 +245,7 @@ _POINTS = (
         GEOMETRY,
         (Parameter("focal_scale", lambda p, given: _focal(p) / _focal(given), _relative),),
         "intrinsics.fx_px, fy_px",
-        "the focal length is another",
+        "the focal length differs from the profile's",
         "the focal length is {focal_scale} times the profile's",
         Steps(by.scale_focal, _log_ratio(_focal), (1e-3,), (0.1,), (0.5,), ANOTHER_LENS),
         calibrated=Calibrated(
@@ -273,9 +273,9 @@ _POINTS = (
         _value("focal_drift_per_s", _extension("focal_drift_per_s")),
         "extensions.focal_drift",
         "the focal length changes while filming",
-        "the focal length changes by {focal_drift_per_s} of itself a second (refocusing)",
+        "the focal length changes by a fraction of {focal_drift_per_s} per second (refocusing)",
         Steps(by.drift_focal, _difference(_extension("focal_drift_per_s")), (1e-3,), (0.03,), (0.2,), 0.3),
-        applied=_applied("focal_drift_per_s", "focal drift of {e.focal_drift_per_s:+g} a second: followed"),
+        applied=_applied("focal_drift_per_s", "focal drift of {e.focal_drift_per_s:+g} per second: followed"),
     ),
     Effect(
         "radial_distortion",
@@ -283,7 +283,7 @@ _POINTS = (
         _value("k1", by.k1_of),
         "intrinsics.distortion",
         "the lens bends straight lines",
-        "the lens bends rays by k1 = {k1}",
+        "the lens has a radial distortion of k1 = {k1}",
         Steps(by.add_k1, _difference(by.k1_of), (1e-3,), (0.1,), (0.5,), 0.8),
         calibrated=Calibrated("k1", by.k1_of, by.keep_lens("model", "coefficients"), 0.03, "distortion", 0.3),
     ),
@@ -292,8 +292,8 @@ _POINTS = (
         GEOMETRY,
         (Parameter("offset_px", lambda p, given: by.principal_shift(given, p).tolist(), _each),),
         "intrinsics.cx_px, cy_px",
-        "the optical axis meets the picture elsewhere",
-        "the optical axis meets the picture {offset_px} px from where the profile says",
+        "the principal point differs from the profile's",
+        "the principal point lies {offset_px} px from the profile's",
         Steps(by.shift_principal_point, by.principal_shift, (1.0, 1.0), (20.0, 20.0), (200.0, 200.0), 300.0),
         calibrated=Calibrated(
             "principal_point_px",
@@ -313,7 +313,7 @@ _POINTS = (
         ),
         "extensions.stabilisation",
         "an optical stabiliser moves the lens",
-        "the lens is moved against the shake: it cancels {fraction} of what is faster than {cutoff_hz} Hz",
+        "an optical stabiliser cancels {fraction} of the motion above {cutoff_hz} Hz",
         Steps(
             by.stabilise,
             by.stabilised_between,
@@ -333,8 +333,8 @@ _POINTS = (
         GEOMETRY,
         _value("depth_m", lambda p: p.depth_m, _none),
         "scene.depth_m",
-        "the scene is at another distance",
-        "the camera travels before a scene {depth_m} m away, so points move by parallax",
+        "the scene's distance differs from the profile's",
+        "the camera translates in front of a scene {depth_m} m away, so points move by parallax",
     ),
     Effect(
         "frame_lag",
@@ -344,8 +344,8 @@ _POINTS = (
             *_value("frames", _extension("frame_lag_frames"), _none),
         ),
         "extensions.frame_lag",
-        "pictures come later than their stamps while the recorder starts",
-        "the first {frames} frames show pictures up to {lag_s} s later than their stamps",
+        "frames show later content than their timestamps while the recorder starts",
+        "the first {frames} frames show content up to {lag_s} s later than their timestamps",
         applied=_applied(
             "frame_lag_frames",
             "frame lag of {e.frame_lag_s:g} s at the start: first {e.frame_lag_frames} frames at their true times",
@@ -359,7 +359,7 @@ _LIGHT = (
         PHOTOMETRY,
         _value("gamma", _curve("extra_gamma", 1.0), _none),
         "extensions.response_gamma",
-        "the exposure curve is bent otherwise",
+        "the response curve differs from the profile's",
         "the grey levels follow a gamma of {gamma} on top of the profile's curve",
     ),
     Effect(
@@ -368,7 +368,7 @@ _LIGHT = (
         _value("black_level", _curve("black_level", 0.0), _none),
         "extensions.black_level",
         "black is stored as grey",
-        "no light at all reads {black_level} of full scale",
+        "zero light reads {black_level} of full scale",
     ),
     Effect(
         "vignetting",
@@ -378,7 +378,7 @@ _LIGHT = (
         "the corners get less light",
         "the corners lose {corner_loss} of the light",
         applied=_applied(
-            "vignetting_corner_loss", "vignetting of {e.vignetting_corner_loss:g}: moved with the picture's place"
+            "vignetting_corner_loss", "vignetting of {e.vignetting_corner_loss:g}: kept where each pixel ends up"
         ),
     ),
     Effect(
@@ -390,8 +390,8 @@ _LIGHT = (
             *_value("phase_rad", _extension("flicker_phase_rad"), _none),
         ),
         "extensions.flicker",
-        "the light pulses",
-        "the lamps pulse by {amplitude} at {frequency_hz} Hz",
+        "the lighting flickers",
+        "the lighting flickers by {amplitude} at {frequency_hz} Hz",
         applied=_applied(
             "flicker_amplitude", "flicker of {e.flicker_amplitude:g} at {e.flicker_frequency_hz:g} Hz: undone"
         ),
@@ -402,9 +402,9 @@ _LIGHT = (
         _value("gain", lambda p: list(p.extensions.gain), _none),
         "extensions.gain",
         "brightness changes that exposure and ISO do not explain",
-        "brightness changes from frame to frame without exposure or ISO saying so",
+        "frame brightness changes without a matching change of exposure or ISO",
         applied=lambda p: (
-            f"gain of {len(p.extensions.gain)} frames: kept, it is common to a whole frame" if p.extensions.gain else ""
+            f"gain of {len(p.extensions.gain)} frames: kept, it scales each whole frame" if p.extensions.gain else ""
         ),
     ),
     Effect(
@@ -413,7 +413,7 @@ _LIGHT = (
         _value("sigma_px", _extension("defocus_sigma_px"), _none),
         "extensions.defocus",
         "the picture is out of focus",
-        "the picture is out of focus by a Gaussian of {sigma_px} px",
+        "the picture is defocused by a Gaussian of {sigma_px} px",
         applied=_applied("defocus_sigma_px", "defocus of {e.defocus_sigma_px:g} px: undone with the blur"),
     ),
     Effect(

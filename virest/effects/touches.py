@@ -1,6 +1,6 @@
-"""What of a prediction a change of the profile touches: what must be worked out anew, and what may be kept.
+"""Which parts of a prediction a change of the profile invalidates, so that the others can be reused.
 
-A value that no line here names touches everything, so that a forgotten one costs time and never a stale prediction.
+A value that is not listed here invalidates everything: forgetting one costs time but never gives a stale prediction.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ from virest.camera.profile import CameraProfile
 
 @dataclass(frozen=True, slots=True)
 class Touched:
-    """Parts of what a profile makes of the inertial samples."""
+    """Parts of a prediction that a change invalidates."""
 
     rates: bool
-    """The true rates: everything is integrated anew."""
+    """The true rates: integrate everything again."""
     axes: bool
-    """The camera's axes on the IMU: trajectory and path turn along."""
+    """The rotation from IMU to camera: rotate trajectory and path."""
     lens: bool
-    """The lens, or how it moves."""
+    """The lens, or its motion."""
 
 
 RATES, AXES, LENS, NOTHING = "rates", "axes", "lens", "nothing"
 OF_PROFILE = {
     "r_cam_imu": AXES,
     "intrinsics": LENS,
-    # when a point is seen and how bright: asked of the profile itself for each prediction
+    # when a point is seen, and how bright: each prediction reads these from the profile
     **dict.fromkeys(("width", "height", "shutter", "readout_known", "time_offset_s", "clock_skew"), NOTHING),
     **dict.fromkeys(("response", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "depth_m"), NOTHING),
     **dict.fromkeys(("device", "estimates", "imu_untrusted_s", "imu_untrusted_stamp_0_ns", "lens_shape"), NOTHING),
 }
-"""Fields of a profile that do not touch everything."""
+"""Profile fields that do not invalidate everything."""
 OF_EXTENSIONS = {
     **dict.fromkeys(("focal_drift_per_s", "stabilisation_fraction", "stabilisation_cutoff_hz"), LENS),
     "stabilisation_lean_rad": LENS,
     **dict.fromkeys(("frame_lag_s", "frame_lag_frames", "vignetting_corner_loss", "gain", "defocus_sigma_px"), NOTHING),
     **dict.fromkeys(("flicker_amplitude", "flicker_frequency_hz", "flicker_phase_rad"), NOTHING),
 }
-"""Extensions that do not touch everything."""
+"""Extensions that do not invalidate everything."""
 OF_FIELDS = {"rate": RATES, "scale": LENS, "delay": NOTHING, "gain": NOTHING, "blur": NOTHING}
-"""Fields in ``extensions.field``, by kind; the shutter and the lens hold the others."""
+"""Fields in ``extensions.field``, by kind; those of other kinds are held by the shutter and the lens."""
 
 
 def touched(before: CameraProfile, after: CameraProfile) -> Touched:
@@ -53,7 +53,7 @@ def touched(before: CameraProfile, after: CameraProfile) -> Touched:
         found |= {OF_EXTENSIONS.get(name, RATES) for name in changed if name != "field"}
         if "field" in changed:
             found |= {OF_FIELDS.get(kind, RATES) for kind in _changed_kinds(before, after)}
-    # fields over what the camera logs have its clock, and move on the IMU's with the offset between the two
+    # fields over logged covariates are on the camera clock: on the IMU clock they move with the time offset
     logged = any(field.log is not None for field in after.extensions.field)
     later = logged and before.time_offset_s != after.time_offset_s
     return Touched(RATES in found, AXES in found, LENS in found or later)

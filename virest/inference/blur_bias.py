@@ -1,16 +1,17 @@
-"""Where Lucas-Kanade finds a point that two frames blur differently, beside the mean of its path.
+"""The tracking bias of Lucas-Kanade for a point that two frames blur differently, relative to its mean blur path.
 
-A frame shows a feature T convolved with its path over the exposure, of transfer K(f) = mean exp(-i f . p(τ)).  The
-tracker matches the two pictures of it, K₁ T and K₂ T: to first order it ends where
+A frame shows a feature T convolved with its blur path p(τ), of transfer K(f) = mean exp(-i f . p(τ)).  The tracker
+matches the two pictures K₁ T and K₂ T; to first order it converges to the shift e where
 
     Σ f |T|² Im(K₁* K₂ exp(i f . e)) = 0,   e = -(Σ f fᵀ |T|² Re K₁* K₂)⁻¹ Σ f |T|² Im K₁* K₂,
 
-with K about the mean of each path.  Paths at an even speed have real K and e = 0; a path that accelerates is denser at
-its slow end, and frequencies near its length see that end.  Hand motion is fastest between turns, so the steps found
-are too short: by 0.1 % at 5 px of blur and 0.3 % at 9, which a fit would take for a focal length and a distortion.
+with K about the mean of each path.  Paths of constant speed have real K and e = 0.  An accelerated path is denser at
+its slow end, and frequencies near its length respond to that end.  Hand motion is fastest between reversals, so tracked
+steps are too short: by 0.1 % at 5 px of blur and 0.3 % at 9 px, which a fit would absorb in focal length and
+distortion.
 
-A corner in a window of w px has the power |T|² = 1 / (f² + (2π/w)²)².  Letters, leaves and a board, blurred by a
-hand's motion, give 0.76 to 1.57 times the e that this predicts: ``UNSURE``.
+A corner in a window of w px has the power |T|² = 1 / (f² + (2π/w)²)².  Letters, leaves and a board, blurred by hand
+motion, give 0.76 to 1.57 times the predicted e: ``RELATIVE_STD``.
 """
 
 from __future__ import annotations
@@ -25,22 +26,22 @@ from virest.inference.tracking import TrackingSettings, shrink_factor
 from virest.motion.trajectory import turned
 
 Array = NDArray[np.float64]
-UNSURE = 0.35
-"""Standard deviation of e as a part of it: of how unlike textures are."""
+RELATIVE_STD = 0.35
+"""Relative standard deviation of e, because textures differ."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
-"""Highest frequency summed, cycles per pixel; pixels average out what lies beyond."""
+"""Samples of the frequency plane; HIGHEST in cycles per pixel: the pixel aperture suppresses higher frequencies."""
 NODES = 15
-"""Of the quadrature along a path: e is exact to 1 % up to 8 px of blur in both directions, and to 25 % up to 12 px."""
-MOST_PX = 0.3
-"""Longer e are cut to this: the first order holds for shifts that are short beside a corner's detail."""
+"""Quadrature nodes along a path: e is exact to 1 % up to 8 px of blur in both directions, and to 25 % up to 12 px."""
+MOST_SHIFT_PX = 0.3
+"""Larger e are clipped to this: the first order holds for shifts that are small relative to a corner's detail."""
 LEAST_BLUR_PX = 0.3
-LEAST_ALIKE = 0.5
-"""Where the frames show less of their detail alike, the rest being inverted, |Re| stands for Re: e stays finite."""
+LEAST_COMMON = 0.5
+"""If a smaller fraction of the detail has the same sign in both frames, |Re| replaces Re, so that e stays finite."""
 POINTS_AT_ONCE = 2000
 
 
 def blur_bias_px(known: IntegratedMotion, table: TrackTable) -> Array:
-    """Tracked less true second points (n, 2), px, from what the camera's turns do within both exposures."""
+    """Tracked minus true second points (n, 2), px, from the camera's rotation during both exposures."""
     profile = known.profile
     factor = shrink_factor(profile.width, profile.height)
     paths = []
@@ -61,7 +62,7 @@ def blur_bias_px(known: IntegratedMotion, table: TrackTable) -> Array:
 
 
 def matched_shift_px(first: tuple[Any, Any], second: tuple[Any, Any]) -> Array:
-    """Shift e (n, 2), px, between features whose paths are p(u) = speed u + bend u², u from -1 to 1.
+    """Shift e (n, 2), px, between features with the blur paths p(u) = speed u + bend u², u from -1 to 1.
 
     first, second: speed (n, 2) and bend (n, 2) of both exposures, px.
     """
@@ -69,15 +70,15 @@ def matched_shift_px(first: tuple[Any, Any], second: tuple[Any, Any]) -> Array:
     both = np.conj(_transfer(*first, f)) * _transfer(*second, f)
     pull = (power * both.imag) @ f
     stiffness, firm = (np.einsum("nk,ki,kj->nij", power * real, f, f) for real in (both.real, np.abs(both.real)))
-    loose = np.trace(stiffness, axis1=1, axis2=2) < LEAST_ALIKE * np.trace(firm, axis1=1, axis2=2)
+    loose = np.trace(stiffness, axis1=1, axis2=2) < LEAST_COMMON * np.trace(firm, axis1=1, axis2=2)
     stiffness[loose] = firm[loose]
     found = -np.linalg.solve(stiffness, pull[..., None])[..., 0]
     length = np.linalg.norm(found, axis=-1, keepdims=True)
-    return np.asarray(found * np.minimum(1.0, MOST_PX / np.maximum(length, MOST_PX)))
+    return np.asarray(found * np.minimum(1.0, MOST_SHIFT_PX / np.maximum(length, MOST_SHIFT_PX)))
 
 
 def _path(known: IntegratedMotion, points_px: Array, time_s: Array, half_s: Array) -> Array:
-    """Speed and bend (2, n, 2) of the paths of points during exposures of ± half_s (n,) about times (n,)."""
+    """Speed and bend (2, n, 2) of the blur paths of points over exposures of ± half_s (n,) around times (n,)."""
     world = turned(known.trajectory.orientation(time_s), known.lens.rays(points_px, time_s))
     ends = []
     for side in (-half_s, half_s):
@@ -96,7 +97,7 @@ def _transfer(speed: Array, bend: Array, f: Array) -> Array:
 
 
 def _corner_spectrum() -> tuple[Array, Array]:
-    """Frequencies (k, 2), rad/px, of half a plane, and what a corner in the tracker's window has there, (k,)."""
+    """Frequencies (k, 2), rad/px, of a half plane, and the power (k,) of a corner in the tracker's window there."""
     radius = 2 * np.pi * HIGHEST * (np.arange(RADII) + 0.5) / RADII
     angle = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     f = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)

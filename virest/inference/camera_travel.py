@@ -1,4 +1,4 @@
-"""The camera's travel as it was found: windows of a few seconds, stretches of them, and the motion over one frame."""
+"""The camera's estimated translation: windows of a few seconds, stretches of windows, and the motion over a frame."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from virest.motion.scene_motion import InertialMotion
 
 Array = NDArray[np.float64]
 OFFSET_FLOOR_S = 3e-5
-"""And its error in time."""
+"""Systematic error of the time offset, added to its standard deviation."""
 ACCEL_SCALE_STD = 0.01
-"""How far a phone's accelerometer may be off in scale (makers' tolerance of its sensitivity): lengths go with it."""
+"""Scale error of a phone's accelerometer (sensitivity tolerance of its makers); lengths scale with it."""
 NEAR_WINDOW_S = 1.5
-"""Frames this far beyond a window's tracked points still take its velocity."""
+"""Frames up to this far from a window's tracked points still use its velocity."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A few seconds, judged."""
+    """Quality of the fit over a few seconds."""
 
     start_s: float
     """First tracked frame's stamp, camera clock."""
@@ -37,21 +37,21 @@ class Window:
     velocity_std: float
     """rms standard deviation of the velocity over its rms."""
     parallax: float
-    """What rotation alone leaves over what is left with translation."""
+    """Residual with rotation alone over the residual with translation."""
     residual: float
-    """Robust standard deviation of what is left, in units of the tracking noise."""
+    """Robust standard deviation of the residual, in units of the tracking noise."""
     reason: str
     """Why the window's velocity is not known in metres; empty: it is."""
     spread: float = 0.0
-    """Standard deviation of inverse depths about the plane, part of the plane's."""
+    """Standard deviation of inverse depths about the plane, relative to the plane's."""
     flow_std: float = 0.0
-    """rms standard deviation of velocity over depth, part of its rms."""
+    """rms standard deviation of velocity over depth, relative to its rms."""
     over_depth: bool = False
-    """Whether velocity over depth is known although metres are not."""
+    """Whether velocity over depth is known although the metric velocity is not."""
 
     @property
     def usable(self) -> bool:
-        """Whether pictures may be restored by the window's velocity over its depth."""
+        """Whether frames may be restored with the window's velocity over depth."""
         return not self.reason or self.over_depth
 
 
@@ -64,11 +64,11 @@ class Stretch:
     windows: tuple[Window, ...]
     points: TriangulatedPoints
     velocity_floor_m_s: Array
-    """(windows,) what tracking's own bias makes of the velocity."""
-    nudged: tuple[IntegratedMotion, ...]
-    """The fit's ground with each value of its terms one quotient's step further."""
+    """(windows,) velocity error from the systematic tracking error."""
+    perturbed: tuple[IntegratedMotion, ...]
+    """The fit's integrated motion with each value of its terms changed by its difference step."""
     reliefs: tuple[WindowRelief | None, ...] = ()
-    """By window; None: the plane tells held-out points as well as a surface does."""
+    """By window; None: the plane predicts held-out points as well as a surface does."""
 
     @property
     def scene(self) -> InertialMotion:
@@ -115,7 +115,7 @@ class Stretch:
     def flow(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
         """Velocity over depth (n, 3) on the optical axis, 1/s, camera axes at stamps (n,), and its covariance.
 
-        A common scale of velocity and depth cancels, however little is known of it.
+        A common scale of velocity and depth cancels, even if it is unknown.
         """
         velocity, nearness, slope, nearness_slope = self._seen(window, stamp_s)
         slope = nearness[:, None, None] * slope + velocity[:, :, None] * nearness_slope[:, None, :]
@@ -125,15 +125,15 @@ class Stretch:
     def _seen(self, window: int, stamp_s: Array) -> tuple[Array, Array, Array, Array]:
         """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the optical axis, and their slopes.
 
-        Slopes (n, 3, k) and (n, k) are per unit of everything that was fitted.  The terms of the profile count too: a
-        turned IMU turns gravity with it, which costs the velocity nothing.
+        Slopes (n, 3, k) and (n, k) are per unit of every fitted value, the profile's terms included: rotating the IMU
+        rotates gravity with it and leaves the velocity unchanged.
         """
         velocity, nearness, rotation = self._seen_from(self.fit.ground, window, stamp_s)
         slope = np.zeros((len(stamp_s), 3, len(self.fit.covariance)))
         nearness_slope = np.zeros((len(stamp_s), slope.shape[-1]))
         quotients = [step for term in self.fit.terms for step in term.quotient]
-        for k, (nudged, quotient) in enumerate(zip(self.nudged, quotients, strict=True)):
-            moved, nearer, _ = self._seen_from(nudged, window, stamp_s)
+        for k, (perturbed, quotient) in enumerate(zip(self.perturbed, quotients, strict=True)):
+            moved, nearer, _ = self._seen_from(perturbed, window, stamp_s)
             slope[..., k] = (moved - velocity) / quotient
             nearness_slope[:, k] = (nearer - nearness) / quotient
         own = len(quotients) + 7 + 6 * window
@@ -211,7 +211,7 @@ class Stretch:
         )
 
     def view(self, window: int, time_s: float, plane_per_m: Array) -> View:
-        """The camera's pose at a time before a plane."""
+        """The camera's pose at a time, with the plane in front of it."""
         place = self.place(window, np.array([time_s]))[0]
         return View(time_s, self.fit.ground.trajectory.orientation(time_s), place, plane_per_m)
 
@@ -225,7 +225,7 @@ def _velocity_slope(moves: Displacement, time_s: Array, origin_s: Array) -> Arra
 
 @dataclass(frozen=True, slots=True)
 class FrameMotion:
-    """The camera's centre over one frame, and what it looked at; camera axes at the frame's reference time."""
+    """The camera's translation over one frame, and the scene in front; camera axes at the frame's reference time."""
 
     velocity_m_s: Array
     """(3,) at the reference time."""
@@ -244,7 +244,7 @@ class VisualInertialAlignment:
 
     stretches: tuple[Stretch, ...]
     reason: str
-    """Why nothing could be fitted at all; empty otherwise."""
+    """Why no stretch could be fitted; empty otherwise."""
 
     @property
     def windows(self) -> tuple[Window, ...]:
@@ -258,21 +258,21 @@ class VisualInertialAlignment:
 
     @property
     def refused(self) -> str:
-        """Why not all windows' velocities are known in metres, the commonest reason first; empty if all are."""
+        """The most frequent reason why windows have no metric velocity; empty if all have one."""
         if self.reason:
             return self.reason
         reasons = [window.reason for window in self.windows if window.reason]
         return max(reasons, key=reasons.count) if reasons else ""
 
     def find(self, camera_time_s: float, *, over_depth: bool = False) -> tuple[Stretch, int] | str:
-        """The window that an instant (camera clock) belongs to, or why there is none.
+        """The window that an instant (camera clock) belongs to, or the reason why there is none.
 
-        over_depth: windows that know velocity over depth only will do.
+        over_depth: accept windows with velocity over depth only.
         """
         at = [(s, k, _distance(w, camera_time_s), w) for s in self.stretches for k, w in enumerate(s.windows)]
         near = [entry for entry in at if entry[2] <= NEAR_WINDOW_S]
         if not near:
-            return self.reason or "no tracked points about this frame"
+            return self.reason or "no tracked points near this frame"
         good = [entry for entry in near if not entry[3].reason or (over_depth and entry[3].over_depth)]
         if not good or min(entry[2] for entry in good) > min(entry[2] for entry in near) + 0.5 * NEAR_WINDOW_S:
             return min(near, key=lambda entry: entry[2])[3].reason
@@ -280,7 +280,7 @@ class VisualInertialAlignment:
         return stretch, window
 
     def frame(self, reference_s: float, start_s: float, end_s: float) -> FrameMotion | str:
-        """Motion over a frame that is taken from start_s to end_s, camera clock; or why it is not known."""
+        """Motion over a frame taken from start_s to end_s, camera clock; or the reason why it is unknown."""
         found = self.find(0.5 * (start_s + end_s))
         unscaled = found if isinstance(found, str) else ""
         if unscaled:
@@ -297,9 +297,9 @@ class VisualInertialAlignment:
         return FrameMotion(velocity[0] @ rotation, reference_s, acceleration @ rotation, depth, unscaled)
 
     def velocity_std_m_s(self, camera_time_s: Array) -> Array:
-        """Standard deviations (n, 3) of the velocity in camera axes at times (n,); NaN where metres are not known.
+        """Standard deviations (n, 3) of the velocity in camera axes at times (n,); NaN where not known in metres.
 
-        Each takes the velocity a dozen times, all of a window's at once: for one frame after the other that is slow.
+        All times of a window are computed together, because each needs a dozen velocities.
         """
         places = [self.find(float(time_s)) for time_s in camera_time_s]
         known = [(None, -1) if isinstance(place, str) else place for place in places]
@@ -313,7 +313,7 @@ class VisualInertialAlignment:
         return found
 
     def clock(self) -> tuple[float, float] | None:
-        """Time offset and its standard deviation over the stretches with usable windows; None: there are none."""
+        """Time offset and its standard deviation over the stretches with usable windows; None without any."""
         found = [s for s in self.stretches if any(w.usable for w in s.windows)]
         if not found:
             return None
@@ -334,7 +334,7 @@ class VisualInertialAlignment:
 
 
 def _std_with_relief(fit: TrackFit, name: str) -> Array:
-    """Standard deviations (k,) of a term's values, with what relief that stands in its place does to them."""
+    """Standard deviations (k,) of a term's values, with the errors from fixed relief."""
     return np.hypot(fit.std(name), SHARED_RELIEF * fit.by_relief[fit.slices[name]])
 
 
@@ -343,7 +343,7 @@ def _distance(window: Window, time_s: float) -> float:
 
 
 def _mean(value: Array, std: Array) -> tuple[float, float]:
-    """Weighted mean and its standard deviation, widened where the values disagree."""
+    """Weighted mean and its standard deviation, inflated if the values disagree."""
     weight = std**-2.0
     mean = float((weight * value).sum() / weight.sum())
     disagreement = float((((value - mean) / std) ** 2).sum()) / max(len(value) - 1, 1)

@@ -1,4 +1,4 @@
-"""Tails of the distributions that tests of significance use, from `scipy.special` (`scipy.stats` loads too slowly)."""
+"""Tails of the distributions used in significance tests, from `scipy.special` (`scipy.stats` loads too slowly)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def student_tail(value: Any, freedom: Any) -> float:
 
 
 def student_deviation(freedom: float) -> float:
-    """What Student's t exceeds as seldom as a normal deviate exceeds 1: 1.84 at one degree of freedom, 1.11 at 5."""
+    """Student's t of the same tail probability as a normal deviate of 1: 1.84 at 1 degree of freedom, 1.11 at 5."""
     return float(special.stdtrit(freedom, special.ndtr(1.0)))
 
 
@@ -37,7 +37,7 @@ def normal_tail(value: Any) -> float:
 
 
 def normal_deviate(tail: Any) -> float:
-    """Normal deviate that this probability exceeds: the inverse of :func:`normal_tail`."""
+    """Normal deviate with this upper tail probability: the inverse of :func:`normal_tail`."""
     return float(-special.ndtri(tail))
 
 
@@ -49,15 +49,15 @@ def t_ratio(values: NDArray[np.float64]) -> float:
 
 
 def chance_of(values: NDArray[np.float64]) -> float:
-    """Probability of so large a mean of values (n,) by chance: a one-sided t test; a half for fewer than three."""
+    """One-sided p-value of a t test that the mean of values (n,) is positive; 0.5 for fewer than three."""
     return student_tail(t_ratio(values), max(len(values) - 1, 1))
 
 
 def beyond_noise(gain: NDArray[np.float64]) -> float:
-    """Sum of gains (blocks,) over its deviation where there is nothing to gain, by what most of the blocks scatter.
+    """Sum of gains (blocks,) over its standard deviation without any gain, from the robust scatter of the blocks.
 
-    What acts on a few blocks, as a lens that settles in the first half second, gains there and nowhere else: by the
-    scatter of all of them m of n blocks reach a t of √m at most, however much they gain.
+    An effect on a few blocks, such as a lens that settles within the first 0.5 s, gains only there.  A t test over all
+    blocks would limit m of n gaining blocks to a t of √m, however large their gain.
     """
     noise = robust_std(gain - np.median(gain)) * len(gain) ** 0.5
     return float(gain.sum() / max(noise, np.finfo(float).tiny))

@@ -1,7 +1,7 @@
-"""Covariances of fitted values where residuals share their errors: within time blocks, within parts of the picture.
+"""Covariances of fitted values if residuals share errors within time blocks and within image regions.
 
-A sandwich H⁻¹ S H⁻¹: S sums the outer products of the groups' summed pulls, of either kind of group, less what both
-count (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
+A sandwich H⁻¹ S H⁻¹: S sums the outer products of the groups' summed scores for both kinds of groups, minus those of
+their intersections (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ ALMOST_NOTHING = 1e-9
 
 
 def scatter(pull: Array, group: Index, *, about_mean: bool = False) -> Array:
-    """Σ g gᵀ (k, k) of the groups' sums g of what each residual pulls the values by (n, k), as if groups were many.
+    """Σ g gᵀ (k, k) of the groups' sums g of the residuals' scores ``pull`` (n, k), corrected for few groups.
 
-    group: (n,) number of each residual's group.  about_mean: of g about its mean, where no prior holds the values and
-    the pulls add up to nothing but for rounding and stale slopes.
+    group: (n,) number of each residual's group.  about_mean: subtract the mean of g first, if no prior acts on the
+    values and the scores sum to zero except for rounding and reused slopes.
     """
     dense = np.unique(group, return_inverse=True)[1]
     sums = np.stack([np.bincount(dense, column) for column in pull.T], axis=-1)
@@ -30,9 +30,9 @@ def scatter(pull: Array, group: Index, *, about_mean: bool = False) -> Array:
 
 
 def raised(covariance: Array, least: Array) -> Array:
-    """A covariance (..., k, k) with variances below ``least``'s raised to those; correlations stay.
+    """A covariance (..., k, k) with variances raised to at least those of ``least``; correlations are kept.
 
-    Where it has no positive variance, which differences of sums may come to, it is ``least``.
+    If a variance is not positive, as differences of sums may be, the result is ``least``.
     """
     have, need = _diagonal(covariance), _diagonal(least)
     grow = np.sqrt(np.maximum(need / np.maximum(have, 1e-300), 1.0))
@@ -43,28 +43,28 @@ def raised(covariance: Array, least: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class CovarianceModel:
-    """What the covariance of values, or of anything linear in them, is made of: sandwich H⁻¹ S H⁻¹ and prior.
+    """The parts of the covariance of fitted values: sandwich H⁻¹ S H⁻¹ and prior.
 
-    A correction along a value must not be carried over to combinations in which values' errors cancel, such as the
-    velocity at an instant (from velocity, gravity and bias): it is asked for anew there.
+    Evaluate it separately for each linear combination: in some, such as the velocity at an instant (from velocity,
+    gravity and bias), errors cancel, so that the variance inflation of single values does not apply.
     """
 
     curvature: Array
     """(k, k) H⁻¹: as if residuals were independent."""
-    by_moment: Array | None = None
-    """(k, k) scatter of what the blocks of time move the values by; None: too few of them."""
-    by_place: Array | None = None
-    """(k, k) what parts of the picture share beyond moments."""
+    by_block: Array | None = None
+    """(k, k) scatter of the values' changes by time block; None: too few blocks."""
+    by_region: Array | None = None
+    """(k, k) scatter shared by image regions beyond that of time blocks."""
     prior: Array | None = None
-    """(k, k) the priors' part."""
+    """(k, k) contribution of the priors."""
     relief: Array | None = None
-    """(places, k) what each part of the picture moves the values by if it lies off the plane by the spread of depths;
-    None: no relief is allowed for."""
+    """(regions, k) change of the values if an image region lies off the plane by the spread of depths; None: no relief
+    is modelled."""
 
     def by_relief(self, slope: Array) -> Array:
-        """Covariance (..., m, m), of what changes by slope (..., m, k), from relief that stands in its place.
+        """Covariance (..., m, m), from fixed relief, of what changes by slope (..., m, k) per unit of the values.
 
-        A camera that travels to and fro sees the same relief pull one way and the other; one that walks on does not.
+        The error cancels for a camera that moves to and fro, but not for one that keeps moving in one direction.
         """
         if self.relief is None:
             return np.zeros((*slope.shape[:-1], slope.shape[-2]))
@@ -72,20 +72,20 @@ class CovarianceModel:
         return np.asarray(pulled @ np.swapaxes(pulled, -1, -2))
 
     def of(self, slope: Array) -> Array:
-        """Covariance (..., m, m) of what changes by slope (..., m, k) per unit of the values.
+        """Covariance (..., m, m) of quantities that change by slope (..., m, k) per unit of the values.
 
-        Parts of the picture widen it; along nothing is it below the curvature's.
+        Errors shared by image regions widen it; no variance is below that of the curvature.
         """
         back = np.swapaxes(slope, -1, -2)
         least = slope @ self.curvature @ back
-        if self.by_moment is None or self.by_place is None or self.prior is None:
+        if self.by_block is None or self.by_region is None or self.prior is None:
             return np.asarray(least)
-        sandwich = slope @ self.by_moment @ back
-        # a difference of two may come out negative: places then share nothing
-        places = np.maximum(_diagonal(slope @ self.by_place @ back), 0.0)
+        sandwich = slope @ self.by_block @ back
+        # a difference of two scatters may be negative: regions then share no error
+        places = np.maximum(_diagonal(slope @ self.by_region @ back), 0.0)
         share = np.sqrt(1 + places / np.maximum(_diagonal(sandwich), 1e-300))
         total = sandwich * share[..., :, None] * share[..., None, :] + slope @ self.prior @ back
-        return raised(total + ALMOST_NOTHING * least, least)  # where all cancels there is still something to raise
+        return raised(total + ALMOST_NOTHING * least, least)  # keeps variances positive if all errors cancel
 
 
 def _diagonal(matrix: Array) -> Array:

@@ -1,8 +1,8 @@
-"""Pictures and gyroscope brought roughly together: time offset and axes, from turns alone.
+"""Coarse alignment of frames and gyroscope: time offset and axes, from frame-to-frame rotations alone.
 
-At each offset the best rotation between the pictures' turns and the gyroscope's (Kabsch 1976) is found in closed form,
-so a sensor mounted any way round is no obstacle.  Where the motion determines no rotation (turns
-about one axis), the profile's own and the 24 axis maps are compared instead.
+At each offset the best rotation between the rotation vectors of frames and gyroscope (Kabsch 1976) is computed in
+closed form, so the sensor may be mounted in any orientation.  If the motion does not determine it (rotation about a
+single axis), the profile's own rotation and the 24 axis maps are compared instead.
 """
 
 from __future__ import annotations
@@ -21,57 +21,57 @@ from virest.motion.integration import integrate_gyro
 Array = NDArray[np.float64]
 STEP_S = 0.004
 MIN_COVERED = 0.75
-"""Least part of the pairs that must lie inside the inertial data."""
+"""Smallest fraction of the pairs that must lie inside the inertial data."""
 PLANAR = 0.05
-"""Turns whose second axis has less than this part of the first one's power do not determine a rotation."""
+"""Motion whose second axis has less than this fraction of the first one's power does not determine a rotation."""
 KEEP_PROFILE = 1.15
-"""The profile's own axes stay unless another rotation leaves less than 1 / this of what they leave unexplained."""
+"""Keep the profile's axes unless another rotation leaves less than 1 / this of their unexplained part."""
 MAX_PROFILE_LEFT = 0.3
-"""And unless they leave more than this part unexplained."""
+"""Keep the profile's axes at the same offset if they leave less than this fraction unexplained."""
 SAME_VALLEY_S = 0.06
 SKEWS = (-0.0045, -0.003, -0.0015, 0.0015, 0.003, 0.0045)
 SKEW_GAIN = 0.8
-"""Another clock rate is taken if it leaves less than this part of what the profile's leaves unexplained."""
+"""Accept another clock rate if it leaves less than this fraction of what the profile's rate leaves unexplained."""
 SOFTENING = 3.0
-"""Pairs further off than this many typical deviations are held back."""
+"""Pairs beyond this many typical deviations are down-weighted."""
 GAINS = (0.4, 2.5)
-"""Of pitch and yaw, where the focal length is guessed."""
+"""Bounds of the gain of pitch and yaw if the focal length is guessed."""
 MIN_PAIRS = 8
-"""Fewer pairs of frames tell no clocks."""
+"""Fewer pairs of frames do not determine an offset."""
 MIN_MOTION_PX = 0.4
-"""Least rms of the pictures' changing turns from frame to frame, at the focal length."""
+"""Smallest rms of the changing part of the frame-to-frame rotation, px at the focal length."""
 MIN_EXPLAINED, MIN_EXPLAINED_BY_PAIR, MAX_MIN_EXPLAINED = 0.5, 5.0, 0.9
-"""Pictures follow the gyroscope if it explains 0.5 + 5 / pairs, at most 0.9, of their turns: with few pairs, unrelated
-motion reaches 0.7 at some offset within a second; with 40 it stays below 0.5."""
+"""Frames follow the gyroscope if it explains at least 0.5 + 5 / pairs, at most 0.9, of their rotation: with few pairs,
+unrelated motion reaches 0.7 at some offset within 1 s; with 40 pairs it stays below 0.5."""
 MIN_DISTINCT = 1.6
-"""The best offset leaves less than 1 / this of what the runner-up leaves unexplained."""
+"""The best offset must leave less than 1 / this of what the runner-up leaves unexplained."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoarseAlignment:
-    """Where pictures and gyroscope agree best."""
+    """The offset and axes at which frames and gyroscope agree best."""
 
     time_offset_s: float
-    """At the middle of the readout, exposure's middle: add nothing more."""
+    """For the middle of readout and exposure: needs no further correction."""
     rotation_cam_imu: Array
     """(3, 3)."""
     explained: float
-    """Part of the pictures' changing turns that the gyroscope then explains."""
+    """Fraction of the frames' changing rotation that the gyroscope explains there."""
     runner_up: float
     """The same at the best offset outside its valley."""
     runner_up_s: float
     axes_changed: bool
-    """Whether another rotation than the profile's was taken."""
+    """Whether another rotation than the profile's was chosen."""
     motion_rad: float
-    """rms of the pictures' changing turns from frame to frame."""
+    """rms of the changing part of the frame-to-frame rotation."""
     at_end: bool
     """Whether the offset lies at the end of the search."""
     gain: float
-    """Pitch and yaw in the pictures over those of the gyroscope; 1 where the focal length is known."""
+    """Pitch and yaw in the frames over those of the gyroscope; 1 if the focal length is known."""
     offset_s: Array
-    """(k,) all that were tried."""
+    """(k,) all offsets searched."""
     explained_at: Array
-    """(k,) what each of them explains."""
+    """(k,) fraction that each of them explains."""
 
     def explained_near(self, offset_s: float, within_s: float) -> float:
         """The most that is explained within some time of an offset; -inf where none was tried."""
@@ -82,22 +82,22 @@ class CoarseAlignment:
         motion_px = self.motion_rad * focal_px
         if motion_px < MIN_MOTION_PX:
             return (
-                f"the pictures hardly change their turn ({motion_px:.2f} px from frame to frame)",
+                f"the rotation hardly changes between frames ({motion_px:.2f} px)",
                 "shake the phone about all three axes; a camera at rest or a steady pan determines nothing",
             )
         if self.explained < min(MIN_EXPLAINED + MIN_EXPLAINED_BY_PAIR / pairs, MAX_MIN_EXPLAINED):
             return (
-                f"the pictures do not follow the gyroscope: it explains {max(self.explained, 0):.0%} of their turns",
-                "stabilised in the camera, or not of this recording?",
+                f"the frames do not follow the gyroscope: it explains {max(self.explained, 0):.0%} of their rotation",
+                "was the movie stabilised in the camera, or is it from another recording?",
             )
         if self.at_end:
             return (
-                f"the time offset lies at the end of the search ({self.time_offset_s:+.2f} s)",
-                "give a time_offset_s to search about",
+                f"the time offset is at the end of the search range ({self.time_offset_s:+.2f} s)",
+                "give a time_offset_s near the true one",
             )
         if 1 - self.runner_up < MIN_DISTINCT * (1 - self.explained):
             return (
-                f"offsets of {self.time_offset_s:+.3f} and {self.runner_up_s:+.3f} s fit the pictures about equally",
+                f"offsets of {self.time_offset_s:+.3f} and {self.runner_up_s:+.3f} s fit the frames about equally well",
                 "move less regularly",
             )
         return None
@@ -112,10 +112,10 @@ def align_coarsely(
     own_axes: bool = False,
     free_focal: bool = False,
 ) -> CoarseAlignment | None:
-    """Search offsets within ± search_s of the profile's; None if the inertial data cover the pairs nowhere.
+    """Search offsets within ± search_s of the profile's; None if the inertial data cover the pairs at no offset.
 
-    Bias and slow drift are free.  own_axes: no others than the profile's are tried.  free_focal: one gain for pitch and
-    yaw is fitted with the profile's axes, as a guessed focal length needs.
+    Bias and slow drift are free.  own_axes: try only the profile's axes.  free_focal: with the profile's axes, fit a
+    common gain of pitch and yaw, as a guessed focal length needs.
     """
     centre = profile.time_offset_s or 0.0
     steps = int(np.ceil(search_s / STEP_S))
@@ -152,7 +152,7 @@ def align_coarsely(
 
 
 def _runner_up(explained: Array, best: int) -> int | None:
-    """The best offset outside the valley of the best one: where twice as much is left, or half as much explained."""
+    """The best offset outside the best one's valley, which ends where twice as much is left, or half is explained."""
     left = 1 - explained[best]
     worse = 1 - explained > min(2 * left, 0.5 * (1 + left))
     numbers = np.arange(len(worse))
@@ -192,7 +192,7 @@ def axis_maps() -> Array:
 
 
 def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Explained part (k,) and rotation (k, 3, 3) at each offset, reweighted once against pairs gone astray."""
+    """Explained fraction (k,) and rotation (k, 3, 3) at each offset, reweighted once against outlying pairs."""
     weight = inside.astype(float)
     for _ in range(2):
         cross = np.einsum("pi,kpj,kp->kij", seen, gyro, weight)
@@ -211,7 +211,7 @@ def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tupl
 
 
 def _gains(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> Array:
-    """Pitch and yaw in the pictures over those of the gyroscope (k,), both in camera axes."""
+    """Gains (k,) of pitch and yaw, frames over gyroscope, both in camera axes."""
     used = inside[..., None]
     cross = (seen[:, :2] * gyro[..., :2] * used).sum(axis=(1, 2))
     return np.clip(cross / np.maximum((gyro[..., :2] ** 2 * used).sum(axis=(1, 2)), 1e-18), *GAINS)
@@ -226,11 +226,11 @@ def _soft_weights(seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation:
 def _explained(
     seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array, gain: Array | None = None
 ) -> Array:
-    """1 − (what is left) / (what there was), soft beyond the typical turn: single pairs gone astray do not decide."""
-    told = gyro @ np.swapaxes(rotation, -1, -2)
+    """1 − (residual power) / (power), saturated beyond the typical rotation, so that outlying pairs do not dominate."""
+    predicted = gyro @ np.swapaxes(rotation, -1, -2)
     if gain is not None:
-        told[..., :2] *= gain[:, None, None]
-    left = ((seen - told) ** 2).sum(axis=-1)
+        predicted[..., :2] *= gain[:, None, None]
+    left = ((seen - predicted) ** 2).sum(axis=-1)
     before = np.broadcast_to((seen**2).sum(axis=-1), left.shape)
     scale = np.median((seen**2).sum(axis=-1)) + 1e-12
     return 1 - (np.log1p(left / scale) * inside).sum(axis=1) / np.maximum(

@@ -1,7 +1,7 @@
-"""Tracking noise as a fit's residual counts it, so that the two can stand beside each other.
+"""Tracking noise measured like a fit's residual, so that the two can be compared.
 
-What a free smooth flow of each pair leaves holds tracking noise and the scene's relief.  A fit allows for relief along
-the parallax; here the same is allowed for.
+The residual of a smooth flow fitted to each pair contains tracking noise and the scene's relief.  A fit discounts
+relief along the parallax; the noise here is discounted in the same way.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 def noise_distances(observed: ObservedTracks, fitted: TrackFit) -> Array:
-    """Whitened lengths (n,) of what smooth flows leave of all points, relief along the parallax as in the fit."""
+    """Whitened residuals (n,) of all points from smooth flows, relief along the parallax discounted as in the fit."""
     if fitted.scene is None:
         pairs = zip(observed.pairs, observed.noise_px, strict=True)
         residual = np.concatenate([smooth_flow_residual(pair) / noise for pair, noise in pairs])
@@ -45,18 +45,18 @@ def noise_distances(observed: ObservedTracks, fitted: TrackFit) -> Array:
 
 
 def _flow_beside_relief(pair: TrackPair, way: Array, kept: Array) -> Array:
-    """Lengths (n,) of what a smooth flow leaves of a pair's steps, the part along ways (n, 2) counted by kept (n,).
+    """Residual lengths (n,) of a pair's steps from a smooth flow, components along ways (n, 2) weighted by kept (n,).
 
-    The flow is fitted with that weight too: otherwise relief would leak across where ways differ between points.
+    The flow is fitted with the same weights; otherwise relief would leak across where directions vary between points.
     """
     step = pair.points_second_px - pair.points_first_px
     sides = np.stack([way * kept[:, None], np.stack([-way[:, 1], way[:, 0]], axis=-1)], axis=1)
-    told = len(pair) + float((kept**2).sum())
-    order = next((k for k in ORDERS if told >= POINTS_PER_TERM * (k + 1) * (k + 2)), 0)
+    effective = len(pair) + float((kept**2).sum())
+    order = next((k for k in ORDERS if effective >= POINTS_PER_TERM * (k + 1) * (k + 2)), 0)
     basis = flow_basis(pair.points_first_px, order)
     rows = (sides[..., None] * basis[:, None, None, :]).reshape(len(pair), 2, -1)
     wanted = (sides * step[:, None, :]).sum(axis=-1)
-    freedom = max(1 - rows.shape[-1] / told, 0.25)
+    freedom = max(1 - rows.shape[-1] / effective, 0.25)
     left, weight = wanted, np.ones(len(pair))
     for _ in range(REWEIGHTINGS):
         root = np.sqrt(weight)[:, None]
@@ -69,19 +69,19 @@ def _flow_beside_relief(pair: TrackPair, way: Array, kept: Array) -> Array:
 
 
 def robust_std(lengths: Array, fitted: TrackFit) -> float:
-    """Standard deviation per coordinate of differences whose lengths (n,) these are, by their median.
+    """Standard deviation per coordinate of differences of these lengths (n,), by their median.
 
-    Across a direction of travel one coordinate is left of two.
+    Across a direction of travel only one of two coordinates remains.
     """
     one_way = isinstance(fitted.scene, DirectedMotion)
     return float(np.median(lengths)) / (NORMAL_MEDIAN if one_way else RAYLEIGH_MEDIAN)
 
 
 def tracking_noise_px(observed: ObservedTracks, fitted: TrackFit) -> float:
-    """Tracking noise, px per coordinate, beside the residual of :func:`residual_px`."""
+    """Tracking noise, px per coordinate, comparable with :func:`residual_px`."""
     return robust_std(noise_distances(observed, fitted), fitted) * float(np.median(observed.noise_px))
 
 
 def residual_px(fitted: TrackFit) -> float:
-    """What a fit leaves of the points, px per coordinate, relief along the parallax allowed for."""
+    """Residual of a fit, px per coordinate, with relief along the parallax discounted."""
     return robust_std(np.linalg.norm(fitted.across_relief_px(), axis=-1), fitted)

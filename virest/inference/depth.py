@@ -1,8 +1,8 @@
-"""How far the scene is (eq 11): matched points triangulated by the camera's metric displacement between their rows.
+"""Scene depth (eq 11): matched points triangulated with the camera's metric displacement between their rows.
 
-Both sights of a point have their own row's time.  A point seen along r at inverse depth ρ from c₁ is expected at
-project(R₂ᵀ (R₁ r + (c₁ − c₂) ρ)); ρ is what brings it to where it was tracked.  A frame's depth is a plane through the
-points about it, ρ(r) = m · r, drawn to the plane of its whole window where the points tell less.
+Both observations of a point have the time of their own row.  A point seen from c₁ along r at inverse depth ρ is
+expected at project(R₂ᵀ (R₁ r + (c₁ − c₂) ρ)); ρ is fitted to the tracked position.  A frame's depth is a plane through
+the points near it, ρ(r) = m · r, with the plane of its whole window as the prior.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ Array = NDArray[np.float64]
 PASSES = 3
 RELIEF_PASSES, RELIEF_REACH = 6, 3.0
 FARTHEST = 0.02
-"""Points are held no farther than this part of the plane's inverse depth."""
+"""Inverse depths are clipped to at least this fraction of the plane's."""
 MAX_ACROSS = 4.0
-"""Standard deviations of the tracking noise."""
+"""Largest deviation across the parallax, in standard deviations of the tracking noise."""
 QUOTIENT = 1e-3
-"""Step of the difference quotient, part of the inverse depth."""
+"""Step of the difference quotient, relative to the inverse depth."""
 MAX_RELATIVE_STD = 0.5
-"""Points whose inverse depth is known no better than this part of it tell nothing."""
+"""Points with a larger relative standard deviation of the inverse depth are dropped."""
 MIN_POINTS = 20
 NEAR_S = 1.0
-"""Points seen within this time of a frame speak for it."""
+"""A frame uses points seen within this time of it."""
 OUTSIDE = 0.05
-"""Points up to this part of the picture beyond its edge speak for it too."""
+"""A frame uses points up to this fraction of the picture's size beyond its edge."""
 REWEIGHTINGS = 6
-FEWEST_SPREAD = 0.02
-"""A plane fitted to a whole window is trusted no better than to this part of its inverse depth at one frame."""
+LEAST_SPREAD = 0.02
+"""Smallest relative standard deviation, at one frame, of a plane fitted to a whole window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class TriangulatedPoints:
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """Triangulated points with how they were seen first."""
+    """Triangulated points with their first observation."""
 
     points: TriangulatedPoints
     pair: NDArray[np.intp]
@@ -78,7 +78,7 @@ class Sightings:
     above_per_m: Array
     """(n,) inverse depth above the window's plane."""
     across: Array
-    """(n,) how far the second sight lies off the parallax, in standard deviations of the tracking noise."""
+    """(n,) distance of the second observation from the parallax line, in standard deviations of the tracking noise."""
 
     def __len__(self) -> int:
         return len(self.pair)
@@ -93,32 +93,32 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class FrameDepth:
-    """The scene before one frame."""
+    """The scene in front of one frame."""
 
     plane_per_m: Array
     """(3,) camera axes at the frame's time: the inverse depth of a ray r with z = 1 is plane · r."""
     depth_m: float
     """Along the optical axis at the picture's centre."""
     std_m: float
-    """Includes the metric scale's."""
+    """Includes that of the metric scale."""
     points: int
-    """Triangulated points that the plane goes through; 0: the window's plane."""
+    """Number of triangulated points that determine the plane; 0: the window's plane."""
     reason: str = ""
     """Why the frame's own points were not used."""
     relief: Relief | None = None
-    """What stands out of the plane; None: nothing that the points tell."""
+    """Relief on the plane; None: none that the points resolve."""
 
     def with_relief(self, relief: Relief, middle: Array, relative_std: float) -> FrameDepth:
-        """The same scene with a surface on its plane; middle (3,): the ray through the picture's centre."""
+        """The same scene with relief on its plane; middle (3,): the ray through the picture's centre."""
         inverse = max(float(self.plane_per_m @ middle + relief.at(middle)), 1e-6)
         relative = float(np.hypot(relief.std_at(middle) / inverse, relative_std))
         return replace(self, depth_m=1 / inverse, std_m=relative / inverse, relief=relief)
 
 
 def triangulate(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> TriangulatedPoints:
-    """Find the inverse depth of every matched point whose parallax tells it and that lies about the plane.
+    """Find the inverse depth of every matched point that the parallax determines and that lies near the plane.
 
-    Points before which the camera hardly moved, or with an absurd depth, are left out.
+    Points with hardly any parallax or with an implausible depth are dropped.
     """
     sights = _sights(known, scene, table, PASSES, 1.0)
     depth, expected = sights.points.inverse_depth_per_m, sights.points.inverse_depth_per_m - sights.above_per_m
@@ -127,9 +127,9 @@ def triangulate(known: IntegratedMotion, scene: InertialMotion, table: TrackTabl
 
 
 def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> Sightings:
-    """Find the inverse depth of every matched point whose parallax tells it, however far from the plane.
+    """Find the inverse depth of every matched point that the parallax determines, at any distance from the plane.
 
-    A point that leaves the line of its parallax is a mismatch or moves on its own.
+    Points off their parallax line are dropped: they are mismatches or move on their own.
     """
     sights = _sights(known, scene, table, RELIEF_PASSES, RELIEF_REACH)
     expected = sights.points.inverse_depth_per_m - sights.above_per_m
@@ -144,7 +144,7 @@ def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: Tr
 
 
 def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, passes: int, reach: float) -> Sightings:
-    """Gauss-Newton on one unknown a point, from the plane of its window, at most ``reach`` of it in a pass.
+    """Gauss-Newton on the inverse depth of each point, from its window's plane; a pass changes it by at most ``reach``.
 
     The standard deviation is the pair's tracking noise over the parallax.
     """
@@ -164,13 +164,13 @@ def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, p
 
 @dataclass(frozen=True, slots=True)
 class _Parallax:
-    """Where points are seen the second time, by their inverse depths."""
+    """The second observation of points as a function of their inverse depths."""
 
     lens: MovingLens
     far: Array
     """(n, 3) the point at infinity."""
     step: Array
-    """(n, 3) its shift a unit of inverse depth."""
+    """(n, 3) its shift per unit of inverse depth."""
     table: TrackTable
     poses: Poses
 
@@ -181,7 +181,7 @@ class _Parallax:
         return self.poses.again(self.lens, rays)
 
     def inverse_depths(self, start: Array, passes: int, reach: float) -> tuple[Array, Array, Array]:
-        """(n,) inverse depths, their standard deviations, and what is left across in those of the tracking noise."""
+        """(n,) inverse depths, their standard deviations, and residuals across the parallax in tracking noise σ."""
         depth, noise = start.copy(), self.table.noise_px[self.table.pair]
         for _ in range(passes):
             quotient = QUOTIENT * np.maximum(start, 1e-3)
@@ -206,7 +206,7 @@ def frame_depth(
     spread_per_m: float,
     relative_std: float,
 ) -> FrameDepth:
-    """Lay a plane through the points about a frame.
+    """Fit a plane to the points near a frame.
 
     rotation_world_cam (3, 3), centre_m (3,): the camera at time_s, from the window's middle.  plane_per_m: the window's
     plane in camera axes at time_s; spread_per_m: standard deviation of inverse depths about it; relative_std: of the
@@ -223,9 +223,9 @@ def frame_depth(
     inside = (np.abs(seen - 0.5 * size) < (0.5 + OUTSIDE) * size).all(axis=-1)
     rays, inverse = rays[inside], 1.0 / local[inside, 2]
     std = points.std_per_m[near][ahead][inside] * (inverse / points.inverse_depth_per_m[near][ahead][inside]) ** 2
-    prior = max(spread_per_m, FEWEST_SPREAD * float(np.linalg.norm(plane_per_m)))
+    prior = max(spread_per_m, LEAST_SPREAD * float(np.linalg.norm(plane_per_m)))
     if len(rays) < MIN_POINTS:
-        own = FrameDepth(plane_per_m, 0.0, 0.0, 0, f"{len(rays)} points with parallax: the window's plane")
+        own = FrameDepth(plane_per_m, 0.0, 0.0, 0, f"only {len(rays)} points with parallax: the window's plane is used")
         variance = 0.0 if spread_per_m == 0 else spread_per_m**2
         return _concluded(own, middle, variance, relative_std)
     plane, covariance, used = _robust_plane(rays, inverse, np.hypot(std, spread_per_m), plane_per_m, prior)
@@ -233,14 +233,14 @@ def frame_depth(
 
 
 def _concluded(found: FrameDepth, middle: Array, variance: float, relative_std: float) -> FrameDepth:
-    """Depth at the picture's middle; variance of its inverse from the points alone."""
+    """Depth at the picture's centre; variance: of its inverse, from the points alone."""
     inverse = max(float(found.plane_per_m @ middle), 1e-6)
     relative = float(np.hypot(np.sqrt(variance) / inverse, relative_std))
     return FrameDepth(found.plane_per_m, 1 / inverse, relative / inverse, found.points, found.reason)
 
 
 def _robust_plane(rays: Array, inverse: Array, std: Array, start: Array, prior_std: float) -> tuple[Array, Array, int]:
-    """Plane (3,), its covariance, and the number of points that go with it: Cauchy weights about the start."""
+    """Plane (3,), its covariance, and the number of inliers, with Cauchy weights; the start is the prior."""
     plane, information = start, np.eye(3) / prior_std**2
     rows, left = rays / std[:, None], inverse / std
     for _ in range(REWEIGHTINGS):

@@ -1,12 +1,13 @@
-"""One robust Gauss-Newton descent for all evidence: tracked points, brightness of patches, local blur.
+"""One robust Gauss-Newton solver for all evidence: tracked points, brightness of patches, local blur.
 
-What was measured, how values predict it, how far off a residual may be and what is eliminated beside the values
-(directions of travel, patches' light, an encoder's memory of earlier frames) is the :class:`Evidence`.  How values are
-found is the same for all: Cauchy weights, priors, steps within limits and bounds, Marquardt's damping where a step does
-not lower the loss, and an end where a step is small in the values' own standard deviations.
+:class:`Evidence` provides the measurements, their prediction, the residuals' standard deviations, and the nuisance
+parameters to eliminate (directions of travel, patches' light, the encoder's memory of earlier frames).  The solver is
+the same for all: Cauchy weights, priors, limited and bounded steps, Marquardt damping if a step does not reduce the
+loss, and convergence when a step is small relative to the values' own standard deviations.
 
-What differs between kinds of evidence is physics: deviations of points and of blur are known but for a factor, which
-what is left tells, those of brightness are measured beforehand; points' slopes are dear and judged in pixels.
+Kinds of evidence differ in their physics: the standard deviations of points and blur are known up to a factor, which
+the residuals determine, while those of brightness are measured beforehand; slopes of points are expensive, and their
+staleness is judged in pixels.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 Array = NDArray[np.float64]
 MAX_ITERATIONS = 15
 CONVERGED = 0.02
-"""A step whose root mean square over the values, in their standard deviations, is below this ends the fit."""
+"""The fit ends when the rms of a step, in the values' standard deviations, is below this."""
 FIRST_DAMPING, MAX_DAMPING = 1e-3, 1e3
 
 
 class Slopes(Enum):
-    """How near the values slopes have to have been taken."""
+    """How close to the current values the slopes must have been evaluated."""
 
     ON_THE_WAY = "for a step"
     AT_THE_END = "for values and their covariance"
@@ -39,27 +40,27 @@ class Slopes(Enum):
 
 
 STALE = {Slopes.ON_THE_WAY: 0.5, Slopes.AT_THE_END: 0.02, Slopes.HERE: 0.0}
-"""Reuse slopes until what they predict moves by this part of what is left (robust standard deviations of both)."""
+"""Reuse slopes until predictions move by this fraction of the residuals (robust standard deviations of both)."""
 
 
 class Look(Protocol):
-    """What values predict, with slopes that were taken there or not far away."""
+    """The prediction at some values, with slopes evaluated there or nearby."""
 
     def is_stale(self, limit: Slopes) -> bool:
-        """Whether the slopes were taken too far away."""
+        """Whether the slopes were evaluated too far away."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
-    """What values leave, with slopes that were taken where they left ``taken``."""
+    """Residuals at some values, with slopes evaluated where the residuals were ``taken``."""
 
     left: Array
     """(n,) measured minus predicted."""
     slope: Array
     """(n, k) change of the prediction per unit of each value."""
     taken: Array
-    """(n,) what was left where the slopes were taken."""
+    """(n,) residuals where the slopes were evaluated."""
 
     def is_stale(self, limit: Slopes) -> bool:
         """Whether the prediction has moved by more than STALE since."""
@@ -72,7 +73,7 @@ L = TypeVar("L", bound=Look)
 
 @dataclass(frozen=True, eq=False)
 class System(Generic[S, L]):
-    """Evidence at one state of the values: weighed rows, and their normal equations with the priors."""
+    """Evidence linearised at one state: weighted rows, and their normal equations with the priors."""
 
     state: S
     look: L
@@ -81,17 +82,17 @@ class System(Generic[S, L]):
     left: Array
     """(n, m) measured minus predicted, likewise."""
     squared: Array
-    """(n,) squared lengths of the residuals, by which they are weighed."""
+    """(n,) squared lengths of the residuals, which determine their weights."""
     scale: float | Array
-    """(n,) or one for all: by what factor the standard deviations are wrong."""
+    """(n,) or scalar: factor on the standard deviations."""
     prior: Array
     """(k,) information."""
     off: Array
-    """(k,) how far the values are from where the priors have them."""
+    """(k,) deviation of the values from the priors' means."""
     limit: float | Array = np.inf
     """(k,) largest change in one step."""
     room: tuple[float | Array, float | Array] = (-np.inf, np.inf)
-    """(k,) each: how far the values can change, down and up, before they reach a bound."""
+    """(k,) each: possible change of the values, down and up, before they reach a bound."""
 
     @cached_property
     def weight(self) -> Array:
@@ -100,19 +101,19 @@ class System(Generic[S, L]):
 
     @cached_property
     def score(self) -> Array:
-        """(n, k) what each residual pulls the values by, before the priors."""
+        """(n, k) score of each residual, without the priors."""
         return np.asarray(np.einsum("nmk,nm->nk", self.rows, self.left * self._precision[:, None]))
 
     @cached_property
     def normal(self) -> Array:
-        """(k, k) curvature of the loss, as Gauss and Newton take it, with the priors'."""
+        """(k, k) Gauss-Newton curvature of the loss, priors included."""
         points, ways, values = self.rows.shape
         flat = self.rows.reshape(points * ways, values)
         weighted = flat * np.repeat(self._precision, ways)[:, None]
         return np.asarray(weighted.T @ flat + np.diag(self.prior))
 
     def pull(self, left: Array) -> Array:
-        """(k, ...) what residuals (n, m, ...) in standard deviations would pull the values by, at these weights."""
+        """(k, ...) total score of residuals (n, m, ...), given in standard deviations, at these weights."""
         return np.asarray(np.einsum("nmk,nm...->k...", self.rows * self._precision[:, None, None], left))
 
     @property
@@ -120,13 +121,13 @@ class System(Generic[S, L]):
         return np.asarray(self.weight / self.scale**2)
 
     def cost(self, scale: float | Array) -> float:
-        """Cauchy loss at a scale, with the priors."""
+        """Cauchy loss at a scale, priors included."""
         width = (CAUCHY * scale) ** 2
         loss = 0.5 * (width * np.log1p(self.squared / width) / scale**2).sum()
         return float(loss + 0.5 * (self.prior * self.off**2).sum())
 
     def step(self, damping: float) -> Array:
-        """The step (k,), the normal equations' diagonal raised by this part; values at a bound stay within."""
+        """The step (k,) with the diagonal of the normal equations increased by this fraction; bounds are respected."""
         matrix = self.normal + damping * np.diag(np.diag(self.normal))
         right, (down, up) = self.score.sum(axis=0) - self.prior * self.off, self.room
         step, free = np.zeros(len(right)), np.ones(len(right), bool)
@@ -146,20 +147,20 @@ class System(Generic[S, L]):
         return np.asarray(np.linalg.pinv(self.normal / whole, rcond=1e-12, hermitian=True)) / whole
 
     def sandwich(self, scatter: Array) -> Array:
-        """Covariance (k, k) where the scores of what errs together have this scatter (k, k), with the priors'."""
+        """Covariance (k, k) for grouped scores of this scatter (k, k), priors included."""
         inverse = self.inverse()
         return np.asarray(inverse @ (scatter + np.diag(self.prior)) @ inverse)
 
 
 class Evidence(Protocol[S, L]):
-    """What was measured, and how values predict it."""
+    """The measurements, and their prediction from values."""
 
     def look(self, state: S, before: L | None, limit: Slopes) -> L:
-        """Predict at a state; slopes of an earlier look serve while they are not stale."""
+        """Predict at a state, reusing the slopes of an earlier look while they are not stale."""
         ...
 
     def weighed(self, state: S, look: L) -> System[S, L]:
-        """Put residuals in their standard deviations and eliminate nuisances."""
+        """Express residuals in standard deviations and eliminate nuisance parameters."""
         ...
 
     def moved(self, state: S, step: Array) -> S:
@@ -174,9 +175,9 @@ def descend(
     look: L | None = None,
     fresh: bool = True,
 ) -> System[S, L]:
-    """Levenberg-Marquardt; the scale of the residuals follows each accepted step.
+    """Levenberg-Marquardt; the scale of the residuals is updated after each accepted step.
 
-    look: at this state, from an earlier descent.  fresh: slopes are taken anew where it ends, if they are stale there.
+    look: at this state, from an earlier descent.  fresh: re-evaluate the final slopes if they are stale.
     """
     system = evidence.weighed(state, look or evidence.look(state, None, Slopes.HERE))
     if not system.prior.size:
@@ -210,9 +211,9 @@ def descend(
 
 
 def slopes_by_steps(predict: Callable[[Array], Array], here: Array, values: Array, steps: Array, high: Array) -> Array:
-    """Change (n, k) of what is predicted per unit of each value; backwards where a step would pass its upper bound.
+    """Change (n, k) of the prediction per unit of each value; backward differences where a step would pass ``high``.
 
-    here: (n,) what is predicted for the values (k,).
+    here: (n,) the prediction at the values (k,).
     """
     changes = np.diag(np.where(values + steps > high, -steps, steps))
     columns = [(predict(values + change) - here) / change.sum() for change in changes]
@@ -220,7 +221,7 @@ def slopes_by_steps(predict: Callable[[Array], Array], here: Array, values: Arra
 
 
 def slices(lengths: Iterable[int]) -> list[slice]:
-    """Where each of some groups of values, one after another, lies in all of them."""
+    """Slices of consecutive groups of these lengths."""
     return [slice(*ends) for ends in pairwise(accumulate(lengths, initial=0))]
 
 

@@ -1,7 +1,7 @@
-"""Stretches of the inertial log that do not look like a gyroscope's: straight lines across gaps, readings at a limit.
+"""Implausible stretches of the gyroscope log: straight lines across gaps, and clipped readings.
 
-The log alone shows them: a gyroscope's noise never lies on a straight line on three axes at once for long, nor piles up
-at its largest value.
+The log itself reveals them: a gyroscope's noise does not follow a straight line on three axes at once for long, nor do
+readings accumulate at their largest value.
 """
 
 from __future__ import annotations
@@ -16,25 +16,26 @@ from virest.capture.imu import ImuSamples
 Mask = NDArray[np.bool_]
 STRAIGHT, CLIPPED = "straight", "clipped"
 STRAIGHT_PART = 0.03
-"""Second differences below this part of their median are those of a straight line."""
+"""Second differences below this fraction of their median count as those of a straight line."""
 CHANCE = 1e-6
-"""Of a straight run somewhere in the log, by the rate of such differences on the three axes."""
+"""False-alarm probability of a straight run in the log, from the rate of such differences on the three axes."""
 LEAST_STRAIGHT_S = 0.02
 PILE_PART, LEAST_PILED, PILED_RUN = 0.005, 6, 3
-"""Readings within this part of the largest count as at the limit; this many in all, with a run this long, show
-clipping."""
+"""Readings within PILE_PART of the largest are at the limit; clipping needs LEAST_PILED of them in all, with a run of
+PILED_RUN."""
 PILE_RATIO = 4.0
-"""Of readings at the limit to those in as wide a band just below: a peak's top is wider than its flanks, but not so."""
+"""Smallest ratio of the readings at the limit to those in an equally wide band below; for an unclipped peak it is
+lower."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """A part of the log that is not trusted."""
+    """An untrusted part of the log."""
 
     kind: str
     """``straight`` or ``clipped``."""
     from_s: float
-    """IMU clock from stamp_0; the last reading that is trusted."""
+    """IMU clock from stamp_0; the last trusted reading before it."""
     to_s: float
     axes: tuple[int, ...]
     limit_rad_s: float | None = None
@@ -42,7 +43,7 @@ class Stretch:
 
 
 def doubtful_stretches(imu: ImuSamples) -> list[Stretch]:
-    """What the log itself shows, in the order of time."""
+    """The implausible stretches of the log, in order of time."""
     if len(imu) < 20:
         return []
     found = [*_straight(imu), *(s for axis in range(3) for s in _clipped(imu, axis))]
@@ -50,7 +51,7 @@ def doubtful_stretches(imu: ImuSamples) -> list[Stretch]:
 
 
 def _straight(imu: ImuSamples) -> list[Stretch]:
-    """Runs of samples on a straight line, on all axes at once, too long for chance."""
+    """Runs of samples on a straight line on all axes at once that are too long for chance."""
     time_s, rate = imu.time_s, imu.gyro_rad_s
     slope = np.diff(rate, axis=0) / np.diff(time_s)[:, None]
     bend = np.abs(np.diff(slope, axis=0))
@@ -68,7 +69,7 @@ def _straight(imu: ImuSamples) -> list[Stretch]:
 
 
 def _clipped(imu: ImuSamples, axis: int) -> list[Stretch]:
-    """Runs of readings at the axis' largest value, where they pile up there."""
+    """Runs of readings at the axis's largest value, if readings accumulate there."""
     size = np.abs(imu.gyro_rad_s[:, axis])
     limit = float(size.max())
     at_limit: Mask = np.asarray(size >= (1 - PILE_PART) * limit)

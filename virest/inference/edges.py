@@ -1,4 +1,4 @@
-"""Isolated slopes of a picture, found anywhere, and profiles across them."""
+"""Isolated edges in a picture, and grey-level profiles across them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 TANGENT_PX = (-2.0, -1.0, 0.0, 1.0, 2.0)
-"""Parallel profiles that are averaged: an edge is straight over this much."""
+"""Offsets of the parallel profiles that are averaged: edges are straight over this length."""
 MARGIN_PX = 7
-"""Edges nearer to the picture's border are not looked at."""
+"""Edges closer to the picture's border are ignored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,17 +24,17 @@ class EdgeSettings:
 
     edges_per_frame: int = 400
     cell_px: int = 20
-    """One edge of each of four directions from each square of this side."""
+    """Side of the squares; each gives one edge for each of four directions."""
     min_slope_levels: float = 2.0
-    """Least slope of a candidate, grey levels a pixel after smoothing by 1 px."""
+    """Smallest slope of a candidate, grey levels per pixel after smoothing by 1 px."""
     min_step_levels: float = 30.0
-    """Least height of a step, grey levels."""
+    """Smallest height of a step, grey levels."""
     max_misfit: float = 0.02
-    """Greatest rms of a profile about its fitted step, as part of the step's height."""
+    """Largest rms of a profile about its fitted step, relative to the step's height."""
 
 
 def find_edges(picture: Picture, settings: EdgeSettings) -> tuple[Array, Array]:
-    """Crests of the slope: points (n, 2) and unit normals (n, 2) from dark to bright, spread over the picture."""
+    """Ridges of the gradient: points (n, 2) and unit normals (n, 2) from dark to bright, spread over the picture."""
     smooth = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 1.0)
     slope_x, slope_y = (cv2.Scharr(smooth, cv2.CV_32F, *order) / 32 for order in ((1, 0), (0, 1)))
     slope = np.hypot(slope_x, slope_y)
@@ -45,12 +45,12 @@ def find_edges(picture: Picture, settings: EdgeSettings) -> tuple[Array, Array]:
     here = np.stack([x, y], -1).astype(np.float32)
     ahead, behind = (sampled(slope, here + sign * normal) for sign in (1, -1))
     crest = (slope[y, x] >= ahead) & (slope[y, x] > behind)
-    kept = np.flatnonzero(crest)[_spread(here[crest], normal[crest], slope[y, x][crest], settings)]
+    kept = np.flatnonzero(crest)[_strongest_per_cell(here[crest], normal[crest], slope[y, x][crest], settings)]
     return here[kept].astype(float), normal[kept].astype(float)
 
 
-def _spread(points: Any, normal: Any, strength: Any, settings: EdgeSettings) -> NDArray[np.intp]:
-    """Index of the strongest edge of each cell and direction, thinned evenly to the wanted number."""
+def _strongest_per_cell(points: Any, normal: Any, strength: Any, settings: EdgeSettings) -> NDArray[np.intp]:
+    """Index of the strongest edge of each cell and direction, thinned evenly to ``edges_per_frame``."""
     direction = np.floor(np.arctan2(normal[:, 1], normal[:, 0]) % np.pi / (np.pi / 4)).astype(np.intp) % 4
     cell = (points // settings.cell_px).astype(np.intp)
     key = (cell[:, 1] * 100_000 + cell[:, 0]) * 4 + direction
@@ -62,9 +62,9 @@ def _spread(points: Any, normal: Any, strength: Any, settings: EdgeSettings) -> 
 
 
 def sampled(plane: Any, points: Any) -> NDArray[np.float32]:
-    """Bicubic samples (n, m) or (n,) of a plane at (n, m, 2) or (n, 2); NaN nearer than a pixel to the border."""
+    """Bicubic samples (n, m) or (n,) of a plane at (n, m, 2) or (n, 2); NaN within 1 px of the border."""
     shape = np.shape(points)[:-1]
-    # In one row: OpenCV goes through a map row by row, and 16,384 rows of one pixel take it 25 times as long.
+    # One row: OpenCV processes a map row by row, so 16,384 rows of one pixel would take 25 times as long.
     flat = np.ascontiguousarray(np.asarray(points, np.float32).reshape(1, -1, 2))
     chunks = [
         cv2.remap(plane, flat[:, i : i + 16_384], None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -79,7 +79,7 @@ def sampled(plane: Any, points: Any) -> NDArray[np.float32]:
 def parallel_profiles(picture: Picture, points: Array, normals: Array, along_px: Array) -> Array:
     """Means (n, m) of parallel profiles across edges, grey levels, at distances along the normals.
 
-    Lanczos over 8 pixels: OpenCV's cubic sharpens by itself, and doubles the overshoot of a bare movie.
+    Lanczos over 8 pixels, because OpenCV's cubic itself sharpens: it doubles the overshoot of an unsharpened movie.
     """
     tangents = np.stack([-normals[:, 1], normals[:, 0]], -1)
     total = np.zeros((len(points), len(along_px)))

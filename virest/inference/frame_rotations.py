@@ -1,4 +1,4 @@
-"""How far the pictures turned from frame to frame, and when the gyroscope did: the coarse search for a time offset."""
+"""Rotation between consecutive frames, from tracked points and from the gyroscope, for the coarse offset search."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ REWEIGHTINGS = 8
 
 @dataclass(frozen=True, slots=True)
 class FrameRotations:
-    """Rotation of the pictures over pairs of frames: x_second = exp(vector) x_first for rays in camera axes."""
+    """Rotation over pairs of frames: x_second = exp(vector) x_first for rays in camera axes."""
 
     first_s: Array
-    """(p,) when the centre of the first picture was seen, camera clock."""
+    """(p,) time of the first frame's centre row, camera clock."""
     second_s: Array
     """(p,)."""
     vector_rad: Array
@@ -29,11 +29,11 @@ class FrameRotations:
 
     @property
     def middle_s(self) -> Array:
-        """(p,) between the two."""
+        """(p,) midpoint of the two."""
         return 0.5 * (self.first_s + self.second_s)
 
     def detrended(self, values: Array) -> Array:
-        """(..., p, 3) without what a constant and a steadily drifting rate would make: gyro bias, or a steady pan."""
+        """(..., p, 3) without a constant and a linearly drifting rate, such as gyroscope bias or a steady pan."""
         lasting = self.second_s - self.first_s
         basis = np.stack([lasting, lasting * (self.middle_s - self.middle_s.mean())], axis=-1)
         q, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0).clip(1e-9))
@@ -41,9 +41,9 @@ class FrameRotations:
 
 
 def picture_rotation(lens: Intrinsics, pair: TrackPair) -> Array:
-    """Rotation vector (3,) that takes the first picture's rays to the second's, robustly.
+    """Robust rotation vector (3,) that takes the first frame's rays to the second's.
 
-    Wahba's problem (Kabsch 1976) with Cauchy weights, whose scale is the median deviation of the pass before.
+    Wahba's problem (Kabsch 1976) with Cauchy weights, scaled by the median deviation of the previous pass.
     """
     first, second = _unit(lens.rays(pair.points_first_px)), _unit(lens.rays(pair.points_second_px))
     weight = np.ones(len(first))
@@ -57,13 +57,13 @@ def picture_rotation(lens: Intrinsics, pair: TrackPair) -> Array:
 
 
 def picture_turns(lens: Intrinsics, pairs: Sequence[TrackPair], first_s: Array, second_s: Array) -> FrameRotations:
-    """Rotation of every pair; first_s, second_s: (p,) camera clock at which the pictures' centres were seen."""
+    """Rotation of every pair; first_s, second_s: (p,) times of the frames' centre rows, camera clock."""
     vectors = np.array([picture_rotation(lens, pair) for pair in pairs]).reshape(-1, 3)
     return FrameRotations(first_s, second_s, vectors)
 
 
 def gyro_turns(trajectory: Trajectory, first_s: Array, second_s: Array) -> Array:
-    """Predict what the pictures' rotation vectors (..., 3) should be between times (...) on the IMU clock."""
+    """Rotation vectors (..., 3) that the gyroscope predicts between times (...) on the IMU clock."""
     after = trajectory.orientation(second_s)
     return vector_from_rotation(np.swapaxes(after, -1, -2) @ trajectory.orientation(first_s))
 

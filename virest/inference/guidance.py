@@ -1,10 +1,10 @@
-"""Where the gyroscope and the forward model put what one frame shows in another: the map that guides tracking.
+"""The map between two frames that gyroscope and forward model predict: it guides tracking.
 
-The map is that of :mod:`virest.image_formation.point_model` for a camera that turns, with each row at its own time.
-It is worked out at Chebyshev nodes and is a polynomial between them: exact to 0.01 px at any rate a hand reaches.
+It is the map of :mod:`virest.image_formation.point_model` for a rotating camera, with each row at its own time.  It is
+computed at Chebyshev nodes and interpolated by a polynomial: exact to 0.01 px at any rate of hand motion.
 
-Where one frame is more blurred than the other, the sharper one is blurred by what it lacks: a uniform path d has the
-covariance d dᵀ / 12, and the positive part of the difference of the two frames' is added as a Gaussian.
+If the frames are blurred differently, the sharper one is blurred by the difference: a uniform blur path d has the
+covariance d dᵀ / 12, and the positive part of the difference of both covariances is applied as a Gaussian.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from virest.inference.tracking import Picture, TrackPair
 
 Array = NDArray[np.float64]
 NODES = 8
-"""Along each side.  With 6 the map of a hand at 5 rad/s is off by up to 0.03 px, with 8 by less than 0.002 px."""
+"""Nodes along each side.  At 5 rad/s of hand motion, 6 nodes err by up to 0.03 px, 8 by less than 0.002 px."""
 ROW_STEPS = 3
-"""Row times depend on where a point lands; each step shrinks the error about tenfold at 250 px a frame."""
+"""Row times depend on where a point lands; each step reduces the error about tenfold at 250 px per frame."""
 INVERSE_STEPS, INVERSE_PX = 12, 1e-3
 LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 1.0, 0.2, 2.0
-"""Blur of a smaller deviation is left out; across its path a Gaussian is a pixel wide; it ends at 2 deviations."""
+"""Smallest σ of blur that is applied; smallest σ of the Gaussian across the path; its extent in σ."""
 
 
 @dataclass(frozen=True, slots=True)
 class GyroGuide:
-    """A camera that turns as the gyroscope says, at the offset of its profile."""
+    """A camera that rotates as the gyroscope measures, at its profile's time offset."""
 
     known: IntegratedMotion
     stamp_s: Array
-    """(frames,) by movie index, camera clock from stamp_0; NaN where the stamp or the log is not to be relied on."""
+    """(frames,) by movie index, camera clock from stamp_0; NaN if the timestamp or the log is unreliable."""
     exposure_s: Array
     """(frames,) as logged; 0 where unknown."""
 
     def seen_before(self, first: int, second: int, shape: tuple[int, int], factor: int) -> MapBetween | None:
-        """Where points of the second frame were in the first one; None without stamps.
+        """The map from points of the second frame to the first; None without timestamps.
 
-        shape, factor: (height, width) of the pictures to be compared, and how often they were shrunk.
+        shape, factor: (height, width) of the pictures to be compared, and their reduction factor.
         """
         if not np.isfinite(self.stamp_s[[first, second]]).all():
             return None
@@ -61,7 +61,7 @@ class GyroGuide:
         )
 
     def _moved(self, frame: int, other: int, points_px: Array) -> Array:
-        """Where points (n, 2) of one frame are in another."""
+        """Positions in another frame of points (n, 2) of one frame."""
         table = track_table([TrackPair(frame, other, points_px, points_px)], self.stamp_s, self.exposure_s, np.ones(1))
         prediction = None
         for _ in range(ROW_STEPS):
@@ -70,7 +70,7 @@ class GyroGuide:
         return table.second_px
 
     def _blur(self, first: int, second: int, at_px: Array) -> Array:
-        """Covariances (2, 2, 2) of both frames' blur, px², from the chords of the exposures' paths at points (n, 2)."""
+        """Covariances (2, 2, 2) of both frames' blur, px², from the chords of the blur paths at points (n, 2)."""
         pairs = [TrackPair(frame, frame, at_px, at_px) for frame in (first, second)]
         table = track_table(pairs, self.stamp_s, self.exposure_s, np.ones(2))
         half_s = 0.5 * np.asarray(self.known.profile.shutter.true_exposure_s(table.first_exposure_s))
@@ -81,17 +81,17 @@ class GyroGuide:
 
 @dataclass(frozen=True, slots=True)
 class MapBetween:
-    """A map from the second picture to the first: a polynomial of the place."""
+    """A map from the second picture to the first, polynomial in the position."""
 
     coefficients: Array
     """(NODES, NODES, 2) of the shift in Chebyshev polynomials of y and x, pixels."""
     shape: tuple[int, int]
     first_lacks: Array | None = None
-    """(2, 2) covariance of the blur that the first picture lacks beside the second, px²; None: nothing."""
+    """(2, 2) covariance of the blur that the first picture lacks relative to the second, px²; None: none."""
     second_lacks: Array | None = None
 
     def first_of(self, points_px: Array) -> Array:
-        """Where points (n, 2) of the second picture are in the first."""
+        """Positions in the first picture of points (n, 2) of the second."""
         height, width = self.shape
         down = _basis(2 * points_px[:, 1] / (height - 1) - 1)
         across = _basis(2 * points_px[:, 0] / (width - 1) - 1)
@@ -99,7 +99,7 @@ class MapBetween:
         return points_px + np.stack(shift, axis=-1)
 
     def second_of(self, points_px: Array) -> Array:
-        """Where points (n, 2) of the first picture are in the second: the inverse, by fixed point."""
+        """Positions in the second picture of points (n, 2) of the first: the inverse, by fixed-point iteration."""
         found = points_px
         for _ in range(INVERSE_STEPS):
             off = points_px - self.first_of(found)
@@ -109,7 +109,7 @@ class MapBetween:
         return found
 
     def carried(self, first: Picture) -> Picture:
-        """The first picture as the second one should show it, as blurred as the second where that is more."""
+        """The first picture warped to the second, and blurred if the second is more blurred."""
         height, width = self.shape
         down, across = (_all_places(length) for length in self.shape)
         values = self.coefficients.astype(np.float32)
@@ -120,14 +120,15 @@ class MapBetween:
         return _blurred(np.asarray(shown, np.uint8), self.first_lacks)
 
     def evened(self, second: Picture) -> Picture:
-        """The second picture, as blurred as the first where that is more."""
+        """The second picture, blurred if the first is more blurred."""
         return _blurred(second, self.second_lacks)
 
 
 def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
-    """The guide of a capture at a profile's offset, 0 where it has none; the profile must have a focal length.
+    """The guide of a capture at a profile's offset, 0 if it has none; the profile must have a focal length.
 
-    Where the log looks filled or clipped it does not guide: it would lead points astray, and those left would agree.
+    Frames whose log looks interpolated or clipped are not guided: the guide would misplace points, and the points that
+    survive would agree with it.
     """
     stamp_s, exposure_s, _ = frame_times(capture)
     stamp_s[[frame.skip_reason is not None for frame in capture.frames]] = np.nan
@@ -136,7 +137,7 @@ def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
 
 
 def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure_s: Array) -> NDArray[np.bool_]:
-    """Frames (frames,) from whose first row to the next frame's last a stretch of the log is in doubt and unbridged."""
+    """Mask (frames,): a doubtful, unbridged stretch of the log lies between a frame's first row and the next's last."""
     doubtful = [(stretch.from_s, stretch.to_s) for stretch in doubtful_stretches(capture.imu)]
     doubtful = [span for span in doubtful if not profile.bridges(*span)]
     clock, period_s = RowClock(profile), float(np.nanmedian(np.diff(stamp_s)))
@@ -149,14 +150,14 @@ def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure
 
 
 def map_between(first_of: Callable[[Array], Array], shape: tuple[int, int], factor: int) -> MapBetween:
-    """The map of pictures (height, width), shrunk ``factor`` times, that takes stored pixels (n, 2) to the first's."""
+    """Interpolate a map of stored pixels (n, 2) to the first frame, for pictures (height, width) after reduction."""
     at_px = _nodes_px(shape, factor)
     shift = (first_of(at_px) - at_px).reshape(NODES, NODES, 2) / factor
     return MapBetween(np.einsum("ki,lj,ijc->klc", _weights(), _weights(), shift), shape)
 
 
 def _nodes_px(shape: tuple[int, int], factor: int) -> Array:
-    """Nodes (NODES², 2) over a shrunk picture, stored pixels, row by row."""
+    """Nodes (NODES², 2) over a reduced picture, in stored pixels, row by row."""
     height, width = shape
     x, y = (0.5 * (length - 1) * (1 + _nodes()) for length in (width, height))
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) * factor + (factor - 1) / 2
@@ -168,15 +169,15 @@ def _positive_part(covariance: Array) -> Array:
 
 
 def _blurred(picture: Picture, covariance: Array | None) -> Picture:
-    """A picture through a Gaussian of a covariance (2, 2), px²; as it is where that is next to nothing."""
+    """A picture blurred by a Gaussian of a covariance (2, 2), px²; unchanged if that is below LEAST_BLUR_PX."""
     if covariance is None:
         return picture
     values, axes = np.linalg.eigh(covariance)
     if values[-1] < LEAST_BLUR_PX**2:
         return picture
     reach = np.ceil(GAUSSIAN_REACH * np.sqrt(np.maximum(np.diag(covariance), NARROWEST_PX**2)))
-    place = np.stack(np.meshgrid(*(np.arange(-length, length + 1) for length in reach)), -1) @ axes
-    kernel = np.exp(-0.5 * (place**2 / np.maximum(values, NARROWEST_PX**2)).sum(axis=-1))
+    offset = np.stack(np.meshgrid(*(np.arange(-length, length + 1) for length in reach)), -1) @ axes
+    kernel = np.exp(-0.5 * (offset**2 / np.maximum(values, NARROWEST_PX**2)).sum(axis=-1))
     return np.asarray(cv2.filter2D(picture, -1, kernel / kernel.sum()), np.uint8)
 
 

@@ -1,12 +1,12 @@
-"""Whether the pictures follow the gyroscope, so that it may guide the tracking: asked before any point is followed.
+"""Decide before tracking whether the frames follow the gyroscope, so that it may guide the tracking.
 
-Tiles of a sample of pictures are compared with the pictures after them at every shift within reach (normalised
-cross-correlation), without the gyroscope.  What the tiles score where the gyroscope puts them is its support.  Texture
-that repeats scores at many shifts, but over many pairs only the right motion finds them all.
+Tiles of some frames are matched with the next frame at every shift within reach (normalised cross-correlation), without
+the gyroscope.  The gyroscope's support is the mean score at the shifts that it predicts.  Repetitive texture scores at
+many shifts, but over many pairs only the true motion scores throughout.
 
-The same log with its axes interchanged (the 24 axis maps) and played backwards is as fast, as smooth in time and as
-often tried, and knows nothing of the pictures.  Its supports, each the best of the same offsets, follow Gumbel's
-distribution of extremes; the gyroscope guides where its own lies beyond what they reach once in 1 / FALSE_ALARMS.
+Rivals are the same log with its axes permuted (the 24 axis maps) and reversed in time: equally fast, equally smooth,
+tried at the same offsets, and unrelated to the frames.  Their supports, each the maximum over the offsets, follow
+Gumbel's extreme-value distribution; the gyroscope guides if its support exceeds their quantile at FALSE_ALARMS.
 """
 
 from __future__ import annotations
@@ -36,47 +36,47 @@ from virest.motion.trajectory import Trajectory
 Array = NDArray[np.float64]
 Reader = Callable[[Sequence[int]], Iterable[tuple[int, Picture | None]]]
 SAMPLE_FRAMES, RUN_FRAMES = 32, 8
-"""Four runs of frames where the gyroscope is liveliest."""
+"""Four runs of frames with the highest gyroscope motion."""
 LONG_SIDE_PX, TILE_PX, REACH_PX = 192, 33, 48
-"""Of the shrunk pictures: a quarter of the longer side a frame is within reach, 480 px of 1920."""
+"""Pixels of the reduced picture: the reach is a quarter of the longer side per frame, 480 px of 1920 px."""
 TILES = 3
-"""Each way."""
+"""Tiles along each side."""
 FLAT_LEVELS = 1.5
-"""A tile whose grey levels spread less shows nothing."""
+"""Tiles with a smaller standard deviation of grey levels are ignored."""
 STEP_S, NEAR_S, SEARCH_S = 0.008, 0.04, 1.0
-"""Offsets tried: about the profile's first, then all."""
+"""Step of the offsets; range around the profile's offset, searched first; full range."""
 FINE_STEP_S = 0.002
 FALSE_ALARMS = 1e-3
 SAME_PX = 2.0
-"""Logs that put the tiles as near to each other as this (rms) are one."""
+"""Logs whose predicted tile positions differ by less (rms) count as the same."""
 MIN_RIVALS = 20
-STRETCH_PAIRS, LASTING, MOST = 4, 2.0, 0.75
-"""Most stretches of this many pairs must each support the gyroscope, by this many deviations of its rivals there: one
-moment of a log may fit by chance, or be the only one that belongs."""
+BLOCK_PAIRS, BLOCK_SIGMA, LEAST_BLOCKS = 4, 2.0, 0.75
+"""LEAST_BLOCKS of the blocks of BLOCK_PAIRS pairs must each support the gyroscope by BLOCK_SIGMA standard deviations of
+its rivals: a short part of a log may fit by chance, or be the only part of this recording."""
 GUMBEL_MEAN, GUMBEL_STD = 0.5772, 1.2825
 
 
 def find_guide(capture: Capture, profile: CameraProfile, gray: Reader, frames: Sequence[int]) -> GyroGuide | None:
-    """The gyroscope as a guide through frames (movie indices); None where the pictures do not say that they follow it.
+    """The gyroscope as a guide through frames (movie indices); None if the frames do not demonstrably follow it.
 
-    gray: gives (index, picture) of the frames asked for.  At the profile's offset; where it has none, or the pictures
-    follow the gyroscope elsewhere, at the offset where they do best.
+    gray: yields (index, picture) of the requested frames.  The guide uses the profile's offset, or the offset of
+    highest support if the profile has none or the frames follow the gyroscope at another one.
     """
     if profile.intrinsics is None or len(capture.imu) < 8:
         return None
     wanted = set(frames)
     usable = [frame for frame in capture.frames if frame.index in wanted]
-    if not _lively(usable, capture, profile):
+    if not _rotates_enough(usable, capture, profile):
         return None
     sample = choose_pairs(usable, capture.imu, SAMPLE_FRAMES, RUN_FRAMES, profile.time_offset_s or 0.0)
     scores = _matched(gray(sample), profile) if len(sample) > MIN_PAIRS else None
     if scores is None or len(scores.first) < MIN_PAIRS:
         return None
     stated_s = profile.time_offset_s
-    found = None if stated_s is None else _Trial(capture, profile, scores).support(stated_s, NEAR_S)
+    found = None if stated_s is None else _GyroSupport(capture, profile, scores).support(stated_s, NEAR_S)
     if found is None:
         few = scores.of_tiles(slice(None, None, 2))
-        found = _Trial(capture, profile, few).support(stated_s or 0.0, SEARCH_S)
+        found = _GyroSupport(capture, profile, few).support(stated_s or 0.0, SEARCH_S)
     if found is None:
         return None
     offset_s, turn = found
@@ -94,12 +94,12 @@ def track_guided(
     each: ParallelMap = one_by_one,
     progress: Callable[[int], None] | None = None,
 ) -> list[TrackPair]:
-    """Follow points through frames (movie indices, rising) as :func:`track_frames` does, guided where that may be."""
+    """Track points through frames (movie indices, rising) like :func:`track_frames`, guided if the frames allow it."""
     return track_frames(gray, frames, each, progress, find_guide(capture, profile, gray, frames))
 
 
-def _lively(frames: Sequence[Frame], capture: Capture, profile: CameraProfile) -> bool:
-    """Whether the gyroscope turns enough from frame to frame for its rivals to be told from it."""
+def _rotates_enough(frames: Sequence[Frame], capture: Capture, profile: CameraProfile) -> bool:
+    """Whether the rotation between frames is large enough to distinguish the gyroscope from its rivals."""
     if profile.intrinsics is None or len(frames) <= MIN_PAIRS:
         return False
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
@@ -111,20 +111,20 @@ def _lively(frames: Sequence[Frame], capture: Capture, profile: CameraProfile) -
 
 @dataclass(frozen=True, slots=True)
 class _Scores:
-    """How well tiles of first pictures match the second ones at every shift."""
+    """Match scores of the first frames' tiles with the second frames, at every shift."""
 
     first: NDArray[np.intp]
     """(p,) movie index."""
     second: NDArray[np.intp]
     values: NDArray[np.float32]
-    """(p, tiles, 2 r + 3, 2 r + 3) correlation at shifts (y, x) from -r - 1; 0 out of reach and where nothing shows."""
+    """(p, tiles, 2 r + 3, 2 r + 3) correlation at shifts (y, x) from -r - 1; 0 out of reach and for flat tiles."""
     centres_px: Array
-    """(tiles, 2) of the stored picture."""
+    """(tiles, 2) in stored pixels."""
     scale: float
-    """Stored pixels in one of the shrunk picture."""
+    """Stored pixels per pixel of the reduced picture."""
 
     def at(self, shift_px: Array) -> Array:
-        """Mean over tiles (..., p) at shifts (..., p, tiles, 2) of the stored picture."""
+        """Mean over tiles (..., p) at shifts (..., p, tiles, 2) in stored pixels."""
         side = self.values.shape[-1]
         place = np.rint(shift_px / self.scale).astype(np.int32) + (side - 1) // 2
         place = np.clip(place, 0, side - 1)
@@ -133,12 +133,12 @@ class _Scores:
         return np.asarray(self.values.ravel()[flat].mean(axis=-1))
 
     def of_tiles(self, chosen: slice) -> _Scores:
-        """Of some of the tiles."""
+        """The scores of some tiles."""
         return replace(self, values=np.ascontiguousarray(self.values[:, chosen]), centres_px=self.centres_px[chosen])
 
 
 def _matched(pictures: Iterable[tuple[int, Picture | None]], profile: CameraProfile) -> _Scores | None:
-    """Scores of each two consecutive pictures; a repeated one shows another time than its stamp."""
+    """Scores of consecutive frames; repeated frames are skipped, since their content has another time."""
     scale = max(profile.width, profile.height) / LONG_SIDE_PX
     size = round(profile.width / scale), round(profile.height / scale)
     if min(size) < TILE_PX + 2:
@@ -165,7 +165,7 @@ def _matched(pictures: Iterable[tuple[int, Picture | None]], profile: CameraProf
 
 
 def _surface(first: Picture, second: Picture, x: int, y: int) -> NDArray[np.float32]:
-    """Correlation of one tile at all shifts; the outermost ring, out of reach, stays 0."""
+    """Correlation of one tile at all shifts; the outermost ring marks shifts out of reach and stays 0."""
     side = 2 * REACH_PX + 3
     scores = np.zeros((side, side), np.float32)
     tile = first[y : y + TILE_PX, x : x + TILE_PX]
@@ -179,8 +179,8 @@ def _surface(first: Picture, second: Picture, x: int, y: int) -> NDArray[np.floa
     return scores
 
 
-class _Trial:
-    """The gyroscope and its like before the pictures."""
+class _GyroSupport:
+    """Compares the gyroscope's support with that of its rivals."""
 
     def __init__(self, capture: Capture, profile: CameraProfile, scores: _Scores) -> None:
         assert profile.intrinsics is not None
@@ -213,7 +213,7 @@ class _Trial:
         return self._refined(float(offsets[contest[chosen][0]]), self.maps[chosen]), self.maps[chosen]
 
     def _best(self, vector: Array) -> tuple[int, Array, Array]:
-        """Number of the offset at which turns (offsets, p, tiles, 3) score best, scores (p,) and shifts there."""
+        """Index of the offset at which rotations (offsets, p, tiles, 3) score best, scores (p,) and shifts there."""
         shifts = self._shifts(vector)
         by_pair = self.scores.at(shifts)
         best = int(np.argmax(by_pair.mean(axis=-1)))
@@ -225,7 +225,7 @@ class _Trial:
         return float(near[support >= support.max() - 1e-9].mean())
 
     def _turns(self, offsets_s: Array, backwards: bool = False) -> NDArray[np.float32]:
-        """Rotation vectors (offsets, p, tiles, 3) of the pictures, each tile at its row's time."""
+        """Predicted rotation vectors (offsets, p, tiles, 3), each tile at its row's time."""
         first_s, second_s = (time_s + offsets_s[:, None, None] for time_s in (self.first_s, self.second_s))
         if backwards:
             ends = sum(self.trajectory.span_s)
@@ -233,9 +233,9 @@ class _Trial:
         return gyro_turns(self.trajectory, first_s, second_s).astype(np.float32)
 
     def _shifts(self, vector: Array) -> Array:
-        """Shifts (..., p, tiles, 2) of the tiles, stored pixels, turned by vectors (..., p, tiles, 3): second order.
+        """Shifts (..., p, tiles, 2) of the tiles, stored pixels, rotated by vectors (..., p, tiles, 3) to second order.
 
-        A tile that moves down the picture is read later: its shift goes on at the same rate.
+        A tile that moves down the picture is read later, and keeps moving at the same rate until then.
         """
         rays = self.lens.rays(self.scores.centres_px).astype(np.float32)
         once = np.cross(vector, rays)
@@ -245,24 +245,24 @@ class _Trial:
         return np.asarray(moved * (1 + self._late_s(moved) / lasting)[..., None])
 
     def _late_s(self, moved: Array) -> Array:
-        """By how much (..., p, tiles) the tiles are read later than where they were."""
+        """Delay (..., p, tiles) of the tiles' readout caused by their shifts."""
         before_px, fraction = self.scores.centres_px, self.clock.readout_fraction
         later = fraction(before_px + moved) - fraction(before_px)
         return np.asarray(row_time_s(0.0, self.clock.profile.shutter.readout_time_s, later))
 
 
 def _beyond_chance(own: Array, rivals: Array) -> bool:
-    """Whether scores of pairs (p,) lie beyond what rivals' (k, p) reach by chance, and do so most of the time."""
+    """Whether scores of pairs (p,) exceed those of rivals (k, p) significantly, overall and in most time blocks."""
     if len(rivals) < MIN_RIVALS:
         return False
-    surest = -np.log(-np.log1p(-FALSE_ALARMS))
-    if _deviations(own.mean(), rivals.mean(axis=1)) < (surest - GUMBEL_MEAN) / GUMBEL_STD:
+    threshold = -np.log(-np.log1p(-FALSE_ALARMS))
+    if _deviations(own.mean(), rivals.mean(axis=1)) < (threshold - GUMBEL_MEAN) / GUMBEL_STD:
         return False
-    stretches = np.array_split(np.arange(len(own)), max(len(own) // STRETCH_PAIRS, 1))
-    lasting = [_deviations(own[part].mean(), rivals[:, part].mean(axis=1)) > LASTING for part in stretches]
-    return float(np.mean(lasting)) >= MOST
+    blocks = np.array_split(np.arange(len(own)), max(len(own) // BLOCK_PAIRS, 1))
+    supported = [_deviations(own[block].mean(), rivals[:, block].mean(axis=1)) > BLOCK_SIGMA for block in blocks]
+    return float(np.mean(supported)) >= LEAST_BLOCKS
 
 
 def _deviations(value: float, others: Array) -> float:
-    """By how many standard deviations of the others (n,) a value lies above their mean."""
+    """Excess of a value over the mean of the others (n,), in their standard deviations."""
     return float((value - others.mean()) / max(float(others.std(ddof=1)), 1e-6))

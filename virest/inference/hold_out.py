@@ -1,4 +1,4 @@
-"""Tracked points judged by fits that did not see their block of time."""
+"""Cross-validation of tracked points: residuals from fits that did not use their time block."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Index = NDArray[np.intp]
 
 
 def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
-    """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
+    """Whitened residual lengths (n,) of all points of a table for a fit that may have used only some of them."""
     scene = for_table(fitted.scene, table)
     everywhere = fit_tracks(imu, table, fitted.profile, (), scene, max_iterations=0, known=fitted.ground)
     return everywhere.distance_at(depth_spread_per_m)
 
 
 def loss(distance: Array, scale: float) -> Array:
-    """Cauchy loss of whitened distances at a scale."""
+    """Cauchy loss of whitened residual lengths at a scale."""
     return np.asarray(np.log1p((distance / (CAUCHY * scale)) ** 2))
 
 
 def group_means(values: Array, group: Index) -> Array:
-    """(groups,) means of values (n,) by the number of their group."""
+    """(groups,) means of values (n,) by group number."""
     return np.asarray(np.bincount(group, values) / np.maximum(np.bincount(group), 1))

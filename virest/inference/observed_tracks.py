@@ -1,4 +1,4 @@
-"""From tracked pairs to what a geometric fit needs: pairs worth using, their noise, turns, windows and table."""
+"""Prepare tracked pairs for a geometric fit: usable pairs, their noise, rotations, windows and point table."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
 MIN_TRACKS = 15
-"""A pair with fewer tells too little."""
+"""Fewest points of a usable pair."""
 WINDOW_S = 3.5
-"""Longest stretch over which the accelerometer's path is followed; its noise grows with the power 1.5."""
+"""Longest time over which accelerations are integrated to a path; the path's noise grows with time to the power 1.5."""
 IMU_PAUSE_PERIODS = 3.0
 MARGIN_S = 0.02
 CELLS, LEAST_IN_CELL, ASTRAY, MOST_ASTRAY = 8, 10, 2.5, 0.5
 GUESSED_FOCAL = 0.8
-"""Of the longer side: a phone's main camera; where nothing is known."""
+"""Focal length of an unknown camera relative to the longer side: a phone's main camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObservedTracks:
-    """Pairs that are worth something, and when their frames were stamped."""
+    """Usable pairs, with their frames' timestamps and exposures."""
 
     pairs: tuple[TrackPair, ...]
     stamp_s: Array
@@ -63,7 +63,7 @@ class ObservedTracks:
         return replace(self, pairs=kept, noise_px=self.noise_px[use])
 
     def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
-        """The pairs whose two pictures lie inside the inertial data, with no pause or untrusted stretch between."""
+        """The pairs whose frames lie inside the inertial data, without a gap or untrusted stretch between them."""
         shutter = profile.shutter
         start = np.asarray(RowClock(profile).time_s(self.stamp_s, self.exposure_s))
         last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s) + MARGIN_S
@@ -78,17 +78,17 @@ class ObservedTracks:
         return self.chosen(use)
 
     def without_astray(self, first_px: Array, distance: Array) -> tuple[ObservedTracks, float]:
-        """Leave out the parts of the picture that go their own way, and say how many of the points that takes."""
+        """Drop image regions that move on their own; also returns the dropped fraction of the points."""
         astray = self.astray_cells(first_px, distance)
         if not astray.any():
             return self, 0.0
         return self.without_cells(astray), float(astray[self.cells(first_px)].mean())
 
     def astray_cells(self, first_px: Array, distance: Array) -> NDArray[np.bool_]:
-        """Which cells (CELLS²,) of the picture go their own way: a dashboard, a passer-by.
+        """Mask (CELLS²,) of cells of the picture that move on their own: a dashboard, a passer-by.
 
-        first_px (n, 2), distance (n,): points of a fit and how far each lies from it, in standard deviations.  A cell
-        is astray if its median distance is ASTRAY times the typical cell's; none if most points would be.
+        first_px (n, 2), distance (n,): points of a fit and their residuals, in standard deviations.  A cell counts if
+        its median residual exceeds ASTRAY times the typical cell's; none count if they would hold most points.
         """
         cell = self.cells(first_px)
         counts = np.bincount(cell, minlength=CELLS**2)
@@ -100,13 +100,13 @@ class ObservedTracks:
         return astray & (counts[astray].sum() <= MOST_ASTRAY * counts.sum())
 
     def without_cells(self, cells: NDArray[np.bool_]) -> ObservedTracks:
-        """Leave out the points that begin in some cells (CELLS²,) of the picture, and pairs that are then too few."""
+        """Drop the points that start in some cells (CELLS²,) of the picture, and pairs left with too few points."""
         kept = [_selected(pair, ~cells[self.cells(pair.points_first_px)]) for pair in self.pairs]
         use = np.array([len(pair) >= MIN_TRACKS for pair in kept])
         return replace(self, pairs=tuple(kept)).chosen(use)
 
     def cells(self, points_px: Array) -> NDArray[np.intp]:
-        """Number of the cell that each point lies in."""
+        """Number of each point's cell."""
         part = points_px * (CELLS / np.array([self.lens.width, self.lens.height]))
         x, y = np.clip(part.astype(np.intp), 0, CELLS - 1).T
         return np.asarray(y * CELLS + x)
@@ -118,7 +118,7 @@ class ObservedTracks:
         return track_table(pairs, self.stamp_s, self.exposure_s, self.noise_px, self._windows())
 
     def _windows(self) -> list[list[int]]:
-        """Equal stretches of at most WINDOW_S; a pause of one also ends a window."""
+        """Equal windows of at most WINDOW_S; a gap of half of it also ends a window."""
         middle = np.array([self.stamp_s[pair.second] for pair in self.pairs])
         parts: list[list[int]] = []
         for run in np.split(np.arange(len(middle)), np.flatnonzero(np.diff(middle) > 0.5 * WINDOW_S) + 1):
@@ -129,7 +129,7 @@ class ObservedTracks:
 
 
 def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> ObservedTracks:
-    """Keep the pairs with enough points and known stamps; the exposure of frames without one is the typical one."""
+    """Keep the pairs with enough points and known timestamps; missing exposures are set to the median."""
     stamp_s, exposure_s, known = frame_times(capture)
     kept = tuple(
         pair for pair in pairs if len(pair) >= MIN_TRACKS and np.isfinite(stamp_s[[pair.first, pair.second]]).all()
@@ -139,7 +139,7 @@ def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: Camera
 
 
 def frame_times(capture: Capture) -> tuple[Array, Array, bool]:
-    """Stamps and logged exposures (frames,) by movie index, and whether exposures are known: else they are 0."""
+    """Timestamps and logged exposures (frames,) by movie index, and whether exposures are known; if not, they are 0."""
     stamp_s = np.array([frame.time_s for frame in capture.frames], float)
     exposure_s = np.array([np.nan if f.exposure_s is None else f.exposure_s for f in capture.frames], float)
     known = bool(np.isfinite(exposure_s).mean() > 0.5)
@@ -148,7 +148,7 @@ def frame_times(capture: Capture) -> tuple[Array, Array, bool]:
 
 
 def guessed_lens(profile: CameraProfile) -> Intrinsics:
-    """A phone's main camera, where nothing is known."""
+    """The lens of a typical phone's main camera, for an unknown one."""
     return profile.lens_of(GUESSED_FOCAL * max(profile.width, profile.height))
 
 
@@ -177,7 +177,7 @@ def track_table(
     noise_px: Array,
     windows: Sequence[Sequence[int]] | None = None,
 ) -> TrackTable:
-    """Lay out pairs; stamp_s, exposure_s (frames,) by movie index, exposure 0 where unknown.
+    """The table of all pairs' points; stamp_s, exposure_s (frames,) by movie index, exposure 0 where unknown.
 
     windows: numbers of the pairs in each window; None: one window.
     """

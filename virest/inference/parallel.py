@@ -1,4 +1,4 @@
-"""Independent calls of one function, done here or handed to processes: who calls need not know."""
+"""Independent calls of one function, made in this process or in others; the caller need not know which."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 
 class ParallelMap(Protocol):
-    """Calls a function of a module with each tuple of plain arguments and lists the results in that order."""
+    """Calls a module-level function with each tuple of picklable arguments and lists the results in that order."""
 
     def __call__(
         self,
@@ -16,22 +16,22 @@ class ParallelMap(Protocol):
         arguments: Iterable[tuple[Any, ...]],
         done: Callable[[int], None] | None = None,
     ) -> list[Any]:
-        """done: told the place of each call whose result is there, in order."""
+        """done: called with the index of each finished call, in order."""
 
 
 @runtime_checkable
 class Background(Protocol):
-    """A :class:`ParallelMap` that can also begin a call and go on."""
+    """A :class:`ParallelMap` that can also start a call without waiting for it."""
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        """Begin a call; what is returned waits for its result."""
+        """Start a call; the returned function waits for its result."""
         ...
 
 
 def begun(each: ParallelMap, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Begin a call of a module's function with plain arguments beside what this process does next; ask for its result.
+    """Start a call of a module-level function with picklable arguments in the background; returns its result's getter.
 
-    Where there is no other process it is made when its result is asked for, and never if that is not wanted.
+    Without another process, the call is made when the result is requested, or never.
     """
     if isinstance(each, Background):
         return each.begin(function, *arguments)
@@ -41,10 +41,10 @@ def begun(each: ParallelMap, function: Callable[..., Any], *arguments: Any) -> C
 def one_by_one(
     function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], done: Callable[[int], None] | None = None
 ) -> list[Any]:
-    """All calls here, one after another."""
+    """Make all calls in this process, one after another."""
     results = []
-    for place, parts in enumerate(arguments):
+    for number, parts in enumerate(arguments):
         results.append(function(*parts))
         if done is not None:
-            done(place)
+            done(number)
     return results

@@ -1,4 +1,4 @@
-"""What may be wrong with a profile's geometry, one term of the fit each, as the table of effects says."""
+"""The fit's terms for possible errors of a profile's geometry, one per entry of the table of effects."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ TERMS = {
     for name, steps in ((effect.name, effect.steps) for effect in EFFECTS.values())
     if steps is not None
 }
-"""By the name of the effect."""
+"""Terms by the effect's name."""
 
 TIME_OFFSET, CLOCK_SKEW = TERMS["time_offset"], TERMS["clock_skew"]
 PLAIN_READOUT = TERMS["readout_time"]
 READOUT = replace(PLAIN_READOUT, change=add_readout)
-"""With the picture's middle row kept where it was: offset and readout are then fitted apart."""
+"""Readout change that keeps the middle row's time, so that offset and readout are fitted independently."""
 IMU_ROTATION, GYRO_BIAS, GYRO_SCALE = TERMS["imu_rotation"], TERMS["gyro_bias"], TERMS["gyro_scale"]
 FOCAL, K1, PRINCIPAL_POINT = TERMS["focal_length"], TERMS["radial_distortion"], TERMS["principal_point"]
 FOCAL_DRIFT, STABILISATION = TERMS["focal_drift"], TERMS["stabilisation"]
@@ -30,13 +30,13 @@ EXPOSURE_SCALE = TERMS["exposure_time"]
 STATED_OFFSET, SMALL_BIAS = replace(TIME_OFFSET, prior_std=(0.03,)), replace(GYRO_BIAS, prior_std=(0.02,) * 3)
 NEAR_AXES = replace(IMU_ROTATION, prior_std=(0.03,) * 3)
 STATED_READOUT, UNKNOWN_READOUT = replace(READOUT, prior_std=(0.003,)), replace(READOUT, prior_std=(0.02,))
-"""How far a careful profile may be off, and what no phone's readout exceeds."""
+"""Terms with the prior standard deviations of a carefully stated profile, and of an unknown phone's readout."""
 
 
 def careful_terms(profile: CameraProfile, *, offset_known: bool, focal_known: bool) -> tuple[Term, ...]:
-    """What a careful profile may be a little off in, and what it leaves open.
+    """The terms for small errors of a carefully stated profile and for its unknown values.
 
-    offset_known, focal_known: these are stated; otherwise they are free.
+    offset_known, focal_known: whether the profile states them; otherwise they are free.
     """
     offset = STATED_OFFSET if offset_known else TIME_OFFSET
     readout = STATED_READOUT if profile.readout_known else UNKNOWN_READOUT

@@ -1,4 +1,4 @@
-"""The recorder's start-up: pictures later than their stamps, and how exact repeats use the lag up."""
+"""The recorder's start-up lag: content later than its timestamps, until exact repeats have used up the lag."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from virest.inference.observed_tracks import ObservedTracks
 
 Array = NDArray[np.float64]
 EXTRA_PERIODS = (0.0, 0.5, 1.0, 1.5, 2.0)
-"""A lag may be longer than the repeats seen use up, if the recording ends before it is over."""
-LAGGING = 0.7
-"""The lag is believed if turns then disagree at most this part of how much they disagree without."""
+"""Further frame periods of lag to try if the recording ends before repeats have used it up."""
+MOST_DISAGREEMENT = 0.7
+"""Accept a lag if it reduces the disagreement of the rotations to at most this fraction."""
 
 Schedule = tuple[float, int, tuple[float, ...]]
-"""(lag_s at slot 0, last lagging slot, seconds by which each slot shows a later capture)."""
+"""(lag_s at slot 0, last lagging slot, delay of each slot's content, s)."""
 
 
 def lag_schedules(capture: Capture, repeats: Sequence[int]) -> list[Schedule]:
-    """Schedules that the repeats seen allow; none without a repeat."""
+    """Schedules consistent with the repeats found; none without a repeat."""
     if not repeats:
         return []
     period_s = median_period_s(np.array([frame.time_s for frame in capture.frames]))
@@ -42,10 +42,10 @@ def lag_schedules(capture: Capture, repeats: Sequence[int]) -> list[Schedule]:
 
 @dataclass(frozen=True, slots=True)
 class StartUpLag:
-    """What the pictures' turns say of the recorder's start-up."""
+    """The recorder's start-up lag, estimated from the frames' rotations."""
 
     lag_s: float
-    """Of slot 0; 0 where none is believed."""
+    """Lag of slot 0; 0 if none was accepted."""
     frames: int
     """The last lagging slot."""
     by_frame_s: tuple[float, ...]
@@ -54,7 +54,7 @@ class StartUpLag:
 
 
 def fit_start_up_lag(capture: Capture, observed: ObservedTracks, profile: CameraProfile) -> StartUpLag:
-    """Find the schedule at which the turns of pictures and gyroscope agree best; observed: with the first frames."""
+    """Find the schedule at which frames and gyroscope agree best; observed: must include the first frames."""
     none = StartUpLag(0.0, 0, (), False, "no frame repeats another: a lag cannot be determined")
     schedules = lag_schedules(capture, capture.repeats)
     if not schedules:
@@ -62,8 +62,8 @@ def fit_start_up_lag(capture: Capture, observed: ObservedTracks, profile: Camera
     left = [_disagreement(capture, observed, profile, by_frame) for _, _, by_frame in schedules]
     without = _disagreement(capture, observed, profile, (0.0,) * len(capture.frames))
     best = int(np.argmin(left))
-    if not left[best] < LAGGING * without:
-        return replace(none, note="the turns agree no better with a lag than without")
+    if not left[best] < MOST_DISAGREEMENT * without:
+        return replace(none, note="the rotations agree no better with a lag than without")
     lag_s, last, by_frame = schedules[best]
     return StartUpLag(lag_s, last, by_frame, True, f"used up by frame {last}")
 
@@ -71,7 +71,7 @@ def fit_start_up_lag(capture: Capture, observed: ObservedTracks, profile: Camera
 def _disagreement(
     capture: Capture, observed: ObservedTracks, profile: CameraProfile, by_frame_s: Sequence[float]
 ) -> float:
-    """Part of the pictures' changing turns that the gyroscope leaves unexplained at the best offset."""
+    """Fraction of the frames' changing rotation that the gyroscope leaves unexplained at the best offset."""
     late = replace(observed, stamp_s=observed.stamp_s + np.array(by_frame_s))
     coarse = align_coarsely(late.turns(profile), capture.imu, profile)
     return 1.0 if coarse is None else 1.0 - coarse.explained

@@ -1,9 +1,9 @@
-"""An encoder that stalls in mid-movie: which capture each slot shows, told by tracked points against the gyroscope.
+"""Encoder stalls in mid-movie: find which capture each slot shows, by comparing tracked points with the gyroscope.
 
-An encoder that pauses draws, when it goes on, what is current: from some slot on pictures are m captures later than
-their stamps, and m repeats use that up, one each.  So slot k of a stall shows capture k + m − (repeats up to k), or its
-own before the jump.  The repeats are seen; where the jump lies is not, and each place says other turns between
-successive pictures.  The place is taken whose turns are the pictures', beyond doubt; otherwise none is.
+An encoder that resumes after a pause takes the current picture: from some slot on, the content is m captures later than
+its timestamps, and each of m repeats reduces the lag by one.  So slot k of a stall shows capture k + m − (repeats up to
+k), or its own before the jump.  Repeats are visible, the jump is not, but each position of it predicts other rotations
+between successive frames.  A position is accepted only if it explains the rotations decisively better than any other.
 """
 
 from __future__ import annotations
@@ -25,42 +25,42 @@ from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 CONTEXT = 8
-"""Frames on both sides of a stall, whose stamps are right: they say how well turns agree."""
+"""Frames with correct timestamps on both sides of a stall, which determine the scatter of the rotations."""
 MIN_CONTEXT = 6
 REPEAT_PX, MOVED_PX = 0.1, 0.5
-"""A picture that moves less than the first where the gyroscope says more than the second repeats its predecessor."""
+"""A frame repeats its predecessor if points move less than REPEAT_PX where the gyroscope predicts over MOVED_PX."""
 LEAST_NOISE_PX = 0.1
-TOLD_CHI2 = 37.0
-"""In units of the turns' own scatter, the best place must be better than any other by this: exp(−37 / 2) is
-1e-8, and 1e-6 where turns scatter 15 % more than their neighbours say."""
+DECISIVE_CHI2 = 37.0
+"""Smallest chi-square advantage of the best position over any other: exp(−37 / 2) is 1e-8, and 1e-6 if rotations
+scatter 15 % more than in the neighbouring frames."""
 OTHER_SIGMA, MOST_REST = 3.0, 0.2
-"""A lateness that is no whole number of captures, by these deviations and this part of a period, is something else."""
-FITS = 1.5
-"""Rms inside the stall over that about it, up to which turns are explained."""
+"""Reject a lag that differs from a whole number of captures by more than these standard deviations and periods."""
+MOST_RMS_RATIO = 1.5
+"""Largest rms residual inside the stall relative to its surroundings for the rotations to count as explained."""
 
 
 @dataclass(frozen=True, slots=True)
 class Retimed:
-    """A stall whose pictures were told."""
+    """A stall whose content was identified."""
 
     first: int
-    """Slot from which pictures are late."""
+    """First slot with late content."""
     last: int
     shows: tuple[int, ...]
     """The capture that each slot from ``first`` to ``last`` shows."""
     rest_s: tuple[float, float]
-    """What is left of their lateness, in the mean, and its standard deviation."""
+    """Mean residual lag, and its standard deviation."""
 
 
 def stall_window(capture: Capture, stall: tuple[int, int]) -> range:
-    """The frames that are looked at."""
+    """The frames to analyse."""
     return range(max(stall[0] - CONTEXT, 0), min(stall[1] + CONTEXT + 1, len(capture.frames)))
 
 
 def fit_stall(
     capture: Capture, profile: CameraProfile, stall: tuple[int, int], pictures: Mapping[int, NDArray[np.uint8]]
 ) -> Retimed | None:
-    """What the slots of a stall show; None where points do not tell.
+    """The captures that the slots of a stall show; None if points do not determine them.
 
     profile: with focal length and time offset; pictures: luma by movie index, those of :func:`stall_window`.
     """
@@ -98,7 +98,8 @@ def fit_stall(
     noise_px = max(float(np.sqrt(np.mean(left[0][~inside] ** 2))), LEAST_NOISE_PX)
     chi2 = (left[:, inside] ** 2).sum(axis=(1, 2)) / noise_px**2
     best = int(np.argmin(chi2))
-    if best == 0 or chi2[best] > FITS**2 * 3 * inside.sum() or np.partition(chi2, 1)[1] - chi2[best] < TOLD_CHI2:
+    unexplained = chi2[best] > MOST_RMS_RATIO**2 * 3 * inside.sum()
+    if best == 0 or unexplained or np.partition(chi2, 1)[1] - chi2[best] < DECISIVE_CHI2:
         return None
     start, shows = stall[0] + best - 1, trials[best - 1]
     within = [k for k, i in zip(seen, inside, strict=True) if i]
@@ -114,7 +115,7 @@ def fit_stall(
 def _rest_s(
     trajectory: Trajectory, first_s: Array, second_s: Array, left_px: Array, focal_px: float, noise_px: float
 ) -> tuple[float, float]:
-    """By how much all of the pictures would be later still, and its standard deviation, by least squares."""
+    """Common residual lag of all frames and its standard deviation, by least squares."""
     step_s = 1e-3
     moved = gyro_turns(trajectory, first_s + step_s, second_s + step_s) - gyro_turns(trajectory, first_s, second_s)
     slope = focal_px * moved / step_s
@@ -123,7 +124,7 @@ def _rest_s(
 
 
 def at_shown_times(capture: Capture, found: Sequence[Retimed]) -> Capture:
-    """The capture with the slots of stalls at the times and exposures of what they show; what else bars them stays."""
+    """The capture with stalled slots at the times and exposures of the captures that they show; other skips remain."""
     frames = list(capture.frames)
     for one in found:
         shows = dict(zip(range(one.first, one.last + 1), one.shows, strict=True))
@@ -141,7 +142,7 @@ def at_shown_times(capture: Capture, found: Sequence[Retimed]) -> Capture:
 
 
 def _stalled(capture: Capture, one: Retimed) -> range:
-    """All slots of the stall that holds a retimed part, those before its jump too: they are as stamped."""
+    """All slots of the stall with a retimed part, including those before its jump, whose timestamps are correct."""
     first = next(first for first, last in capture.stalls if first <= one.first <= last)
     return range(first, one.last + 1)
 
@@ -152,20 +153,20 @@ def _pair(pictures: Mapping[int, NDArray[np.uint8]], k: int) -> TrackPair | None
 
 
 def _stands(pair: TrackPair | None) -> bool:
-    """Whether a picture is its predecessor's; pictures that are the same throughout give no pair."""
+    """Whether a frame repeats its predecessor; identical frames give no pair."""
     if pair is None:
         return True
     return float(np.median(np.linalg.norm(pair.points_second_px - pair.points_first_px, axis=-1))) < REPEAT_PX
 
 
 def _middle_s(capture: Capture, profile: CameraProfile) -> Array:
-    """When the middle of each capture's picture was seen, IMU clock."""
+    """Time of the middle row of each capture, IMU clock."""
     stamp_s = np.array([frame.time_s for frame in capture.frames])
     exposure_s = np.array([frame.exposure_s or 0.0 for frame in capture.frames])
     return np.asarray(RowClock(profile).middle_s(stamp_s, exposure_s))
 
 
 def _shows(window: range, start: int, repeats: Sequence[int]) -> dict[int, int]:
-    """The capture that each slot shows where pictures are late from ``start`` on."""
+    """The capture that each slot shows if content is late from ``start`` on."""
     late = {k: len(repeats) - sum(repeat <= k for repeat in repeats) for k in window}
     return {k: k + (late[k] if k >= start else 0) for k in window}

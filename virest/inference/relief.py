@@ -1,11 +1,11 @@
-"""What stands out of the plane: a surface of inverse depth over one frame's picture, from points of many frames.
+"""Relief on the plane: a surface of inverse depth over one frame's picture, from points of many frames.
 
-Depths before a camera are patches with edges between them, so points a distance h apart differ by ½ E(Δ²) =
-nugget² + sill² (1 − exp(−h / length)) in inverse depth: the variogram of a random mosaic (Matheron 1963; Lee, Mumford
-& Huang 2001).  It is measured among the points of each window.  A frame's surface is bilinear between the nodes of a
-coarse grid, tied to their neighbours as loosely as that and drawn back to the plane over its length where no points
-are: a Gaussian Markov field (Rue & Held 2005), so the information matrix is a band.  A window takes surfaces only if
-they tell held-out points better than its planes do.
+Scenes consist of patches with depth edges between them, so the inverse depths of points at distance h differ by
+½ E(Δ²) = nugget² + sill² (1 − exp(−h / length)): the variogram of a random mosaic (Matheron 1963; Lee, Mumford &
+Huang 2001).  It is measured on the points of each window.  A frame's surface is bilinear between the nodes of a coarse
+grid.  The variogram sets how strongly neighbouring nodes are coupled, and away from points the surface returns to the
+plane over ``length``: a Gaussian Markov field (Rue & Held 2005), whose information matrix is banded.  A window uses
+surfaces only if they predict held-out points better than its planes do.
 """
 
 from __future__ import annotations
@@ -30,36 +30,37 @@ Index = NDArray[np.intp]
 LONG_CELLS, SHORT_CELLS = 24, 18
 """Cells along the picture's longer and shorter side."""
 OUTSIDE = 0.05
-"""The grid reaches this part of the picture beyond its edge."""
+"""The grid extends beyond the picture's edge by this fraction of its size."""
 NEAR_S = 1.0
-"""Points seen within this time of a frame speak for it."""
-ENOUGH, MOST, NEARBY = 500, 1500, 1 / 32
-"""A frame takes the points of the nearest pairs: this many, or up to MOST while parallax stays below this part of the
-picture's longer side."""
+"""A frame uses points seen within this time of it."""
+ENOUGH_POINTS, MOST_POINTS, NEARBY = 500, 1500, 1 / 32
+"""A frame uses the points of the nearest pairs: ENOUGH_POINTS, or up to MOST_POINTS while the parallax stays below
+NEARBY of the picture's longer side."""
 MIN_POINTS = 60
-"""A frame with fewer keeps its plane."""
-COMPARED_PAIRS, CLEAR = 8, 2.0
-"""Pairs of frames whose points are compared with each other, those left out that are known CLEAR times worse than the
-typical one."""
+"""With fewer points a frame keeps its plane."""
+COMPARED_PAIRS, MOST_STD_RATIO = 8, 2.0
+"""Number of pairs of frames whose points are compared with each other; points whose standard deviation exceeds
+MOST_STD_RATIO times the typical one are ignored."""
 LAGS, FINEST_LAG, WIDEST_LAG, MIN_DIFFERENCES = 9, 0.02, 0.6, 200
-"""Edges of the classes of distance, from and to these parts of the picture's longer side, and what fills a class."""
+"""Number of edges of the distance classes, smallest and largest edge relative to the picture's longer side, and the
+fewest differences in a usable class."""
 LENGTHS, SHORTEST, LONGEST = 8, 0.04, 0.6
-"""Lengths that are tried, parts of the picture's longer side."""
+"""Correlation lengths to try: number, and range relative to the picture's longer side."""
 FAR_QUANTILE, FAR_REACH = 0.02, 1.5
-"""Inverse depths are held within the outermost quantiles, widened by this factor, before they are compared."""
+"""Inverse depths are clipped to these outer quantiles, widened by this factor, before they are compared."""
 WITHIN_CELL = 0.38
-"""Mean distance of a square's points from its middle, in sides."""
+"""Mean distance of a square's points from its centre, in sides."""
 MATCHED_CELLS, MATCHED_GROWTH = 2.0, 0.18
-"""Nodes this far apart differ as the variogram says: on a wide membrane by 0.73 times the variance of a free edge
-(Spitzer 1976), taken four times looser, since depths step rather than bend."""
+"""Nodes MATCHED_CELLS apart differ as the variogram predicts: on a wide membrane by 0.73 times the variance of a free
+edge (Spitzer 1976), taken four times looser, because depth changes in steps rather than smoothly."""
 STIFFNESSES = (0.25, 1.0, 4.0)
-"""Times stiffer than that: what tells held-out points best is taken."""
+"""Factors on that stiffness; the one that predicts held-out points best is used."""
 REWEIGHTINGS = 1
 STD_STEP = 6
-"""Standard deviations are worked out at every such node."""
+"""Standard deviations are computed at every such node."""
 JUDGED_INSTANTS, MIN_JUDGED_CELLS = 4, 12
-SURE, LEAST_GAIN = 3.0, 0.1
-"""A surface must beat the plane on held-out points by this many standard errors and by this part of their distance."""
+LEAST_SIGMA, LEAST_GAIN = 3.0, 0.1
+"""A surface must reduce the residuals of held-out points by this many standard errors and by this fraction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +68,14 @@ class Roughness:
     """Variogram of inverse depths about the plane."""
 
     sill_per_m: float
-    """Standard deviation of what neighbours share."""
+    """Standard deviation of the correlated part."""
     length_rad: float
-    """Angle over which they share it."""
+    """Correlation length, an angle."""
     nugget_per_m: float
-    """Standard deviation of what they do not, beyond the tracking noise."""
+    """Standard deviation of the uncorrelated part beyond the tracking noise."""
 
     def lost(self, distance_rad: Array | float) -> Array:
-        """Variance of the difference between places that far apart, the nugget's left out."""
+        """Variance of the difference between positions at this distance, without the nugget."""
         return np.asarray(2 * self.sill_per_m**2 * -np.expm1(-np.asarray(distance_rad) / self.length_rad))
 
 
@@ -96,7 +97,7 @@ class Grid:
 
 
 def picture_grid(lens: MovingLens, time_s: float) -> Grid:
-    """Lay a grid over what the lens sees at a time."""
+    """The grid over the lens's field of view at a time."""
     size = np.array([lens.lens.width, lens.lens.height], float)
     part = np.linspace(0.0, 1.0, 5)
     points_px = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * (size - 1)
@@ -113,15 +114,15 @@ def picture_grid(lens: MovingLens, time_s: float) -> Grid:
 def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
     """Fit the variogram of a window's points to differences between points of the same frame; None: too few.
 
-    ½ Δ² less the two points' own variances, averaged over classes of distance; sill and nugget by least squares for
-    each of some lengths.
+    ½ Δ² minus the two points' own variances is averaged over distance classes; sill and nugget are fitted by least
+    squares for each length tried.
     """
-    values, variance, place = _held(sights.above_per_m), sights.points.std_per_m**2, angles(sights.rays)
-    clear = variance < CLEAR**2 * np.median(variance)
+    values, variance, place = _clipped(sights.above_per_m), sights.points.std_per_m**2, angles(sights.rays)
+    precise = variance < MOST_STD_RATIO**2 * np.median(variance)
     edges = grid.extent * np.geomspace(FINEST_LAG, WIDEST_LAG, LAGS)
     total, count = np.zeros((2, LAGS - 1)), np.zeros(LAGS - 1)
-    for pair in _spread(np.unique(sights.pair), COMPARED_PAIRS):
-        mine = np.flatnonzero(clear & (sights.pair == pair))
+    for pair in _evenly_chosen(np.unique(sights.pair), COMPARED_PAIRS):
+        mine = np.flatnonzero(precise & (sights.pair == pair))
         first, second = (mine[k] for k in np.triu_indices(len(mine), 1))
         lag = np.searchsorted(edges, np.linalg.norm(place[first] - place[second], axis=-1)) - 1
         inside = (lag >= 0) & (lag < LAGS - 1)
@@ -136,14 +137,14 @@ def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
     return _fitted(middle[used], total[0][used] / count[used], grid.extent)
 
 
-def _held(values: Array) -> Array:
-    """Values drawn in to their outermost quantiles: a mismatch must not stand for a depth."""
+def _clipped(values: Array) -> Array:
+    """Values clipped to their outer quantiles, so that mismatches do not count as depths."""
     low, middle, high = np.quantile(values, [FAR_QUANTILE, 0.5, 1 - FAR_QUANTILE])
     return np.clip(values, middle + FAR_REACH * (low - middle), middle + FAR_REACH * (high - middle))
 
 
 def _fitted(lag: Array, half: Array, extent: float) -> Roughness:
-    """Least squares on relative differences: a variogram's error grows with its value."""
+    """Least squares on relative differences, because a variogram's error grows with its value."""
     level = max(float(half.max()), 1e-18)
     weight = 1 / np.maximum(half, 0.1 * level)
     best, least = Roughness(0.0, extent, float(np.sqrt(max(half.mean(), 0.0)))), np.inf
@@ -172,7 +173,7 @@ def _both_positive(rise: Array, half: Array, weight: Array) -> tuple[float, floa
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A camera before its plane."""
+    """A camera's pose, with the plane in front of it."""
 
     time_s: float
     """IMU clock."""
@@ -185,25 +186,25 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
-    """Points as one frame sees them."""
+class PointsInFrame:
+    """Points in the axes of one frame."""
 
     place: Array
     """(n, 2) angles."""
     above_per_m: Array
     """(n,) inverse depth above the frame's plane."""
     variance: Array
-    """(n,) of the tracking noise and of what may hide a point that was seen from elsewhere."""
+    """(n,) from tracking noise, and from possible occlusion of points seen from another position."""
 
-    def chosen(self, use: NDArray[np.bool_]) -> Before:
+    def chosen(self, use: NDArray[np.bool_]) -> PointsInFrame:
         """Some of the points."""
-        return Before(self.place[use], self.above_per_m[use], self.variance[use])
+        return PointsInFrame(self.place[use], self.above_per_m[use], self.variance[use])
 
 
-def points_before(sights: Sightings, view: View, prior: ReliefPrior) -> Before:
-    """Move the window's points into a frame's camera axes.
+def points_in_frame(sights: Sightings, view: View, prior: ReliefPrior) -> PointsInFrame:
+    """Transform the window's points into a frame's camera axes.
 
-    A point seen from elsewhere may be hidden by now: the surface that is seen in its place has been displaced against
+    A point seen from another position may be occluded in this frame.  The surface visible instead has moved relative to
     it by up to the parallax of the sill, and differs from it by the variogram at that distance.
     """
     points, grid, rough = sights.points, prior.grid, prior.rough
@@ -219,20 +220,20 @@ def points_before(sights: Sightings, view: View, prior: ReliefPrior) -> Before:
     apart = (sights.from_m[near] - view.centre_m) @ view.rotation_world_cam
     parallax = np.linalg.norm(apart[:, :2] - rays[:, :2] * apart[:, 2:], axis=-1) * rough.sill_per_m
     std = points.std_per_m[near] * (inverse / points.inverse_depth_per_m[near]) ** 2
-    return Before(place, inverse - rays @ view.plane_per_m, std**2 + rough.lost(parallax))
+    return PointsInFrame(place, inverse - rays @ view.plane_per_m, std**2 + rough.lost(parallax))
 
 
 def _seen_nearby(sights: Sightings, view: View, prior: ReliefPrior) -> Index:
-    """Numbers of the points seen from about here: by pairs, the nearest first.
+    """Indices of the points seen from nearby, chosen by pairs of frames, nearest first.
 
-    All pairs between which the sill's parallax is below NEARBY of a cell, or as many as give ENOUGH points.
+    Takes pairs until there are ENOUGH_POINTS, and further ones whose parallax of the sill is below NEARBY.
     """
     pairs, start, count = np.unique(sights.pair, return_index=True, return_counts=True)
     parallax = np.linalg.norm(sights.from_m[start] - view.centre_m, axis=-1) * prior.rough.sill_per_m
     late = np.abs(sights.points.time_s[start] - view.time_s) > NEAR_S
     order = np.lexsort((start, np.abs(sights.points.time_s[start] - view.time_s), parallax, late))
     before = np.cumsum(count[order]) - count[order]
-    taken = (before < ENOUGH) | ((before < MOST) & (parallax[order] < NEARBY * prior.grid.extent))
+    taken = (before < ENOUGH_POINTS) | ((before < MOST_POINTS) & (parallax[order] < NEARBY * prior.grid.extent))
     taken &= ~late[order]
     chosen = np.zeros(len(pairs), bool)
     chosen[order[taken]] = True
@@ -241,14 +242,14 @@ def _seen_nearby(sights: Sightings, view: View, prior: ReliefPrior) -> Index:
 
 @dataclass(frozen=True, slots=True)
 class ReliefPrior:
-    """How much neighbouring nodes may differ: a membrane on the grid, drawn to the plane."""
+    """Prior of the nodes: a membrane on the grid that couples neighbours and pulls towards the plane."""
 
     rough: Roughness
     grid: Grid
     edge_variance: float
-    """Of the difference between neighbouring nodes, were they tied by nothing else."""
+    """Variance of the difference between two neighbouring nodes without other couplings."""
     within_variance: float
-    """Of a sight about its cell's bilinear surface."""
+    """Variance of a point about its cell's bilinear surface."""
 
     def information(self) -> Array:
         """Band (rows + 2, nodes) of the nodes' information matrix: band[k, j] = Q[j + k, j]."""
@@ -268,23 +269,23 @@ class ReliefPrior:
 
 
 def relief_prior(rough: Roughness, grid: Grid, stiffness: float = 1.0) -> ReliefPrior:
-    """Tie neighbours so that nodes MATCHED_CELLS apart differ as the variogram says."""
+    """Couple neighbours so that nodes MATCHED_CELLS apart differ as the variogram predicts."""
     cell = float(grid.cell.mean())
     within = float(rough.lost(WITHIN_CELL * cell))
     edge = float(rough.lost(MATCHED_CELLS * cell)) / MATCHED_GROWTH / stiffness
     return ReliefPrior(rough, grid, edge, within + rough.nugget_per_m**2)
 
 
-def fit_surface(before: Before, prior: ReliefPrior, *, deviations: bool = True) -> Relief:
+def fit_surface(seen: PointsInFrame, prior: ReliefPrior, *, deviations: bool = True) -> Relief:
     """Posterior mean and standard deviation of the nodes, with Cauchy weights about the surface."""
     grid, information = prior.grid, prior.information()
-    node, part = _corners(before.place, grid)
-    variance = before.variance + prior.within_variance
+    node, part = _corners(seen.place, grid)
+    variance = seen.variance + prior.within_variance
     weight = 1 / variance
     for passing in range(REWEIGHTINGS + 1):
-        factor, values = _posterior(before.above_per_m, weight, node, part, information, grid.rows)
+        factor, values = _posterior(seen.above_per_m, weight, node, part, information, grid.rows)
         if passing < REWEIGHTINGS:
-            left = before.above_per_m - (values[node] * part).sum(axis=-1)
+            left = seen.above_per_m - (values[node] * part).sum(axis=-1)
             weight = 1 / (variance + (left / CAUCHY) ** 2)
     std = _deviations(factor, grid) if deviations else np.zeros((2, 2))
     above = values.reshape(grid.columns, grid.rows).T
@@ -294,7 +295,7 @@ def fit_surface(before: Before, prior: ReliefPrior, *, deviations: bool = True) 
 
 
 def _corners(place: Array, grid: Grid) -> tuple[Index, Array]:
-    """The four nodes about each place (n, 4), numbered down the columns, and their bilinear weights (n, 4)."""
+    """The four nodes around each position (n, 4), numbered down the columns, and their bilinear weights (n, 4)."""
     position = np.clip((place - grid.low) / grid.cell, 0.0, np.array([grid.columns, grid.rows]) - 1.000001)
     first = position.astype(np.intp)
     x, y = (position - first).T
@@ -306,7 +307,7 @@ def _corners(place: Array, grid: Grid) -> tuple[Index, Array]:
 def _posterior(
     above: Array, weight: Array, node: Index, part: Array, information: Array, rows: int
 ) -> tuple[Array, Array]:
-    """Banded Cholesky factor and mean (nodes,): each point ties the four nodes about it."""
+    """Banded Cholesky factor and mean (nodes,): each point couples the four nodes around it."""
     count = information.shape[1]
     weighted = part * weight[:, None]
     band = information.copy()
@@ -332,10 +333,10 @@ def _deviations(factor: Array, grid: Grid) -> Array:
 # ── surface or plane ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def surface_gain(frames: list[Before], prior: ReliefPrior) -> tuple[float, float]:
-    """By how much surfaces come nearer to held-out points than planes: relative gain, and that over its error.
+def surface_gain(frames: list[PointsInFrame], prior: ReliefPrior) -> tuple[float, float]:
+    """Relative reduction of held-out residuals by surfaces compared with planes, and its ratio to the standard error.
 
-    Points in every other cell are held out, then the others: a surface must tell what lies a cell away.
+    Two-fold cross-validation on a chessboard of cells: a surface must predict depths one cell away.
     """
     grid = prior.grid
     gain, before = np.zeros((2, (grid.rows - 1) * (grid.columns - 1)))
@@ -348,10 +349,10 @@ def surface_gain(frames: list[Before], prior: ReliefPrior) -> tuple[float, float
                 continue
             surface = fit_surface(points.chosen(~held), prior, deviations=False)
             node, part = _corners(points.place[held], grid)
-            told = (surface.above_per_m.T.ravel()[node] * part).sum(axis=-1)
+            predicted = (surface.above_per_m.T.ravel()[node] * part).sum(axis=-1)
             above = points.above_per_m[held]
             near = 1 / (points.variance[held] + prior.within_variance)
-            plane, left = np.abs(above), np.abs(above - told)
+            plane, left = np.abs(above), np.abs(above - predicted)
             gain += np.bincount(cell[held], near * (plane - left), len(gain))
             before += np.bincount(cell[held], near * plane, len(gain))
             seen += np.bincount(cell[held], minlength=len(gain))
@@ -363,7 +364,7 @@ def surface_gain(frames: list[Before], prior: ReliefPrior) -> tuple[float, float
 
 
 def _cells(place: Array, grid: Grid) -> tuple[Index, NDArray[np.bool_]]:
-    """Number of each place's cell, and its colour on a chessboard."""
+    """Number of each position's cell, and its colour on a chessboard."""
     position = np.clip((place - grid.low) / grid.cell, 0.0, np.array([grid.columns, grid.rows]) - 1.000001)
     x, y = position.astype(np.intp).T
     return y * (grid.columns - 1) + x, (x + y) % 2 == 1
@@ -371,22 +372,22 @@ def _cells(place: Array, grid: Grid) -> tuple[Index, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, slots=True)
 class WindowRelief:
-    """What stands out of the planes of a window."""
+    """Relief on the planes of a window."""
 
     sights: Sightings
     """All tracked points of the window."""
     prior: ReliefPrior
 
     def surface(self, view: View) -> Relief | None:
-        """The surface that a camera sees; None where it has too few points before it."""
-        before = points_before(self.sights, view, self.prior)
-        return fit_surface(before, self.prior) if len(before.place) >= MIN_POINTS else None
+        """The surface in front of a camera; None if it has too few points."""
+        seen = points_in_frame(self.sights, view, self.prior)
+        return fit_surface(seen, self.prior) if len(seen.place) >= MIN_POINTS else None
 
 
 def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) -> WindowRelief | None:
-    """Measure how rough a window's scene is, and keep the surfaces if they tell held-out points better.
+    """Measure the roughness of a window's scene, and keep surfaces if they predict held-out points better than planes.
 
-    view: the camera at a time, before its frame's plane.
+    view: the camera's pose at a time, with its frame's plane.
     """
     if len(sights) < 2 * MIN_POINTS:
         return None
@@ -394,16 +395,17 @@ def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) ->
     if rough is None or not rough.sill_per_m > 0:
         return None
     priors = [relief_prior(rough, grid, stiffness) for stiffness in STIFFNESSES]
-    chosen = _spread(np.unique(sights.pair), JUDGED_INSTANTS)
+    chosen = _evenly_chosen(np.unique(sights.pair), JUDGED_INSTANTS)
     instants = [float(np.median(sights.points.time_s[sights.pair == pair])) for pair in chosen]
-    frames = [points_before(sights, view(instant), priors[0]) for instant in instants]
+    frames = [points_in_frame(sights, view(instant), priors[0]) for instant in instants]
     gains = [surface_gain(frames, prior) for prior in priors]
     best = int(np.argmax([gain for gain, _ in gains]))
-    gain, sure = gains[best]
-    log.debug("relief %s: %s, held-out points %.0f %% nearer, %.1f errors", rough, STIFFNESSES[best], 100 * gain, sure)
-    return WindowRelief(sights, priors[best]) if gain > LEAST_GAIN and sure > SURE else None
+    gain, sigma = gains[best]
+    text = "relief %s, stiffness %s: held-out residuals %.0f %% smaller, %.1f standard errors"
+    log.debug(text, rough, STIFFNESSES[best], 100 * gain, sigma)
+    return WindowRelief(sights, priors[best]) if gain > LEAST_GAIN and sigma > LEAST_SIGMA else None
 
 
-def _spread(values: Index, count: int) -> Index:
+def _evenly_chosen(values: Index, count: int) -> Index:
     """At most ``count`` of the values, spread evenly."""
     return values[np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).astype(int))]

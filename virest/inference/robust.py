@@ -1,4 +1,4 @@
-"""Robust statistics: how wide values scatter whatever lies far out, and how little that then weighs."""
+"""Robust statistics: scatter that outliers do not affect, and weights that suppress them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 CAUCHY = 2.4
-"""A value this many standard deviations away has half its weight: 95 % efficient for normal errors (Holland & Welsch
-1977, doi:10.1080/03610927708827533)."""
+"""Standard deviations at which the weight is 0.5: 95 % efficient for normal errors (Holland & Welsch 1977,
+doi:10.1080/03610927708827533)."""
 NORMAL_MEDIAN, RAYLEIGH_MEDIAN = 0.6745, 1.1774
 """Medians of |x| and of √(x² + y²) for normal x and y of unit variance."""
 MEDIAN_TO_STD = 1.4826
@@ -16,10 +16,10 @@ MEDIAN_TO_STD = 1.4826
 
 
 def robust_std(values: Array) -> float:
-    """Standard deviation of values about nought, by the median of their sizes; 0 without any."""
+    """Standard deviation of values about zero, from the median of their magnitudes; 0 without values."""
     return MEDIAN_TO_STD * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
 def cauchy_weight(squared: Array, width: float | Array) -> Array:
-    """Weights, 0 to 1, of values by their squares: a half at ``width``."""
+    """Cauchy weights, 0 to 1, of values given by their squares: 0.5 at ``width``."""
     return np.asarray(1.0 / (1.0 + squared / width**2))

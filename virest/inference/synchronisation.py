@@ -1,8 +1,8 @@
-"""Pictures and gyroscope on one clock: the time offset, the gyroscope's bias, and whether the two agree at all.
+"""Synchronise frames and gyroscope: the time offset, the gyroscope's bias, and whether the two agree at all.
 
-Coarse: turns of the pictures against the gyroscope's at every offset within the search.  Fine: every tracked point at
-its own row's time (track_fit), with what a careful profile may be a little off in beside the offset.  What the clocks
-drift apart by is fitted about the middle of the points, where it does not touch the offset.
+Coarse: compare rotations of frames and gyroscope at every offset within the search.  Fine: fit every tracked point at
+its own row's time (track_fit), with small errors of a careful profile as further terms.  Clock drift is fitted about
+the middle of the points, where it is uncorrelated with the offset.
 """
 
 from __future__ import annotations
@@ -27,71 +27,71 @@ from virest.motion.optics import settling_time_s
 
 Array = NDArray[np.float64]
 POINTS = 2500
-"""Tracked points used in the fit; evenly thinned beyond."""
+"""Most tracked points used in the fit; more are thinned evenly."""
 IMU_MARGIN_S = 0.5
 TRANSLATION_RATIO = 1.25
-"""The camera moves where differences are this much larger in all directions than across the best parallax."""
+"""The camera translates if residuals are this much larger in all directions than across the best parallax."""
 MAX_STD_S = 0.02
 UNKNOWN_EXPOSURE_STD_S = 0.008
 UNKNOWN_READOUT_STD_S = 0.003
-"""At least, where the readout is fitted: lens and parallax shear pictures too."""
-MAX_FOCAL_LEFT = 1.5
-"""Residual, in units of tracking's noise, up to which a focal length is told.  A stabiliser of a tenth makes it 8 to
-9 % too short and leaves 1.7 to 3.5 at 0.2 and 0.1 px of noise; a principal point 9 px off leaves 1.15 to 1.4, and
-no error of the focal length above 0.1 % (tracks made from three analytic motions)."""
+"""Smallest standard deviation of a fitted readout, since lens and parallax also shear the picture."""
+MAX_FOCAL_RESIDUAL = 1.5
+"""Largest residual, in units of tracking noise, for which a fitted focal length is reported.  A stabiliser that cancels
+0.1 of the motion makes it 8 to 9 % too short and leaves residuals of 3.5 to 1.7 at 0.1 to 0.2 px of noise; a principal
+point 9 px off leaves 1.15 to 1.4, with focal errors below 0.1 % (tracks from three analytic motions)."""
 MAX_FOCAL_SPREAD = 0.25
 DRIFT_SIGMA, LEAST_DRIFT = 4.0, 5e-4
 NEAR_S = 0.01
 FOREIGN_BIAS = 4.0
-"""A bias further from the profile's than this many prior deviations is an unmodelled scene, lens or axis map."""
+"""A bias further from the profile's than this many prior σ absorbs an unmodelled scene, lens or axis map."""
 AGREEMENT_SLACK_S = 0.03
-"""An offset wrong by this is a matter for calibration, not a sign that pictures and gyroscope are strangers."""
+"""Smaller errors of the offset are left to calibration; they do not mean that frames and gyroscope disagree."""
 CLEARLY_BETTER = 30.0
-"""Chi-square (one degree of freedom) above which another offset is clearly better; errors of pairs go together, so
-more than nine."""
+"""Chi-square (1 degree of freedom) above which another offset is clearly better; well above 9, because errors of pairs
+are correlated."""
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """The time offset and what came with it; t_imu = t_cam (1 + clock_skew) + time_offset_s."""
+    """The time offset and the values fitted with it; t_imu = t_cam (1 + clock_skew) + time_offset_s."""
 
     time_offset_s: float
-    """At the middle of the points, with the profile's readout and its meaning of a stamp."""
+    """At the middle of the points, with the profile's readout and timestamp reference."""
     std_s: float
-    """Includes what the model leaves open; inf where not determined."""
+    """Includes model uncertainty; inf if not determined."""
     determined: bool
     """Whether the offset may be used."""
     reason: str = ""
-    """Why not; or what to keep in mind; may be empty."""
+    """Why not, or a caveat; may be empty."""
     explained: float = float("nan")
-    """Part of the pictures' changing turns that the gyroscope explains, at most 1."""
+    """Fraction of the frames' changing rotation that the gyroscope explains, at most 1."""
     bias_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Gyroscope bias, IMU axes, as profiles hold it."""
     bias_std_rad_s: tuple[float, float, float] = (float("nan"),) * 3
-    """NaN where it is not determined, or parallax may have faked it."""
+    """NaN if it is not determined, or if it may have absorbed parallax."""
     readout_s: float = 0.0
-    """Fitted; negative where the rows are read the other way."""
+    """Fitted; negative if the rows are read in the opposite direction."""
     drift_s_per_s: float = 0.0
-    """How the offset drifts: the clock skew that the profile may lack."""
+    """Drift of the offset: a clock skew beyond the profile's."""
     focal_px: float | None = None
-    """Fitted where the profile knows none, the points follow the fit and the motion determines it to a quarter."""
+    """Fitted if the profile has none, the residuals are small and the motion determines it to MAX_FOCAL_SPREAD."""
     focal_std_px: float | None = None
     travels: bool = False
-    """Whether the points were judged across the parallax of a camera that travels."""
+    """Whether the camera translates, so that only residuals across the parallax were used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Whether the pictures move as the gyroscope says."""
+    """Whether the frames follow the gyroscope."""
 
     agrees: bool
     reason: str = ""
     tested: bool = True
-    """Whether there were points and samples enough to ask."""
+    """Whether there were enough points and samples for the test."""
     explained: float = float("nan")
-    """Part of the pictures' changing turns that the gyroscope explains at the profile's offset; NaN: unknown."""
+    """Fraction of the frames' changing rotation that the gyroscope explains at the profile's offset; NaN: unknown."""
     best_offset_s: float | None = None
-    """Another offset at which they would agree, or agree clearly better; None: there is none, or none is needed."""
+    """Another offset at which they agree, or agree clearly better; None: there is none, or none is needed."""
 
 
 # ── the time offset ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -100,9 +100,9 @@ class Agreement:
 def estimate_time_offset(
     observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
 ) -> OffsetEstimate:
-    """Find the time offset within ± search_s of the profile's (of 0 where that is unknown), and the gyroscope's bias.
+    """Find the time offset within ± search_s of the profile's (of 0 if unknown), and the gyroscope's bias.
 
-    Never raises for poor data: the result says that nothing is determined, and why.
+    Never raises for poor data: the result then is not determined, with a reason.
     """
     start_s, free_focal = profile.time_offset_s or 0.0, profile.intrinsics is None
     if reason := _too_few(observed, imu):
@@ -110,7 +110,7 @@ def estimate_time_offset(
     turns = observed.turns(profile)
     coarse = align_coarsely(turns, imu, profile, search_s, own_axes=True, free_focal=free_focal)
     if coarse is None:
-        reason = "the inertial data do not cover the frames at any offset searched"
+        reason = "the inertial data do not cover the frames at any searched offset"
         return OffsetEstimate(start_s, float("inf"), False, reason)
     if (doubt := coarse.doubt(len(observed.pairs), observed.lens.fx_px)) is not None:
         still = coarse.motion_rad * observed.lens.fx_px < MIN_MOTION_PX
@@ -121,9 +121,9 @@ def estimate_time_offset(
     found = refine_time_offset(observed, imu, start, focal_known=not free_focal)
     found = replace(found, explained=coarse.explained_near(found.time_offset_s, NEAR_S))
     if found.determined and abs(found.time_offset_s - start_s) > search_s:
-        return replace(found, determined=False, reason=f"the offset left the search (±{search_s:g} s)")
+        return replace(found, determined=False, reason=f"the offset left the search range (±{search_s:g} s)")
     if found.determined and found.explained < MIN_EXPLAINED:
-        reason = f"at the fitted offset the gyroscope explains only {max(found.explained, 0.0):.0%} of the turns"
+        reason = f"at the fitted offset the gyroscope explains only {max(found.explained, 0.0):.0%} of the rotation"
         return replace(found, determined=False, reason=reason)
     return found
 
@@ -131,11 +131,11 @@ def estimate_time_offset(
 def refine_time_offset(
     observed: ObservedTracks, imu: ImuSamples, start: CameraProfile, *, focal_known: bool = True
 ) -> OffsetEstimate:
-    """Fit the offset to tracked points from a profile whose offset is right to a few hundredths of a second."""
+    """Fit the offset to tracked points, from a profile whose offset is correct to a few hundredths of a second."""
     assert start.time_offset_s is not None
     covered = observed.covered(imu, start)
     if len(covered.pairs) < MIN_PAIRS:
-        reason = f"{len(covered.pairs)} pairs of frames lie inside the inertial data"
+        reason = f"only {len(covered.pairs)} pairs of frames lie inside the inertial data"
         return OffsetEstimate(start.time_offset_s, float("inf"), False, reason)
     table = covered.table(POINTS)
     first_s, last_s = float(table.first_stamp_s.min()), float(table.second_stamp_s.max())
@@ -158,14 +158,14 @@ def refine_time_offset(
 
 
 def _simplest(imu: ImuSamples, table: TrackTable, start: CameraProfile, terms: Sequence[Term]) -> TrackFit:
-    """Turning alone, or with the direction of travel that the points ask for."""
-    turning = fit_tracks(imu, table, start, terms)
+    """The fit with rotation alone, or with directions of travel if the points need them."""
+    rotating = fit_tracks(imu, table, start, terms)
     if start.depth_m is not None and np.isinf(start.depth_m):
-        return turning
-    many = fit_tracks(imu, table, turning.profile, terms, many_directions(table))
-    if turning.scale < TRANSLATION_RATIO * many.scale:
-        return turning
-    return fit_directed(imu, table, turning.profile, terms, many)
+        return rotating
+    many = fit_tracks(imu, table, rotating.profile, terms, many_directions(table))
+    if rotating.scale < TRANSLATION_RATIO * many.scale:
+        return rotating
+    return fit_directed(imu, table, rotating.profile, terms, many)
 
 
 def _concluded(
@@ -186,23 +186,23 @@ def _concluded(
         variance += 0.25 * max(readout_off_s**2 - readout_std_s**2, 0.0)
     else:
         variance += 0.25 * (readout_std_s**2 + UNKNOWN_READOUT_STD_S**2)
-        notes.append("readout unknown: the offset and half the readout are determined together only")
+        notes.append("readout unknown: only the sum of the offset and half the readout is well determined")
     determined = bool(np.sqrt(variance) <= MAX_STD_S)
     if not determined:
         notes = [f"the motion does not determine the offset (standard deviation {1e3 * np.sqrt(variance):.0f} ms)"]
     if not observed.exposure_known:
         variance += UNKNOWN_EXPOSURE_STD_S**2
-        notes.append("exposure unknown: the offset contains half of it")
+        notes.append("exposure unknown: the offset includes half of it")
     if abs(drift) > max(DRIFT_SIGMA * drift_std, LEAST_DRIFT):
         variance += (drift * np.hypot(middle_s, spread_s)) ** 2
-        notes.append(f"the offset drifts by {1e3 * drift:.2f} ms a second: the clocks' rates differ")
+        notes.append(f"the offset drifts by {1e3 * drift:.2f} ms per second: the clocks run at different rates")
     bias_std_rad_s = std("gyro_bias")
     changed = np.abs(np.subtract(found.gyro_bias_rad_s, start.gyro_bias_rad_s)) / np.array(SMALL_BIAS.prior_std)
     if fit.scene is not None or np.max(changed) > FOREIGN_BIAS:
         bias_std_rad_s = np.full(3, np.nan)
     focal_px, focal_std_px = None, None
-    told = not focal_known and fit.scale < MAX_FOCAL_LEFT
-    if told and found.intrinsics is not None and (spread := std("focal_length")[0]) <= MAX_FOCAL_SPREAD:
+    fits = not focal_known and fit.scale < MAX_FOCAL_RESIDUAL
+    if fits and found.intrinsics is not None and (spread := std("focal_length")[0]) <= MAX_FOCAL_SPREAD:
         focal_px, focal_std_px = found.intrinsics.fx_px, float(found.intrinsics.fx_px * spread)
     return OffsetEstimate(
         offset_s, float(np.sqrt(variance)), determined, "; ".join(notes), float("nan"), found.gyro_bias_rad_s,
@@ -213,8 +213,8 @@ def _concluded(
 
 def _too_few(observed: ObservedTracks, imu: ImuSamples) -> str:
     if len(observed.pairs) < MIN_PAIRS:
-        return f"{len(observed.pairs)} pairs of frames with {MIN_TRACKS} or more tracked points; {MIN_PAIRS} are needed"
-    return f"{len(imu)} gyroscope samples" if len(imu) < 8 else ""
+        return f"{len(observed.pairs)} pairs of frames have {MIN_TRACKS} or more tracked points; {MIN_PAIRS} are needed"
+    return f"only {len(imu)} gyroscope samples" if len(imu) < 8 else ""
 
 
 # ── agreement ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -223,38 +223,38 @@ def _too_few(observed: ObservedTracks, imu: ImuSamples) -> str:
 def check_agreement(
     observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
 ) -> Agreement:
-    """Tell whether the pictures turn as the gyroscope says at the profile's offset, give or take AGREEMENT_SLACK_S.
+    """Check whether the frames rotate as the gyroscope measures at the profile's offset ± AGREEMENT_SLACK_S.
 
-    Bias and steady drift are free, moving objects and parallax count little.  Too little to tell counts as agreement:
-    nothing speaks against the gyroscope.
+    Bias and steady drift are free; moving objects and parallax have little weight.  Too few data count as agreement,
+    since nothing contradicts the gyroscope.
     """
     if reason := _too_few(observed, imu):
-        return Agreement(True, f"too little to tell: {reason}", tested=False)
+        return Agreement(True, f"too few data to tell: {reason}", tested=False)
     offset_s, focal_px, turns = profile.time_offset_s or 0.0, observed.lens.fx_px, observed.turns(profile)
-    seen_px, told_px = (focal_px * changes for changes in _changes_rad(turns, imu, profile))
-    if max(_rms(seen_px), _rms(told_px)) < MIN_MOTION_PX:
+    seen_px, predicted_px = (focal_px * changes for changes in _changes_rad(turns, imu, profile))
+    if max(_rms(seen_px), _rms(predicted_px)) < MIN_MOTION_PX:
         return Agreement(True, "too little motion to tell")
     free_focal = profile.intrinsics is None
     coarse = align_coarsely(turns, imu, profile, search_s, own_axes=True, free_focal=free_focal)
     explained = -np.inf if coarse is None else coarse.explained_near(offset_s, AGREEMENT_SLACK_S)
     if coarse is None or not np.isfinite(explained):
-        return Agreement(True, "too little to tell: no inertial data at the frames")
+        return Agreement(True, "too few data to tell: no inertial data at the frames")
     if explained >= MIN_EXPLAINED:
         better = _clearly_better(coarse.offset_s, coarse.explained_at, offset_s, 3 * len(observed.pairs))
         return Agreement(True, explained=explained, best_offset_s=better)
     elsewhere = None if coarse.doubt(len(observed.pairs), focal_px) else coarse.time_offset_s
-    hint = "stabilised pictures, or not of this recording?"
+    hint = "was the movie stabilised in the camera, or is it from another recording?"
     if elsewhere is not None:
         hint = f"at an offset of {elsewhere:+.3f} s it would explain {coarse.explained:.0%}"
-    reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the pictures' rotation: {hint}"
+    reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the frames' rotation: {hint}"
     return Agreement(False, reason, explained=explained, best_offset_s=elsewhere)
 
 
 def _clearly_better(tried_s: Array, explained_at: Array, offset_s: float, figures: int) -> float | None:
-    """Offset near the given one that leaves clearly less unexplained; None: there is none.
+    """Offset near the given one that explains clearly more; None: there is none.
 
-    What is left, as a parabola over the offset, has its least there; times ``figures`` / least, the difference is a
-    chi-square of one.
+    The unexplained part is approximated by a parabola over the offset; its excess over the minimum, times ``figures`` /
+    minimum, is a chi-square with 1 degree of freedom.
     """
     near = np.abs(tried_s - offset_s) <= AGREEMENT_SLACK_S
     best = int(np.argmax(np.where(near, explained_at, -np.inf)))
@@ -272,10 +272,10 @@ def _clearly_better(tried_s: Array, explained_at: Array, offset_s: float, figure
 
 
 def _changes_rad(turns: FrameRotations, imu: ImuSamples, profile: CameraProfile) -> tuple[Array, Array]:
-    """The changing turns of pictures and gyroscope at the profile's offset, (p, 3) each."""
+    """The changing rotation of frames and gyroscope at the profile's offset, (p, 3) each."""
     times = (np.asarray(profile.imu_time_s(time_s)) for time_s in (turns.first_s, turns.second_s))
-    told = gyro_turns(integrate_gyro(imu, profile), *times)
-    return turns.detrended(turns.vector_rad), turns.detrended(told)
+    predicted = gyro_turns(integrate_gyro(imu, profile), *times)
+    return turns.detrended(turns.vector_rad), turns.detrended(predicted)
 
 
 def _rms(vectors: Array) -> float:

@@ -1,4 +1,4 @@
-"""A term: one thing that may be wrong with a profile, as fits change it."""
+"""A term of a fit: one possible error of a profile."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One thing that may be wrong with a profile: how a vector of steps changes it."""
+    """One possible error of a profile, changed by a vector of steps."""
 
     name: str
     change: Callable[[CameraProfile, Array], CameraProfile]
     """The profile with these values (k,) added to its own."""
     quotient: tuple[float, ...]
-    """(k,) step of the difference quotient; also tells how many values there are."""
+    """(k,) step of the difference quotient; its length is the number of values."""
     limit: tuple[float, ...]
     """(k,) largest change in one iteration."""
     prior_std: tuple[float, ...]
-    """(k,) of the whole change about the starting profile; inf: none."""
+    """(k,) prior standard deviation of the total change from the starting profile; inf: no prior."""
     slopes: Callable[[CameraProfile, TrackTable, Callable[[CameraProfile], Array]], Array] | None = None
-    """Of a profile, the points, and by how much (n, 2) another profile moves them: (n, 2, k) all slopes at once, where
-    that is quicker; None: quotient by quotient."""
+    """All slopes (n, 2, k) at once, if that is faster, from a profile, the points, and a function that gives their
+    displacement (n, 2) for another profile; None: by difference quotients."""
 
     def __len__(self) -> int:
         return len(self.quotient)
@@ -38,7 +38,7 @@ class Term:
 def slopes_of(
     term: Term, profile: CameraProfile, table: TrackTable, moved_by: Callable[[CameraProfile], Array]
 ) -> Array:
-    """Change (n, 2, k) of the predicted points per unit of a term's values; moved_by: of another profile."""
+    """Change (n, 2, k) of predicted points per unit of a term's values; moved_by: displacement for another profile."""
     if term.slopes is not None:
         return term.slopes(profile, table, moved_by)
     columns = []

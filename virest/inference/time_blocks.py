@@ -1,4 +1,4 @@
-"""Blocks of time: what lies in one shares its errors, so it counts once; blocks judge fits that did not see them."""
+"""Time blocks: data of one block share errors and count as one sample; held-out blocks test fits of the others."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Mask = NDArray[np.bool_]
 
 
 def even_blocks(number: Index, total: int, blocks: int) -> Index:
-    """Block (n,) of each of some numbers below ``total``, counted in time: about as many numbers in each."""
+    """Block (n,) of numbers below ``total`` in time order; all blocks hold about equally many numbers."""
     return np.asarray(number * blocks // max(total, 1))
 
 
 def varied_blocks(position: Array | Index, lengths: Sequence[float] | Array) -> Index:
-    """Block (n,) of each position in time, from the first on: lengths in turn, varied so that nothing beats."""
+    """Block (n,) of each position in time; lengths cycle through ``lengths`` to avoid beats with periodic motion."""
     if not len(position):
         return np.zeros(0, np.intp)
     in_turn = np.asarray(lengths, float)
@@ -28,6 +28,6 @@ def varied_blocks(position: Array | Index, lengths: Sequence[float] | Array) -> 
 
 
 def halves(block: Index) -> tuple[Mask, Mask]:
-    """What two fits see, (n,) each: every other block; what one sees judges the other."""
+    """Masks (n,) of the data of two fits, alternating blocks; each fit is tested on the other's data."""
     even = block % 2 == 0
     return even, ~even

@@ -1,7 +1,7 @@
-"""Tracked points as evidence: where named terms of a profile and the scene's motion put them, and how sure they are.
+"""Tracked points as evidence: their prediction from a profile's terms and the scene's motion, and their uncertainty.
 
-How the points depend on the values changes little on the way: slopes are taken anew only where the points have moved
-far since, and once more where the descent ends.
+The points' slopes change little during a descent: they are re-evaluated only after the points have moved far, and once
+more where the descent ends.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ SMALLEST_SCALE = 0.03
 STALE = {Slopes.ON_THE_WAY: (1.5, 0.5), Slopes.AT_THE_END: (0.1, 0.05), Slopes.HERE: (0.0, 0.0)}
 """Reuse the Jacobian until points move this far (median, px) or the scene changes by this fraction."""
 ANY_DEPTH = 1e6
-"""Spread of inverse depths that leaves a point free to lie anywhere along its parallax."""
+"""Spread of inverse depths that allows any position along the parallax."""
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Where a descent stands."""
+    """State of a descent."""
 
     known: IntegratedMotion
     scene: Motion | None
     change: Array
-    """(k,) of the terms' values from the starting profile."""
+    """(k,) change of the terms' values from the starting profile."""
     depth_spread: float
     """Standard deviation of points' inverse depths about the plane, 1/m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """The points as a state predicts them, with slopes that were taken there or not far away."""
+    """The points predicted at a state, with slopes evaluated there or nearby."""
 
     scene: Motion | None
     prediction: Prediction
     slope: Array
     """(n, 2, k) change of the predicted points per unit of each term's values and of the motion's entries, px."""
     taken_px: Array
-    """(n, 2) where the points were predicted when the slopes were taken."""
+    """(n, 2) predicted points where the slopes were evaluated."""
     taken_scene: Motion | None
 
     def is_stale(self, limit: Slopes) -> bool:
-        """Whether points or scene have moved further than STALE since the slopes were taken."""
+        """Whether points or scene have changed by more than STALE since the slopes were evaluated."""
         if self.prediction.second_px is self.taken_px:
             return False
         moved_px = float(np.median(np.abs(self.prediction.second_px - self.taken_px)))
@@ -62,7 +62,7 @@ class Linearisation:
 
 
 def _part_moved(before: Motion | None, after: Motion | None) -> float:
-    """By what part the planes and velocities of an inertial motion have changed."""
+    """Largest relative change of the planes and velocities of an inertial motion."""
     if not isinstance(before, InertialMotion) or not isinstance(after, InertialMotion):
         return 0.0
     parts = (
@@ -77,7 +77,7 @@ TrackSystem = System[State, Linearisation]
 
 @dataclass(frozen=True, slots=True)
 class TrackEvidence:
-    """Tracked points, and what stays the same through a descent."""
+    """Tracked points, and everything that stays constant during a descent."""
 
     imu: ImuSamples
     table: TrackTable
@@ -85,7 +85,7 @@ class TrackEvidence:
     start: Motion | None
 
     def look(self, state: State, before: Linearisation | None, limit: Slopes) -> Linearisation:
-        """Predict the points of a state; slopes of an earlier look serve while they are not stale."""
+        """Predict the points of a state, reusing the slopes of an earlier look while they are not stale."""
         table, scene = self.table, state.scene
         like = None if before is None else before.prediction
         directed = isinstance(scene, DirectedMotion)
@@ -98,7 +98,7 @@ class TrackEvidence:
                 if not kept.is_stale(limit):
                     return kept
             like = prediction
-        if directed:  # whose points do not depend on which way it goes
+        if directed:  # slopes do not depend on the direction, which is eliminated
             slope = self._term_slopes(replace(state, scene=None), prediction)
             return Linearisation(scene, prediction, slope, prediction.second_px, scene)
         prediction = predict(state.known, table, scene, slopes=scene is not None, like=like)
@@ -118,7 +118,7 @@ class TrackEvidence:
         return np.concatenate(found, axis=-1) if found else np.zeros((len(self.table), 2, 0))
 
     def weighed(self, state: State, look: Linearisation) -> TrackSystem:
-        """Whiten a look's rows by noise and spread of depths, and take out what directions of travel explain."""
+        """Whiten a look's rows by noise and spread of depths, and eliminate the directions of travel."""
         table, scene = self.table, look.scene
         difference = table.second_px - look.prediction.second_px
         limit = [value for term in self.terms for value in term.limit]
@@ -143,7 +143,7 @@ class TrackEvidence:
         return System(found, look, rows, left, squared, scale, np.array(prior), np.array(off), np.array(limit))
 
     def whitened(self, state: State, at: Prediction, columns: Array) -> Array:
-        """Columns (n, 2, k), px, over the standard deviations of points that are predicted there."""
+        """Columns (n, 2, k), px, divided by the standard deviations of the predicted points."""
         noise = self.table.noise_px[self.table.pair]
         columns = columns / noise[:, None, None]
         if at.along_px is None:
@@ -163,17 +163,17 @@ class TrackEvidence:
         return State(known, scene, state.change + step[:count], state.depth_spread)
 
     def depth_spread(self, system: TrackSystem) -> float:
-        """Standard deviation of inverse depths: what differences along the parallax have more than those across."""
+        """Standard deviation of inverse depths, from the excess of residuals along the parallax over those across."""
         along_px = system.look.prediction.along_px
         if along_px is None or system.state.depth_spread == ANY_DEPTH:
             return 0.0 if along_px is None else ANY_DEPTH
         noise = self.table.noise_px[self.table.pair]
         length, way = lengths_and_ways(along_px)
-        telling = (ratio := length / noise) > np.quantile(ratio, 0.5)
-        if telling.sum() < 50 or np.median(ratio[telling]) < 1e-3:
+        sensitive = (ratio := length / noise) > np.quantile(ratio, 0.5)
+        if sensitive.sum() < 50 or np.median(ratio[sensitive]) < 1e-3:
             return 0.0
-        off = ((self.table.second_px - system.look.prediction.second_px) / noise[:, None])[telling]
-        way, ratio = way[telling], ratio[telling]
+        off = ((self.table.second_px - system.look.prediction.second_px) / noise[:, None])[sensitive]
+        way, ratio = way[sensitive], ratio[sensitive]
         along, across = (off * way).sum(axis=-1), off[:, 1] * way[:, 0] - off[:, 0] * way[:, 1]
         base = (np.median(np.abs(across)) / NORMAL_MEDIAN) ** 2
         more = along**2 - base * NORMAL_MEDIAN**2
@@ -190,7 +190,7 @@ def lengths_and_ways(vectors: Array) -> tuple[Array, Array]:
 
 
 def _directed(table: TrackTable, at: Prediction, motion: DirectedMotion) -> tuple[Prediction, DirectedMotion]:
-    """Directions found anew from the differences, and the prediction with what lies along them."""
+    """Directions re-estimated from the residuals, and the prediction with the parallax along them."""
     assert at.per_step is not None
     noise, group = table.noise_px[table.pair], motion.group(table.pair)
     start = motion.direction if motion.direction.any() else None

@@ -48,7 +48,7 @@ __all__ = [
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4
-PLACES = 5
+REGIONS = 5
 """The picture is divided into this many parts each way: a wall or a ceiling fills some of them."""
 ONE_DIRECTION = 1.15
 """One direction of travel for the whole capture stays if it leaves less than this many times what one a pair leaves."""
@@ -235,10 +235,10 @@ def _doubt(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) 
         return CovarianceModel(inverse)
     block = even_blocks(table.pair, table.n_pairs, count)
     moved = system.score @ inverse / _true_curvature(system)
-    place = _parts_of_picture(table.first_px)
-    by_place = scatter(moved, place, about_mean=True) - scatter(moved, block * PLACES**2 + place, about_mean=True)
+    place = _regions(table.first_px)
+    by_region = scatter(moved, place, about_mean=True) - scatter(moved, block * REGIONS**2 + place, about_mean=True)
     return CovarianceModel(
-        inverse, scatter(moved, block, about_mean=True), by_place, inverse @ (system.prior[:, None] * inverse)
+        inverse, scatter(moved, block, about_mean=True), by_region, inverse @ (system.prior[:, None] * inverse)
     )
 
 
@@ -261,17 +261,17 @@ def _relief(table: TrackTable, system: TrackSystem, inverse: Array, depth_spread
     ratio = length / table.noise_px[table.pair]
     pull = system.weight / system.scale**2 * ratio / np.sqrt(1 + (depth_spread * ratio) ** 2)
     moved = np.einsum("ni,nik->nk", way, system.rows) @ inverse * pull[:, None]
-    place = _parts_of_picture(table.first_px)
+    place = _regions(table.first_px)
     points = np.maximum(np.bincount(place), 1)[:, None]
     together = np.stack([np.bincount(place, column) for column in moved.T], axis=-1)
     return np.asarray(depth_spread * np.sqrt(len(table)) * together / np.sqrt(points))
 
 
-def _parts_of_picture(points_px: Array) -> Index:
-    """Number of the part of the picture (n,) that each point lies in: PLACES by PLACES of them."""
+def _regions(points_px: Array) -> Index:
+    """Number of the part of the picture (n,) that each point lies in: REGIONS by REGIONS of them."""
     low, high = points_px.min(axis=0), points_px.max(axis=0)
-    cell = ((points_px - low) / np.maximum(high - low, 1.0) * PLACES).astype(np.intp).clip(0, PLACES - 1)
-    return np.asarray(cell[:, 0] * PLACES + cell[:, 1])
+    cell = ((points_px - low) / np.maximum(high - low, 1.0) * REGIONS).astype(np.intp).clip(0, REGIONS - 1)
+    return np.asarray(cell[:, 0] * REGIONS + cell[:, 1])
 
 
 def _true_curvature(system: TrackSystem) -> float:

@@ -1,4 +1,4 @@
-"""How well points are tracked, measured without any camera model: what a free smooth flow of each pair leaves."""
+"""Tracking noise, measured without a camera model: the residual of a smooth flow fitted to each pair."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from virest.inference.tracking import TrackPair
 Array = NDArray[np.float64]
 REWEIGHTINGS = 6
 POINTS_PER_TERM = 4
-"""A cubic flow has 10 terms an axis; with fewer points than this many times the terms a lower order is taken."""
+"""Points needed per term of the flow (a cubic has 10 per axis); otherwise a lower order is used."""
 ENOUGH_POINTS = 36
-"""With fewer points the flow that can be fitted does not follow a turning picture; other pairs speak for them."""
+"""With fewer points, a flow of low order cannot follow a rotating camera, so the pair takes the others' noise."""
 ORDERS = (3, 2, 1)
 SMALLEST_NOISE_PX = 0.01
 
@@ -23,8 +23,8 @@ SMALLEST_NOISE_PX = 0.01
 def step_noise_px(pairs: Sequence[TrackPair]) -> Array:
     """Standard deviation (pairs,) of a tracked step per coordinate, from a cubic flow over each picture.
 
-    Turns, a readout and a plane's parallax are smooth over a picture; tracking errors are not.  Depth steps and moving
-    objects raise it a little: the scale is a median.
+    Rotation, readout and a plane's parallax are smooth over a picture; tracking errors are not.  Depth steps and moving
+    objects raise it only slightly, because the scale is a median.
     """
     noise = np.array([_pair_noise(pair) for pair in pairs])
     enough = np.array([len(pair) >= ENOUGH_POINTS for pair in pairs], bool)
@@ -32,7 +32,7 @@ def step_noise_px(pairs: Sequence[TrackPair]) -> Array:
 
 
 def smooth_flow_residual(pair: TrackPair) -> Array:
-    """Tracked steps (n, 2) less their pair's smooth flow."""
+    """Tracked steps (n, 2) minus their pair's smooth flow."""
     return _residual(pair)[0]
 
 
@@ -58,7 +58,7 @@ def _residual(pair: TrackPair) -> tuple[Array, int]:
 
 
 def flow_basis(points_px: Array, order: int) -> Array:
-    """Monomials (n, k) of places up to an order, about their middle."""
+    """Monomials (n, k) of positions up to an order, about their mean."""
     centred = points_px - points_px.mean(axis=0)
     x, y = (centred / max(float(np.abs(centred).max()), 1.0)).T
     return np.stack([x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)], axis=-1)

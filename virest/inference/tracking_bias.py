@@ -1,16 +1,15 @@
-"""What tracking gets wrong in the same way all over a capture, so that no statistics of the capture show it.
+"""Systematic tracking errors that are the same throughout a capture, so that its own statistics do not reveal them.
 
-:func:`bias_std` holds for points as they were tracked, :func:`remaining_std` for points that
-:mod:`virest.inference.blur_bias` has corrected.
+:func:`bias_std` applies to points as tracked, :func:`remaining_std` to points corrected by
+:mod:`virest.inference.blur_bias`.
 
-Followed points lag and shrink a little where blur changes from frame to frame, and more where the codec's predicted
-blocks replace what was seen.  Measured on simulated captures with H.264 at 0.12 to 2 bits a pixel; it grows with the
-noise of a tracked step, of which 0.15 px is typical.
+Tracked steps are slightly late and short where blur changes from frame to frame, and more so where the codec's
+predicted blocks replace image detail.  The error was measured on simulated captures with H.264 at 0.12 to 2 bits per
+pixel; it grows with the noise of a tracked step, typically 0.15 px.
 
-Whatever its pattern is, a part of it is correlated with what a value itself does to the points.  Where a value moves
-many
-points far, that is little; where it moves them by hundredths of a pixel (a lens seen while walking straight on, a skew
-within three seconds), it is most of what is not known.
+Part of the error is correlated with the change of the points that a value itself causes.  If a value moves many points
+far, that matters little; if it moves them by hundredths of a pixel (a lens while walking straight ahead, a clock skew
+within 3 s), it is most of the uncertainty.
 """
 
 from __future__ import annotations
@@ -18,23 +17,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.inference.blur_bias import UNSURE
+from virest.inference.blur_bias import RELATIVE_STD
 from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
 TYPICAL_NOISE_PX, LEAST_NOISE_PX = 0.15, 0.05
 SHARED = 0.025
-"""Part of each point's error that is correlated with a value's own pattern.  Ten kinds of values in forty captures
-whose
-truth was known came out wrong by 0.018 to 0.027 of it (rms), hand-held or walking, before far things, walls and rooms,
-at 0.04 to 0.19 px of noise; statistics alone had put one in five of them more than two deviations off."""
+"""Fraction of each point's error that is correlated with a value's own pattern.  In 40 captures of known truth, ten
+kinds of values were off by 0.018 to 0.027 of it (rms): hand-held or walking, distant scenes, walls and rooms, 0.04 to
+0.19 px of noise.  By statistics alone, one value in five was off by more than 2 σ."""
 SHARED_READOUT = 0.03
-"""The same for a readout: predicted blocks shear less than rows do.  With it median |error| / deviation is 0.71 of
-readouts and 0.68 of the offsets of their first rows in seven hand-held
-captures drawn as `bench --only calibration` draws them; 0.67 is right, and twice the part gave 0.40 and 0.39."""
+"""The same for a readout: predicted blocks shear less than rows do.  In seven hand-held captures drawn like those of
+`bench --only calibration`, median |error| / σ is then 0.71 for readouts and 0.68 for the offsets of their first rows;
+0.67 is ideal, and twice this fraction gave 0.40 and 0.39."""
 SHARED_RELIEF = 0.6
-"""Part of the spread of depths about the plane that parts of the picture share in a constant rate's own sense: travel
-of which the depths are wrong looks like one.  In rooms that were walked through biases were off by 0.5 to 2 of it."""
+"""Fraction of the spread of depths about the plane that image regions share in the pattern of a constant rate, since
+translation with wrong depths resembles one.  In rooms walked through, biases were off by 0.5 to 2 times it."""
 BIAS_STD: dict[str, tuple[float, ...]] = {
     "time_offset": (2e-5,),
     "imu_rotation": (2.5e-4,) * 3,
@@ -51,26 +49,27 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "exposure_time": (0.015,),
     "scene_depth": (0.004,),
 }
-"""At the typical noise, in the units of the terms of profile_terms; a depth's relative.  By analogy, not measured: a
-low pass's delay as an offset, pixel_aspect as √2 of a focal length, since one of two directions tells it."""
-WANDER_STD = {"gyro_bias": 1.5e-4}
-"""What a value does of its own accord however well points are tracked: a phone's gyroscope drifts by this much within
-seconds, and its noise of 3e-4 rad/s/√Hz has that mean over two of them."""
+"""Bias at the typical noise, in the units of the terms of profile_terms; relative for a depth.  By analogy, not
+measured: the low-pass filter's delay as a time offset, pixel_aspect as √2 of a focal length, since only one of two
+directions determines it."""
+DRIFT_STD = {"gyro_bias": 1.5e-4}
+"""Changes of a value itself, however well points are tracked: a phone's gyroscope drifts by this much within seconds,
+and the mean of its noise of 3e-4 rad/s/√Hz over 2 s is about as large."""
 
 
 def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
     """Standard deviation (k,) of the bias of a term's values; noise_px: of a tracked step, per coordinate.
 
-    At least what errors common to many points make of them: Σw points told a value to the curvature, and no number of
-    points tells it better than 1 / SHARED² would.
+    At least the error that points share: the curvature is that of Σw independent points, but no number of points can
+    determine a value better than 1 / SHARED² of them.
     """
     own = fit.slices.get(name)
-    told = np.zeros(1) if own is None else np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[own])
+    per_point = np.zeros(1) if own is None else np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[own])
     by_coding = np.zeros(1) if own is None else fit.by_coding[own]
     if name == "readout_time":
-        return np.asarray(np.hypot(SHARED_READOUT * told, by_coding))
+        return np.asarray(np.hypot(SHARED_READOUT * per_point, by_coding))
     scaled = max(noise_px, LEAST_NOISE_PX) / TYPICAL_NOISE_PX * np.array(BIAS_STD[name])
-    floor = np.maximum(np.maximum(scaled, SHARED * told), WANDER_STD.get(name, 0.0))
+    floor = np.maximum(np.maximum(scaled, SHARED * per_point), DRIFT_STD.get(name, 0.0))
     floor = np.hypot(floor, by_coding)
     if name == "gyro_bias" and own is not None:
         floor = np.hypot(floor, SHARED_RELIEF * fit.by_relief[own])
@@ -89,22 +88,23 @@ STILL_SHARED = {
     "principal_point": 0.018,
     "exposure_time": 0.010,
 }
-"""Part of a step's noise that is correlated with a value's own pattern once blur's bias is taken out: what remains is
-mostly the codec's, whose predicted blocks shear less than rows do.  Those of 52 captures that were drawn as
-``python -m virest.app.bench --only calibration`` draws them; that command prints what its captures ask for."""
+"""Fraction of a step's noise that is correlated with a value's own pattern after the blur bias is removed.  The rest
+comes mostly from the codec, whose predicted blocks shear less than rows do.  Values of 52 captures drawn like those of
+``python -m virest.app.bench --only calibration``; that command prints the values for its captures."""
 STILL_SHARED_OTHER = 0.012
-"""The same for all other values: the typical one."""
+"""The same for all other values: a typical one."""
 GYRO_WANDER_RAD_S = 5e-5
 """Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
 
 
 def remaining_std(fit: TrackFit, name: str, moved: Array, gyro_mean_std_rad_s: float) -> Array:
-    """Standard deviation (k,) of what is left of a term's bias in points that blur's bias was taken out of.
+    """Standard deviation (k,) of a term's remaining bias, from points without the blur bias.
 
-    moved (k,): by how much that moved the values.  gyro_mean_std_rad_s: of the gyroscope's noise, over the capture.
+    moved (k,): change of the values by that correction.  gyro_mean_std_rad_s: standard deviation of the mean gyroscope
+    noise over the capture.
     """
     own = fit.slices[name]
-    std = np.hypot(np.hypot(shared_std(fit, name), UNSURE * moved), fit.by_coding[own])
+    std = np.hypot(np.hypot(shared_std(fit, name), RELATIVE_STD * moved), fit.by_coding[own])
     if name == "gyro_bias":
         wander = np.hypot(GYRO_WANDER_RAD_S, gyro_mean_std_rad_s)
         return np.asarray(np.hypot(np.hypot(std, wander), SHARED_RELIEF * fit.by_relief[own]))
@@ -112,6 +112,6 @@ def remaining_std(fit: TrackFit, name: str, moved: Array, gyro_mean_std_rad_s: f
 
 
 def shared_std(fit: TrackFit, name: str) -> Array:
-    """The part (k,) of :func:`remaining_std` that STILL_SHARED makes."""
-    told = np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[fit.slices[name]])
-    return np.asarray(STILL_SHARED.get(name, STILL_SHARED_OTHER) * told)
+    """The part (k,) of :func:`remaining_std` that comes from STILL_SHARED."""
+    per_point = np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[fit.slices[name]])
+    return np.asarray(STILL_SHARED.get(name, STILL_SHARED_OTHER) * per_point)

@@ -1,7 +1,7 @@
-"""Which way the camera travels, where no accelerometer tells: unit vectors from the parallax that differences show.
+"""The camera's direction of travel without an accelerometer: unit vectors from the parallax in tracked points.
 
-A point's parallax lies along the flow F d of the direction d; by how much, its unknown depth says.  So only what lies
-across counts (the epipolar constraint for a small turn), and the directions are eliminated from every fit.
+A point's parallax lies along the flow F d of the direction d, with a length that its unknown depth determines.  So only
+residuals across it count (the epipolar constraint for small rotations), and the directions are eliminated from fits.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _UPPER = np.triu_indices(3)
 
 
 def find_directions(flow: Array, difference: Array, group: Index, groups: int, start: Array | None) -> Array:
-    """Find unit vectors (groups, 3) whose flow the differences (n, 2) follow best; flow (n, 2, 3) in the same units.
+    """Find unit vectors (groups, 3) whose flow fits the differences (n, 2) best; flow (n, 2, 3) in the same units.
 
-    Across F d, a difference r measures d · (r × F) / |F d|: linear in d but for the length, which each pass takes from
-    the one before; Cauchy weights at the noise across.
+    Across F d, a difference r measures d · (r × F) / |F d|: linear in d except for the norm, which is taken from the
+    previous pass; Cauchy weights at the noise across.
     """
     ahead, down = np.ascontiguousarray(flow.transpose(1, 2, 0))
     across = difference[:, 0] * down - difference[:, 1] * ahead
@@ -45,9 +45,9 @@ def find_directions(flow: Array, difference: Array, group: Index, groups: int, s
 def without_directions(
     rows: Array, left: Array, weight: Array, difference: Array, flow: Array, direction: Array, group: Index
 ) -> tuple[Array, Array]:
-    """Rows (n, 2, k) and differences (n, 2), both across only, less what turning the directions would explain.
+    """Rows (n, 2, k) and differences (n, 2) across the parallax only, with the directions eliminated.
 
-    difference (n, 2): whole, in the same units as ``left``.  Schur complement of two tangents for each direction.
+    difference (n, 2): both components, in the units of ``left``.  Schur complement of two tangents per direction.
     """
     moved = np.einsum("nij,nj->ni", flow, direction[group])
     size = np.maximum(np.linalg.norm(moved, axis=-1), 1e-12)
@@ -66,7 +66,7 @@ def without_directions(
 
 
 def _least(square: Array, belongs: csr_array) -> Array:
-    """Unit vectors (groups, 3) with the least Σ (row · d)², of the rows' products (6, n) in the order of _UPPER."""
+    """Unit vectors d (groups, 3) that minimise Σ (row · d)², from the rows' products (6, n) in the order of _UPPER."""
     total = np.empty((belongs.shape[0], 3, 3))
     total[:, *_UPPER] = total[:, *_UPPER[::-1]] = belongs @ np.ascontiguousarray(square.T)
     return np.asarray(np.linalg.eigh(total)[1][..., 0])

@@ -168,7 +168,7 @@ def _fit_stretch(
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
     assert isinstance(fit.scene, InertialMotion)
     points = triangulate(fit.ground, fit.scene, table)
-    stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table), _nudged(fit, imu))
+    stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table), _perturbed(fit, imu))
     stretch = replace(stretch, windows=tuple(_judged(stretch, still, k, depth_m) for k in range(table.n_windows)))
     sights = triangulate_relief(fit.ground, fit.scene, observed.table(observed.tracks))
     reliefs = tuple(_relief(stretch, sights, k) for k in range(table.n_windows))
@@ -188,7 +188,7 @@ def _relief(stretch: Stretch, sights: Sightings, window: int) -> WindowRelief | 
     return find_relief(sights.chosen(sights.points.window == window), grid, view)
 
 
-def _nudged(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
+def _perturbed(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
     """The fit's ground with each value of its terms one quotient's step further."""
     steps = [(term, np.diag(term.quotient)[k]) for term in fit.terms for k in range(len(term))]
     return tuple(with_profile(fit.ground, imu, term.change(fit.profile, step)) for term, step in steps)
