@@ -14,7 +14,7 @@ from virest.errors import ImuError
 from virest.image_formation.point_model import ground, predict
 from virest.inference import profile_terms as terms_of
 from virest.inference.clustered import CovarianceModel
-from virest.inference.coded_motion import drawn_px, step_slopes
+from virest.inference.coded_motion import StepSlopes, drawn_px, step_slopes
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import InertialMotion
@@ -316,7 +316,7 @@ def test_steps_of_the_rows_above_are_within_the_deviation(term: Term, read: str)
     table, profile = recording.table(), recording.profile
     known = ground(recording.imu, profile, translation=False)
     slopes = step_slopes(known, table, None, predict(known, table, None))
-    drawn = drawn_px(slopes, table.noise_px[table.pair])[1]
+    drawn = drawn_px(slopes, table.noise_px[table.pair])[3]
     fits = [
         fit_tracks(recording.imu, replace(table, second_px=table.second_px + shift), profile, (term,))
         for shift in (0.0, drawn)
@@ -329,8 +329,22 @@ def test_steps_of_the_rows_above_are_within_the_deviation(term: Term, read: str)
         assert (moved < 0) == (read == "top_to_bottom")
 
 
+def test_what_a_still_camera_centre_explains_is_apart_from_the_rows_times() -> None:
+    """Slopes at one instant are those of a global shutter; rows' times add the rest, along the readout alone."""
+    recording = recorded(replace(LANDSCAPE, gyro_noise_rad_s=0.0, frames=20))
+    table, profile = recording.table(), recording.profile
+    known = ground(recording.imu, profile, translation=False)
+    at = predict(known, table, None)
+    slopes = step_slopes(known, table, None, at)
+    assert not slopes.by_rows[0].any()
+    moved = replace(profile.intrinsics, cx_px=profile.intrinsics.cx_px, cy_px=profile.intrinsics.cy_px - 1.0)
+    shifted = predict(ground(recording.imu, replace(profile, intrinsics=moved), translation=False), table, None)
+    np.testing.assert_allclose(shifted.second_px - at.second_px, slopes.at_once[1], atol=2e-5)
+
+
 def test_steps_that_go_alike_everywhere_are_not_drawn() -> None:
     """Without a slope nothing is off; where it is small, by no more than a block's side."""
-    assert not drawn_px(np.zeros((2, 5, 2)), np.full(5, 0.2)).any()
-    slight = drawn_px(np.full((2, 5, 2), 1e-3), np.full(5, 0.5))
+    none, little = np.zeros((2, 5, 2)), np.full((2, 5, 2), 1e-3)
+    assert not drawn_px(StepSlopes(none, none), np.full(5, 0.2)).any()
+    slight = drawn_px(StepSlopes(little, none), np.full(5, 0.5))
     assert np.abs(slight).max() <= 16e-3

@@ -3,8 +3,8 @@
 $ python -m virest.app.bench --only coding --quick
 
 Captures of which nothing is wrong, of four motions and contents, each read downwards, upwards, to the right and to the
-left and coded at three rates: by how much the time offset that their points ask for is off, and what error of a step,
-over the square of its noise, that asks for beside the one in use.
+left and coded at three rates: by how much the time offset and the principal point that their points ask for are off,
+each fitted alone, and what errors of a step, over the square of its noise, those ask for: by rows, at one instant.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, simulated
@@ -22,12 +23,14 @@ from virest.app.diagnose import open_source
 from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.capture.video import GrayReader, probe_movie
 from virest.image_formation.point_model import TrackTable, ground, predict
-from virest.inference.coded_motion import DRAWN_PER_PX, drawn_px, step_slopes
+from virest.inference.coded_motion import AT_ONCE_PER_PX, BY_ROWS_PER_PX, drawn_px, step_slopes
 from virest.inference.guide_choice import track_guided
 from virest.inference.observed_tracks import observe_tracks
-from virest.inference.profile_terms import TIME_OFFSET
+from virest.inference.profile_terms import PRINCIPAL_POINT, TIME_OFFSET
+from virest.inference.term import Term
 from virest.inference.track_fit import fit_tracks
 
+Array = NDArray[np.float64]
 Row = dict[str, Any]
 BITS_PER_PX = (0.5, 0.2, 0.1)
 SCENES = ("leaves", "text", "board", "photographs")
@@ -55,27 +58,47 @@ def _row(work: Path, scene: tuple[int, str], read: str, bits_per_px: float) -> R
     pairs = track_guided(capture, profile, GrayReader(capture.movie, probe_movie(capture.movie)), range(FRAMES))
     seen = observe_tracks(capture, pairs, profile).table(MOST_POINTS)
 
-    def offset_s(points: TrackTable) -> float:
-        return float(fit_tracks(capture.imu, points, profile, (TIME_OFFSET,), covariances=False).change[0])
+    def fitted(term: Term, points: TrackTable) -> Array:
+        return fit_tracks(capture.imu, points, profile, (term,), covariances=False).change
 
     known = ground(capture.imu, profile, translation=False)
     slopes = step_slopes(known, seen, None, predict(known, seen, None))
-    in_use, axis = DRAWN_PER_PX, 0 if profile.shutter.reads_columns else 1
-    drawn = drawn_px(slopes, seen.noise_px[seen.pair])[axis] / in_use[axis]
-    lag_s = offset_s(seen)
-    unit_s = offset_s(replace(seen, second_px=seen.second_px + drawn)) - lag_s
+    at_once, by_rows = np.split(drawn_px(slopes, seen.noise_px[seen.pair]), 2)
+    axis = 0 if profile.shutter.reads_columns else 1
+    offset_s, centre_px = fitted(TIME_OFFSET, seen), fitted(PRINCIPAL_POINT, seen)
+
+    def asked(term: Term, off: Array, drawn: Array, in_use: float, part: int = 0) -> float:
+        unit = fitted(term, replace(seen, second_px=seen.second_px + drawn / in_use)) - off
+        return float(off[part] / unit[part])
+
+    left, above = (asked(PRINCIPAL_POINT, centre_px, at_once[k], AT_ONCE_PER_PX[k], k) for k in (0, 1))
     return {"scene": name, "read": read, "bits_per_px": bits_per_px, "noise_px": float(np.median(seen.noise_px)),
-            "offset_s": lag_s, "drawn_per_px": lag_s / unit_s, "in_use": in_use[axis]}  # fmt: skip
+            "offset_s": float(offset_s[0]), "centre_px": centre_px.tolist(), "left": left, "above": above,
+            "by_rows": asked(TIME_OFFSET, offset_s, by_rows[axis], BY_ROWS_PER_PX[axis])}  # fmt: skip
 
 
 def _text(rows: list[Row]) -> str:
     lines = []
     for read, bits in product(READOUT_DIRECTIONS, BITS_PER_PX):
         some = [row for row in rows if row["read"] == read and row["bits_per_px"] == bits]
-        offset_us, asked = (np.array([row[key] for row in some]) for key in ("offset_s", "drawn_per_px"))
+        off = 1e6 * np.mean([row["offset_s"] for row in some]), *np.mean([row["centre_px"] for row in some], axis=0)
         lines.append(
-            [read, f"{bits:g}", f"{np.mean([row['noise_px'] for row in some]):.3f}", f"{1e6 * np.mean(offset_us):+.0f}",
-             f"{np.mean(asked):+.1f}", f"{np.sqrt(np.mean(asked**2)):.1f}", f"{some[0]['in_use']:g}"]
+            [read, f"{bits:g}", f"{np.mean([row['noise_px'] for row in some]):.3f}",
+             *(f"{value:+.{digits}f}" for value, digits in zip(off, (0, 2, 2), strict=True)),
+             *(_asked(some, kind) for kind in ("by_rows", "left", "above"))]
         )  # fmt: skip
-    header = ["read", "bits/px", "noise px", "offset off by µs", "asked 1/px", "rms", "in use"]
-    return "CODING: points drawn to the motion of the blocks above and to the left\n" + table(header, lines)
+    header = ["read", "bits/px", "noise px", "offset µs", "cx px", "cy px",
+              "by rows: asked 1/px, rms", "at once, left", "at once, above"]  # fmt: skip
+    lines.append(["all", "", "", "", "", "", "", _asked(rows, "left"), _asked(rows, "above")])
+    for name, read in (("columns", "left_to_right right_to_left"), ("rows", "top_to_bottom bottom_to_top")):
+        lines.append(
+            [name, "", "", "", "", "", _asked([row for row in rows if row["read"] in read], "by_rows"), "", ""]
+        )
+    in_use = f"in use: by rows {BY_ROWS_PER_PX}, at once {AT_ONCE_PER_PX} (left, above)"
+    return f"CODING: points drawn to the motion of the blocks above and to the left; {in_use}\n{table(header, lines)}"
+
+
+def _asked(rows: list[Row], kind: str) -> str:
+    """Mean and root mean square of what captures ask for."""
+    asked = np.array([row[kind] for row in rows])
+    return f"{asked.mean():+.1f} {np.sqrt(np.mean(asked**2)):.1f}"
