@@ -143,6 +143,17 @@ def test_restored_pictures(walk, restored, tmp_path):
     assert facts["instant_after_stamp_s"] == 0.0  # the first row's exposure start, which the stamps mean
 
 
+def test_restored_pictures_have_no_readout_in_any_format(walk, restored, tmp_path):
+    """Straightened frames show one instant: a readout of the recording would bend them anew."""
+    files = {"gyroflow": ("lens.json", "frame_readout_time"), "colmap": ("rolling_shutter.json", "readout_time_s")}
+    for form, (name, key) in files.items():
+        folder, _ = export(walk, tmp_path / form, format=form, restored=restored)
+        assert json.loads((folder / name).read_text())[key] == 0.0
+    folder, _ = export(walk, tmp_path / "nerf", format="nerfstudio", restored=restored)
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert {frame["rolling_shutter_time"] for frame in frames} == {0.0}
+
+
 def test_a_run_of_another_capture_is_refused(walk, restored, tmp_path):
     """A run is told by its name and by its stamps; no folder is left behind."""
     other = shutil.copytree(walk, tmp_path / "other")

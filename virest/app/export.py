@@ -89,11 +89,11 @@ def _write_lens_profile(plan: ExportPlan, part: Path) -> tuple[Json, str]:
     if plan.profile.intrinsics is None:
         raise CaptureError(f"{plan.capture.name}: the focal length is unknown", hint="virest calibrate --with focal")
     rate_hz = _rate_hz([frame.time_ns for frame in plan.frames])
-    text, error_px = gyroflow_profile(replace(plan.camera, intrinsics=plan.standard.intrinsics), rate_hz)
+    text, error_px = gyroflow_profile(replace(plan.profile, intrinsics=plan.standard.intrinsics), rate_hz)
     _write(part / "lens.json", text)
     facts = _facts(plan, list(plan.frames)) | {"frames": 0, "lens_error_px": error_px}
     _write(part / RECORD, json.dumps(plain(facts), allow_nan=False, indent=2) + "\n")
-    readout = f"{1e3 * plan.camera.shutter.readout_time_s:.2f} ms" if plan.camera.readout_known else "unknown"
+    readout = f"{1e3 * plan.profile.shutter.readout_time_s:.2f} ms" if plan.profile.readout_known else "unknown"
     lines = [
         f"{plan.capture.name}: lens profile for Gyroflow, readout {readout}",
         f"its fisheye model is within {error_px:.2f} px of this lens",

@@ -143,7 +143,6 @@ def transforms_json(plan: ExportPlan, poses: list[FramePose]) -> str:
     """``transforms.json``: intrinsics, and for each frame what is known of its time, motion and pose."""
     lens = plan.standard.intrinsics
     assert lens is not None
-    readout_s = 0.0 if plan.options.restored else plan.camera.shutter.readout_time_s
     content: Json = {
         "w": lens.width,
         "h": lens.height,
@@ -152,7 +151,7 @@ def transforms_json(plan: ExportPlan, poses: list[FramePose]) -> str:
         "cx": lens.cx_px + HALF_PX,
         "cy": lens.cy_px + HALF_PX,
         **_nerfstudio_distortion(lens),
-        "frames": [_nerfstudio_frame(plan, pose, readout_s) for pose in poses],
+        "frames": [_nerfstudio_frame(plan, pose) for pose in poses],
     }
     return json.dumps(plain(content), allow_nan=False, indent=1) + "\n"
 
@@ -165,14 +164,14 @@ def _nerfstudio_distortion(lens: Intrinsics) -> Json:
     return {"camera_model": "OPENCV", **dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.coefficients, strict=True))}
 
 
-def _nerfstudio_frame(plan: ExportPlan, pose: FramePose, readout_s: float) -> Json:
+def _nerfstudio_frame(plan: ExportPlan, pose: FramePose) -> Json:
     exposure_s = plan.capture.frames[pose.frame.index].exposure_s
     true_s = None if exposure_s is None else plan.camera.shutter.true_exposure_s(exposure_s)
     facts: Json = {
         "file_path": f"images/{pose.name}",
         "timestamp_ns": pose.frame.time_ns,
         "exposure_time": 0.0 if plan.options.restored else true_s,
-        "rolling_shutter_time": readout_s,
+        "rolling_shutter_time": plan.profile.shutter.readout_time_s,
         "camera_angular_velocity": (OPENGL @ pose.rate_rad_s).tolist(),
         "motion_blur_score": pose.blur_px,
     }
@@ -245,7 +244,7 @@ def _shutter_json(plan: ExportPlan, poses: list[FramePose]) -> str:
         frames.append(entry)
     facts = {
         "readout_direction": plan.camera.shutter.readout_direction,
-        "readout_time_s": 0.0 if plan.options.restored else plan.camera.shutter.readout_time_s,
+        "readout_time_s": plan.profile.shutter.readout_time_s,
         "frames": frames,
     }
     return json.dumps(plain(facts), allow_nan=False, indent=1) + "\n"
