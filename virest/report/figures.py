@@ -14,6 +14,8 @@ from virest.calibration.response_curve import CurveFit
 FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
 DPI = 110
+DARK, ON_DARK = "#1b1f22", "#e4e6e8"
+"""Ground beside photographs, and letters on it."""
 COVARIATES = {"row": "part of the readout", "time": "time, s", "radius": "radius, px", "rate": "rate, rad/s"}
 """What residuals are drawn over, and how the axes are called."""
 RESIDUALS = ("x_px", "y_px")
@@ -103,24 +105,26 @@ def comparison_figure(
 ) -> bytes:
     """Measured picture, simulated picture and their difference, a row each: (label, measured, simulated).
 
-    Pictures (h, w) or (h, w, 3) of 8 bits.  The difference is of luma, all on one scale; its rms stands above.
+    Pictures (h, w) or (h, w, 3) of 8 bits.  The difference is of luma, all on one scale; its rms stands above.  The
+    ground is dark, as beside photographs, whatever the colours of the page.
     """
     figure = canvas(11.0, 0.6 + 3.0 * len(rows))
+    figure.set_facecolor(DARK)
     axes = figure.subplots(len(rows), 3, squeeze=False)
     differences = [_luma(measured) - _luma(simulated) for _, measured, simulated in rows]
     reach = max(1.0, *(float(np.percentile(np.abs(d), 99)) for d in differences))
     for line, (label, measured, simulated), difference in zip(axes, rows, differences, strict=True):
         for place, picture, name in zip(line, (measured, simulated), ("measured", f"simulated, {label}"), strict=False):
             place.imshow(picture, cmap="gray", vmin=0, vmax=255)
-            place.set_title(literal(name), fontsize=9)
+            place.set_title(literal(name), fontsize=9, color=ON_DARK)
         shown = line[2].imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
         rms = float(np.sqrt(np.mean(difference**2)))
-        line[2].set_title(f"measured − simulated, rms {rms:.1f} levels", fontsize=9)
-        figure.colorbar(shown, ax=line[2], shrink=0.8)
+        line[2].set_title(f"measured − simulated, rms {rms:.1f} levels", fontsize=9, color=ON_DARK)
+        figure.colorbar(shown, ax=line[2], shrink=0.8).ax.tick_params(colors=ON_DARK)
         for place in line:
             place.set_xticks([])
             place.set_yticks([])
-    figure.suptitle(literal(title))
+    figure.suptitle(literal(title), color=ON_DARK)
     return as_file(figure, image_format)
 
 
