@@ -55,14 +55,14 @@ class _Console(logging.Handler):
         """Write text as it is; a closed standard error is no reason to fail."""
         if sys.stderr is None:
             return
-        if self.bar:
+        if self.bar is not None:
             self.bar.clear()
         try:
             sys.stderr.write(text.encode(sys.stderr.encoding or "utf-8", "backslashreplace").decode("utf-8", "replace"))
             sys.stderr.flush()
         except (OSError, ValueError):
             return
-        if self.bar:
+        if self.bar is not None:
             self.bar.refresh()
 
 
@@ -110,14 +110,20 @@ def silence_stdout() -> None:
 
 
 @contextmanager
-def progress_bar(total: int, label: str, *, quiet: bool) -> Iterator[Bar | None]:
-    """A bar on standard error, only where that is a terminal."""
+def progress_bar(total: int | None, label: str, *, quiet: bool, done: int = 0) -> Iterator[Bar | None]:
+    """A bar on standard error, only where that is a terminal.
+
+    total: None where the work has no steps to count.  done: of the total by an earlier run; speeds leave it out.
+    """
     if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield None
         return
     from tqdm import tqdm
 
-    with tqdm(total=total, desc=label, unit="frame", file=sys.stderr, leave=False) as bar:
+    shape = "{desc} …" if total is None else None
+    with tqdm(
+        total=total, desc=label, unit="frame", file=sys.stderr, leave=False, initial=done, smoothing=0, bar_format=shape
+    ) as bar:
         CONSOLE.bar = bar
         try:
             yield bar

@@ -137,7 +137,7 @@ def _process(turn: CaptureSlot, options: ProcessOptions, workers: Workers) -> Ca
     planned = Planned()
     try:
         require_startable(turn.path, turn.name, options)
-        with console.progress_bar(1, f"{shown(turn.name)}: reading and planning", quiet=options.quiet):
+        with console.progress_bar(None, f"{shown(turn.name)}: reading and planning", quiet=options.quiet):
             planned = turn.plan(options)
         seconds = planned.seconds if turn.ahead else time.perf_counter() - began
         say(planned.messages)
@@ -271,9 +271,7 @@ def _work(
     name: str,
     quiet: bool,
 ) -> None:
-    with console.progress_bar(total, name, quiet=quiet) as bar:
-        if bar:
-            bar.update(before)
+    with console.progress_bar(total, name, quiet=quiet, done=before) as bar:
         if give:
             give(None)
         for segment, counts in run_segments(todo, workers):
