@@ -25,6 +25,8 @@ COMMANDS: dict[str, Any] = PROGRAM.commands
 OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive", "--nthreads", "--array"}
 """Options of pip, git, dask and Slurm that a page may name."""
 MOST_BYTES = 8192
+LINE = 132
+"""Characters of an entry of the changelog: a line of a wide terminal."""
 SHELL = ("", "sh", "console")
 
 
@@ -60,6 +62,16 @@ def inline_calls(page: Path) -> list[str]:
 def test_the_readme_is_short() -> None:
     """A reader has the README read in a few minutes; all else is in docs/."""
     assert len(README.read_bytes()) <= MOST_BYTES
+
+
+def test_the_changelog_says_each_change_in_a_line() -> None:
+    """In the form of Keep a Changelog, newest first; 0.1.0 lists what the program began with."""
+    recent, _, _ = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").partition("## [0.1.0]")
+    lines = [line for line in recent.splitlines() if line][3:]
+    heads = [line for line in lines if line.startswith("#")]
+    assert heads[0] == "## [Unreleased]"
+    assert {head for head in heads if head.startswith("### ")} <= {"### Added", "### Changed", "### Fixed"}
+    assert not [line for line in lines if not line.startswith(("- ", "#")) or len(line) > LINE]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
