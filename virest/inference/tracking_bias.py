@@ -80,13 +80,13 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
 
 STILL_SHARED = {
     "time_offset": 0.010,
-    "readout_time": 0.026,
+    "readout_time": 0.022,
     "imu_rotation": 0.006,
     "gyro_bias": 0.005,
     "focal_length": 0.014,
     "radial_distortion": 0.012,
-    "principal_point": 0.018,
-    "exposure_time": 0.010,
+    "principal_point": 0.006,
+    "exposure_time": 0.005,
 }
 """Fraction of a step's noise that is correlated with a value's own pattern after the blur bias is removed.  The rest
 comes mostly from the codec, whose predicted blocks shear less than rows do.  Values of 52 captures drawn like those of
