@@ -262,7 +262,7 @@ def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
 
 def _no_parallax(found: Window) -> str:
     if found.parallax < MIN_PARALLAX:
-        return f"hardly any parallax: the residual of rotation alone is {found.parallax:.2f} times that of translation"
+        return f"too little parallax: rotation alone leaves {found.parallax:.2f} times the residual of translation"
     return ""
 
 
