@@ -24,12 +24,12 @@ MIN_FINITE = 0.98
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """Path of the camera's centre from the accelerometer alone, in the trajectory's axes; from rest at the first row."""
+    """Path of the camera's centre from the accelerometer alone, trajectory's axes; from rest at the first row."""
 
     trajectory: Trajectory
     spline: CubicHermiteSpline
-    """(m, 15), by rows of (3, 5): P of the IMU, metres, for zero gravity, velocity and bias; its change per m/s² of bias
-    along each IMU axis; its change per second of delay of the accelerations."""
+    """(m, 15), by rows of (3, 5): P of the IMU, metres, for zero gravity, velocity and bias; its change per m/s² of
+    bias along each IMU axis; its change per second of delay of the accelerations."""
     arm_cam_m: Array
     """(3,) the IMU's origin in camera axes."""
 
@@ -45,7 +45,7 @@ class Displacement:
         return path + arm, per_bias, per_delay
 
     def velocity(self, time_s: Array, origin_s: Array) -> tuple[Array, Array, Array]:
-        """Change of the IMU's velocity since an origin (1,), (n, 3), per bias (n, 3, 3), per delay (n, 3), world axes."""
+        """Velocity of the IMU since an origin (1,): (n, 3), per bias (n, 3, 3) and per delay (n, 3), world axes."""
         return _parts(self.spline(time_s, 1) - self.spline(origin_s, 1))
 
     def acceleration(self, time_s: Array) -> Array:

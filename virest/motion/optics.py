@@ -164,7 +164,7 @@ def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:
 
 
 def settling_time_s(profile: CameraProfile) -> float:
-    """Time before a picture from which inertial data are needed, so that the stabiliser's state does not depend on it."""
+    """Time before a picture at which the inertial data must start for the stabiliser's state not to depend on it."""
     extensions = profile.extensions
     if not extensions.stabilisation_fraction:
         return 0.0
@@ -199,7 +199,7 @@ def _running_response(decay: Array, drive: Array) -> Array:
 
 
 def _responses(decay: Array, drive: Array) -> Array:
-    """θ[1:], recursively: two steps combine into one with both decays. log2(n) vectorised passes, 2 n steps in total."""
+    """θ[1:], recursively: two steps combine into one with both decays. log2(n) vectorised passes, 2 n steps in all."""
     if len(drive) < 2:
         return drive
     found = np.empty_like(drive)
