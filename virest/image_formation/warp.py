@@ -1,5 +1,4 @@
-"""The motion of image points: the one map p(t) ~ K (R_t_ref K⁻¹ p_ref + t_t_ref / Z) (forward_model, section 5; eqs
-23-28).
+"""Motion of image points: the one map p(t) ~ K (R_t_ref K⁻¹ p_ref + t_t_ref / Z) (forward_model, section 5; eqs 23-28).
 
 Rolling shutter, blur paths and the log's corner points are this map between different times.  Points are undistorted
 before it and distorted after it, by the lens at the respective time.  Depth is along the optical axis at the first
