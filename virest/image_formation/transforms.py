@@ -21,7 +21,7 @@ from scipy import fft
 
 Image = NDArray[np.float32]
 Transform = Callable[[Image, Image | None], Image]
-"""From a picture or its packed spectrum, (height, width) float32, and an output array, or None for a new one."""
+"""Takes a picture or its packed spectrum, (height, width) float32, and an output array, or None for a new one."""
 OPENCV, POCKETFFT = "OpenCV", "scipy's pocketfft"
 LEAST_POCKETFFT_PX = 128
 """Smaller tiles use OpenCV, because repacking costs what the transform saves (`virest doctor`, both libraries)."""

@@ -67,7 +67,7 @@ class TrackFit:
     """(k,) total change of the terms' values from the starting profile."""
     covariance: Array
     """(k + scene, k + scene): the terms first."""
-    doubt: CovarianceModel
+    covariance_model: CovarianceModel
     """Parts of the covariance, for linear combinations of the values."""
     scale: float
     """Robust standard deviation of the whitened residuals; 1 if the model is complete."""
@@ -125,13 +125,13 @@ class TrackFit:
     @property
     def curvature(self) -> Array:
         """The covariance from the curvature alone, as if points were independent."""
-        return self.doubt.curvature
+        return self.covariance_model.curvature
 
     @property
     def by_relief(self) -> Array:
         """Errors of the values (k + scene,) if image regions lie off the plane by the spread of depths."""
         each = np.eye(len(self.covariance))[:, None, :]
-        return np.asarray(np.sqrt(self.doubt.by_relief(each)[:, 0, 0]))
+        return np.asarray(np.sqrt(self.covariance_model.propagate_relief(each)[:, 0, 0]))
 
     def std(self, name: str) -> Array:
         """Standard deviations (k,) of a term's values."""
@@ -205,13 +205,13 @@ def _conclude(
 ) -> TrackFit:
     inverse, state, prediction = system.inverse(), system.state, system.look.prediction
     relief = _relief(table, system, inverse, depth_spread)
-    doubt = replace(_doubt(table, system, inverse, blocks), relief=relief)
+    model = replace(_covariance_model(table, system, inverse, blocks), relief=relief)
     stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
     noise_px, directed = table.noise_px[table.pair], isinstance(state.scene, DirectedMotion)
     difference = system.left * noise_px[:, None] if directed else table.second_px - prediction.second_px
     parts = zip((term.name for term in terms), slices(map(len, terms)), strict=True)
     return TrackFit(
-        state.known.profile, state.scene, terms, state.change, doubt.of(np.eye(len(inverse))), doubt,
+        state.known.profile, state.scene, terms, state.change, model.propagate(np.eye(len(inverse))), model,
         float(system.scale), depth_spread,
         difference, system.weight, np.sqrt(system.squared), stretches,
         system.cost(1.0), state.known, prediction.second_s, noise_px,
@@ -222,7 +222,7 @@ def _conclude(
 # ── covariance ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _doubt(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> CovarianceModel:
+def _covariance_model(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> CovarianceModel:
     """Scatter of the points' scores by time blocks and by image regions.
 
     Points of one time block share errors, and points of one image region share relief while the camera keeps moving in

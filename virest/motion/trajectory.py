@@ -81,16 +81,16 @@ class Orientations:
     """(n, 3, 3)."""
 
     def to_world(self, rays: Array) -> Array:
-        """Rays (n, 3) in camera axes, in world axes."""
+        """Rays (n, 3) from camera to world axes."""
         return turned(self.knot, turned(self.since, rays))
 
     def to_camera(self, rays: Array) -> Array:
-        """Rays (n, 3) in world axes, in camera axes."""
+        """Rays (n, 3) from world to camera axes."""
         in_knot = np.einsum("nji,nj->ni", self.knot, rays)
         return np.asarray(np.einsum("nji,nj->ni", self.since, in_knot))
 
     def per_world(self, slopes: Array) -> Array:
-        """Slopes (n, k, 3) by camera axes, as slopes by world axes."""
+        """Slopes (n, k, 3) with respect to camera axes, converted to world axes."""
         return np.asarray(slopes @ np.swapaxes(self.since, -1, -2) @ np.swapaxes(self.knot, -1, -2))
 
 
