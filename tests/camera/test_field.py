@@ -109,7 +109,7 @@ def test_a_profile_with_fields_is_read_as_it_was_written() -> None:
     ("change", "said"),
     [
         ({"kind": "delays"}, "kind"),
-        ({"covariates": ["focus"]}, "covariates are"),
+        ({"covariates": ["focus"]}, "covariates must be"),
         ({"knots": [[0.0, 0.5, 0.5, 0.8, 1.0]]}, "rising knots"),
         ({"values": [[0.0]]}, "1 numbers for each knot"),
         ({"version": 3}, "version"),

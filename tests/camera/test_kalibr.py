@@ -152,7 +152,7 @@ def test_what_is_lost_is_named_in_comments():
     for word in ("k3: 0.031", "clock_skew", "gyro_bias_rad_s", "srgb", "extensions"):
         assert word in said
     plain = comments(format_camchain(PROFILE))
-    assert not any(word in plain for word in ("clock_skew", "gyro_bias_rad_s", "exposure curve", "extensions"))
+    assert not any(word in plain for word in ("clock_skew", "gyro_bias_rad_s", "response curve", "extensions"))
 
 
 def test_unknown_values_are_left_out_and_an_unknown_lens_is_refused():

@@ -46,9 +46,9 @@ FOUND_YAML = {
     "number that Python writes only in part": (PROFILE + b"x: 0x" + b"f" * 5000, "digits"),
     "key that Python writes only in part": (b"0x" + b"f" * 5000 + b": 1", "digits"),
     "number of base 60 beyond a float": (b"x: 1" + b":1" * 400 + b".5", "digits"),
-    "tag for true or false": (b"x: !!bool y", "of the kind that it is written as"),
-    "tag for a number, of nothing": (b'x: !!int ""', "of the kind that it is written as"),
-    "tag for a time": (b"x: !!timestamp soon", "of the kind that it is written as"),
+    "tag for true or false": (b"x: !!bool y", "does not match its form"),
+    "tag for a number, of nothing": (b'x: !!int ""', "does not match its form"),
+    "tag for a time": (b"x: !!timestamp soon", "does not match its form"),
     "axes beyond a float's square": (
         PROFILE + b"imu: {T_cam_imu: [[1e+200,1e+200,0,0],[1e+200,-1e+200,0,0],[0,0,1,0]]}",
         "is too large",

@@ -258,7 +258,7 @@ def test_edge_epochs_with_repeated_block(tmp_path):
     [
         ("", "is empty"),
         ("\n\n", "is empty"),
-        ("userId,movieId,rating\n1,2,3\n", "no header of gyro_accel.csv"),
+        ("userId,movieId,rating\n1,2,3\n", "not a header of gyro_accel.csv"),
         (METADATA_HEADERS["v1"][0] + "\n", "movie_metadata.csv, not of gyro_accel.csv.*swapped"),
         ("Frame timestamp[nanosec]\n1\n", "frame_timestamps.txt"),
         (GYRO_TIGHT + "\n", "0 usable of 0 rows"),

@@ -176,7 +176,7 @@ def test_accelerations_without_gravity_are_not_used(tmp_path: Path) -> None:
 def test_a_damaged_matrix_is_one_line(tmp_path: Path) -> None:
     """Text, or the intrinsics of another picture, are refused."""
     folder = write_scan(tmp_path / "scan", 1.0)
-    for text, says in (("one, two\n", "not a 3 x 3 matrix"), ("9e4,0,1\n0,9e4,1\n0,0,1\n", "none of a 128x96")):
+    for text, says in (("one, two\n", "not a 3 x 3 matrix"), ("9e4,0,1\n0,9e4,1\n0,0,1\n", "do not fit a 128x96")):
         (folder / "camera_matrix.csv").write_text(text)
         with pytest.raises(CaptureError, match=says):
             read_capture(folder)

@@ -123,7 +123,7 @@ def test_16_bits_keep_their_fractions(tmp_path: Path) -> None:
         ("file,exposure_s\np0.png,0\n", "'0'"),
         ("file,exposure_s\np0.png,soon\n", "'soon'"),
         ("file,exposure_s\np0.png,1,2\n", "line 2: 3 values"),
-        ("file,exposure_s\np0.png,1\np0.png,2\n", "line 3: p0.png comes twice"),
+        ("file,exposure_s\np0.png,1\np0.png,2\n", "line 3: p0.png is listed twice"),
         ("file,exposure_s\n" + "x" * 10_000 + ",1\n", "line 2: 10002 characters"),
         ("file,exposure_s\np0.png,\0\n", "NUL"),
     ],

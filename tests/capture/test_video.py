@@ -259,7 +259,7 @@ def test_absurd_size_is_refused(movie, monkeypatch):
 def test_pipe_and_folder_do_not_hang(tmp_path):
     """A named pipe or a folder in the movie's place is refused at once."""
     os.mkfifo(tmp_path / "movie.mp4")
-    with pytest.raises(VideoError, match="no regular file"):
+    with pytest.raises(VideoError, match="not a regular file"):
         probe_movie(tmp_path / "movie.mp4")
     with pytest.raises(VideoError, match="is a folder"):
         probe_movie(tmp_path)

@@ -289,15 +289,15 @@ def test_what_cancels_in_a_combination_is_not_doubted() -> None:
     """Two values whose errors cancel in their sum; a correction of one alone must not come back in it."""
     together = np.array([[1.0, -1.0], [-1.0, 1.0]])
     by_region = np.array([[3.0, -3.0], [-3.0, 3.0]])
-    doubt = CovarianceModel(1e-6 * np.eye(2), together, by_region, np.zeros((2, 2)), relief=np.array([[0.5, -0.5]]))
-    each = doubt.of(np.eye(2))
+    model = CovarianceModel(1e-6 * np.eye(2), together, by_region, np.zeros((2, 2)), relief=np.array([[0.5, -0.5]]))
+    each = model.propagate(np.eye(2))
     np.testing.assert_allclose(np.diag(each), 4.0)
     total = np.array([[1.0, 1.0]])
-    np.testing.assert_allclose(doubt.of(total), 2e-6)
-    np.testing.assert_allclose(doubt.by_relief(total), 0.0, atol=1e-12)
-    np.testing.assert_allclose(doubt.by_relief(np.array([[1.0, 0.0]])), 0.25)
-    lopsided = replace(doubt, by_region=np.diag([3.0, -1.0]))
-    np.testing.assert_allclose(np.diag(lopsided.of(np.eye(2))), [4.0, 1.0])
+    np.testing.assert_allclose(model.propagate(total), 2e-6)
+    np.testing.assert_allclose(model.propagate_relief(total), 0.0, atol=1e-12)
+    np.testing.assert_allclose(model.propagate_relief(np.array([[1.0, 0.0]])), 0.25)
+    lopsided = replace(model, by_region=np.diag([3.0, -1.0]))
+    np.testing.assert_allclose(np.diag(lopsided.propagate(np.eye(2))), [4.0, 1.0])
 
 
 # ── points that coding draws to the blocks above ─────────────────────────────────────────────────────────────────

@@ -116,9 +116,9 @@ def test_a_profile_that_is_a_little_off_does_not_pass_for_parallax() -> None:
 STILL = {"sway_m": 0.0, "seed": 6}
 STEADY = Sway(**STILL, velocity_m_s=(0.5, -0.2, 0.3))  # type: ignore[arg-type]
 REFUSED: dict[str, tuple[Sway, str]] = {
-    "still camera": (Sway(**STILL, rate_rad_s=1e-3), "no parallax"),  # type: ignore[arg-type]
-    "pure rotation": (Sway(**STILL), "no parallax"),  # type: ignore[arg-type]
-    "far away": (Sway(depth_m=150.0), "no parallax"),
+    "still camera": (Sway(**STILL, rate_rad_s=1e-3), "too little parallax"),  # type: ignore[arg-type]
+    "pure rotation": (Sway(**STILL), "too little parallax"),  # type: ignore[arg-type]
+    "far away": (Sway(depth_m=150.0), "too little parallax"),
     "no accelerometer": (Sway(accelerometer=False), "no accelerometer"),
 }
 

@@ -1,16 +1,16 @@
-"""Fields: smooth corrections of the model along recorded covariates, for effects that have no name of their own.
+"""Fields: smooth corrections of the model along recorded covariates, for effects without a name of their own.
 
-A field is given by its values at knots; between them runs the interpolating cubic spline (of lower degree below four
-knots; straight lines for a blur, which must not swing below 0), and beyond the first and last knot the end values hold.
-Two covariates make a tensor product.  Six kinds:
+A field has values at knots, interpolated by a cubic spline (of lower degree below four knots; linearly for a blur,
+which must not fall below 0) and constant beyond the first and last knot.  Two covariates form a tensor product.  Six
+kinds:
 
-- ``delay`` (s): a row starts this much later than an even readout has it, or a frame than its stamp (camera clock); of
-  row and time, the time is that of the frame's first row.
-- ``displacement`` (px): a point is seen this far from where the lens puts it.
-- ``scale`` (1): the focal length is longer by this part; over the radius, for points that are seen there.
-- ``gain`` (1): at this place more light, by this part, reaches the sensor.
-- ``blur`` (px): the standard deviation of a Gaussian on the light, beside an even defocus.
-- ``rate`` (rad/s, IMU axes): the true rate is larger than the gyroscope's, less bias and over scale.
+- ``delay`` (s): delay of a row relative to an even readout, or of a frame relative to its timestamp (camera clock);
+  with row and time, the time is that of the frame's first row.
+- ``displacement`` (px): displacement of a point from where the lens model puts it.
+- ``scale`` (1): relative increase of the focal length; over the radius, for points seen there.
+- ``gain`` (1): relative increase of the light at a position of the sensor.
+- ``blur`` (px): standard deviation of a Gaussian on the light, in addition to a uniform defocus.
+- ``rate`` (rad/s, IMU axes): true rate minus the gyroscope's, after correction for bias and scale.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
 }
 """Unit, number of components and possible covariates of each kind."""
 UNITS = {"row": "1", "radius": "px", "x": "px", "y": "px", "time": "s", "focus": "1/m", "focal": "1"}
-"""Of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``radius``: from
-the principal point; ``focal``: logged focal length over its median."""
+"""Units of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``radius``:
+from the principal point; ``focal``: logged focal length over its median."""
 TIMED_BY_IMU = ("scale", "rate")
-"""Kinds whose times are the inertial log's; the others' are the camera's."""
+"""Kinds whose times are on the IMU clock; those of the others are on the camera clock."""
 _FIXED_POINT_STEPS = 5
-"""A displacement's slope is a few per cent: each step of its inversion shrinks the error by that factor."""
+"""A displacement's slope is a few percent: each step of its inversion reduces the error by that factor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,43 +55,43 @@ class Field:
     """A key of KINDS."""
     covariates: tuple[str, ...]
     knots: tuple[tuple[float, ...], ...]
-    """Rising, one list for each covariate, in its unit."""
+    """Rising, one list per covariate, in its unit."""
     values: tuple[tuple[float, ...], ...]
-    """(knots, components); of two covariates the second runs fastest."""
+    """(knots, components); with two covariates the second varies fastest."""
     std: tuple[tuple[float, ...], ...] = ()
     """Standard deviations of the values; empty: unknown."""
     stamp_0_ns: int | None = None
-    """First stamp of the only capture that the field holds for; None: it belongs to the phone."""
+    """First timestamp of the only capture to which the field applies; None: it belongs to the phone."""
     log: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Times (camera clock) and values of a logged covariate in the capture at hand; in no file."""
+    """Times (camera clock) and values of a logged covariate in the current capture; not stored in files."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise SettingsError(f"field kind '{self.kind}' is not known", hint=f"use one of {', '.join(KINDS)}")
+            raise SettingsError(f"unknown field kind '{self.kind}'", hint=f"use one of {', '.join(KINDS)}")
         _, parts, allowed = KINDS[self.kind]
         if self.covariates not in allowed:
             known = " or ".join("(" + ", ".join(names) + ")" for names in allowed)
-            raise SettingsError(f"field {self.kind}: covariates are {known}, not {', '.join(self.covariates)}")
+            raise SettingsError(f"field {self.kind}: covariates must be {known}, not {', '.join(self.covariates)}")
         if len(self.knots) != len(self.covariates) or any(len(k) < 2 or np.any(np.diff(k) <= 0) for k in self.knots):
             raise SettingsError(f"field {self.kind}: needs two or more rising knots for each covariate")
         for name, rows in (("values", self.values), ("std", self.std or self.values)):
             if self.kind == "blur" and any(value < 0 for row in rows for value in row):
-                raise SettingsError(f"field blur: {name} are 0 or more")
+                raise SettingsError(f"field blur: {name} must be 0 or more")
             if len(rows) != np.prod([len(k) for k in self.knots]) or any(len(row) != parts for row in rows):
                 raise SettingsError(f"field {self.kind}: {name} must have {parts} numbers for each knot")
 
     @property
     def unit(self) -> str:
-        """Of the values."""
+        """Unit of the values."""
         return KINDS[self.kind][0]
 
     @property
     def belongs_to_one_capture(self) -> bool:
-        """Whether it holds for the capture alone that it was found in."""
+        """Whether it applies only to the capture in which it was found."""
         return self.stamp_0_ns is not None
 
     def at(self, *covariates: Any) -> Array:
-        """Values (..., components) where the covariates are (...) each."""
+        """Values (..., components) at covariates of shape (...) each."""
         table = np.array(self.values)
         if len(self.knots) == 1:
             return interpolated(self.knots[0], table, covariates[0], 1 if self.kind == "blur" else 3)
@@ -101,7 +101,7 @@ class Field:
         return np.asarray((weights[..., None] * interpolated(self.knots[1], by_first, second)).sum(axis=-2))
 
     def at_time(self, time_s: Any, *first: Any) -> Array:
-        """Values (..., components) of a field over time, or over what is logged, at times (...) of its own clock.
+        """Values (..., components) of a field over time, or over a logged covariate, at times (...) on its own clock.
 
         first: the first of two covariates.
         """
@@ -109,7 +109,7 @@ class Field:
         return self.at(*first, time_s if self.log is None else np.interp(time_s, *self.log))
 
     def undisplaced(self, points_px: Array) -> Array:
-        """Where points seen at pixels (..., 2) would be without a displacement: q + u(q) = p."""
+        """Positions without displacement of points seen at pixels (..., 2): q + u(q) = p."""
         points_px = np.asarray(points_px, float)
         found = points_px
         for _ in range(_FIXED_POINT_STEPS):
@@ -117,18 +117,18 @@ class Field:
         return found
 
     def moved(self, across_px: float, down_px: float) -> Field:
-        """A field over the picture, of a picture that begins this much further right and down."""
+        """A field over the picture for a crop that starts this much further right and down."""
         x, y = (tuple(k - by for k in knots) for knots, by in zip(self.knots, (across_px, down_px), strict=True))
         return replace(self, knots=(x, y))
 
     @property
     def is_pair(self) -> bool:
-        """Whether it is over two covariates that are not a place in the picture: version 2 of the file's entries."""
+        """Whether it has two covariates other than x and y: version 2 of the file's entries."""
         return len(self.covariates) > 1 and self.covariates != ("x", "y")
 
     @property
     def is_single(self) -> bool:
-        """Whether a profile holds one such field at most."""
+        """Whether a profile may hold at most one such field."""
         return self.kind == "displacement" or (self.kind, self.covariates) == ("delay", ("row",))
 
     def with_times(self, clock: Callable[[float], float]) -> Field:
@@ -144,13 +144,13 @@ class Field:
         return replace(self, values=rows, std=() if std is None else tuple(map(tuple, np.asarray(std).tolist())))
 
     def rounded(self, digits: int = 5) -> Field:
-        """The field rounded to a number of significant digits, as it is written."""
+        """The field rounded to a number of significant digits, as in files."""
         rows = (tuple(tuple(float(f"{v:.{digits}g}") for v in row) for row in part) for part in (self.values, self.std))
         values, std = rows
         return replace(self, values=values, std=std)
 
     def is_in_place_of(self, other: Field) -> bool:
-        """Whether two fields are the same but for their values."""
+        """Whether two fields differ only in their values."""
         return (self.kind, self.covariates, self.knots) == (other.kind, other.covariates, other.knots)
 
     def later(self, seconds: float) -> Field:
@@ -161,7 +161,7 @@ class Field:
 
 
 def interpolated(knots: tuple[float, ...], values: Array, covariate: Any, degree: int = 3) -> Array:
-    """The interpolating spline through values (knots, ...) where a covariate is (...); held beyond its ends."""
+    """Spline through values (knots, ...) at a covariate of shape (...); constant beyond its ends."""
     held = np.clip(np.asarray(covariate, float), knots[0], knots[-1])
     cardinal = _cardinal(knots, degree)
     along = np.tensordot(cardinal.c, values, axes=1)
@@ -169,7 +169,7 @@ def interpolated(knots: tuple[float, ...], values: Array, covariate: Any, degree
 
 
 def cardinal_weights(knots: tuple[float, ...], covariate: Any, degree: int = 3) -> Array:
-    """What each knot's value counts (..., knots) in the interpolating spline where a covariate is (...)."""
+    """Weights (..., knots) of the knots' values in the interpolating spline at a covariate of shape (...)."""
     held = np.clip(np.asarray(covariate, float), knots[0], knots[-1])
     return np.asarray(_cardinal(knots, degree)(held))
 

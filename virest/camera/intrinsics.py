@@ -1,4 +1,4 @@
-"""The lens: how a ray in camera axes becomes a pixel, and back.
+"""The lens: projection of rays in camera axes to pixels, and back.
 
 Camera axes: x right, y down, z forward.  Pixel (0, 0) is the centre of the top-left pixel.
 Distortion models are OpenCV's: ``radtan`` (Brown 1971; k1 k2 p1 p2 k3) and ``fisheye``
@@ -24,7 +24,7 @@ COEFFICIENT_NAMES: dict[str, tuple[str, ...]] = {
 _UNDISTORT_STEPS = 12
 _RAY_TOLERANCE = 1e-9
 _WITHIN_FOLD = 1e-2
-"""Part of the radius at which a picture folds back by which rays are kept inside: there Newton's method still ends."""
+"""Relative distance kept from the radius at which the distortion folds back, so that Newton's method converges."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,12 @@ class Intrinsics:
     coefficients: tuple[float, ...] = ()
     """In the order of COEFFICIENT_NAMES."""
     displaced: Field | None = None
-    """How far points lie from where the model puts them; None: the model holds."""
+    """Displacement of points from the model; None: none."""
 
     def __post_init__(self) -> None:
         if self.model not in COEFFICIENT_NAMES:
             raise SettingsError(
-                f"distortion model '{self.model}' is not known",
+                f"unknown distortion model '{self.model}'",
                 hint=f"use one of {', '.join(COEFFICIENT_NAMES)}",
             )
         if len(self.coefficients) != len(COEFFICIENT_NAMES[self.model]):
@@ -65,7 +65,7 @@ class Intrinsics:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether distortion changes any pixel: the equidistant fisheye does even with zero coefficients."""
+        """Whether distortion moves any pixel; that of the equidistant fisheye does even with zero coefficients."""
         return self.model == "fisheye" or any(self.coefficients) or self.displaced is not None
 
     @property
@@ -115,8 +115,8 @@ class Intrinsics:
     def _undistort(self, distorted: NDArray[np.float64]) -> NDArray[np.float64]:
         """Newton's method on the distortion.
 
-        Beyond the radius at which the picture of a radial lens folds back no ray is seen: what lies there gets the rays
-        just inside, which are finite, and change little with the lens.
+        Beyond the radius at which radial distortion folds back, no ray is seen: pixels there get the rays just inside,
+        which are finite and change little with the lens.
         """
         if self.model != "fisheye" and not any(self.coefficients):
             return distorted
@@ -159,7 +159,7 @@ class Intrinsics:
 
 @lru_cache(maxsize=256)
 def _fold_radius(coefficients: tuple[float, ...]) -> float:
-    """Greatest r (1 + k1 r² + k2 r⁴ + k3 r⁶), units of the focal length, before it falls as r grows; inf: never."""
+    """First maximum of r (1 + k1 r² + k2 r⁴ + k3 r⁶) over r, units of the focal length; inf: none."""
     k1, k2, k3 = (k if abs(k) > _RAY_TOLERANCE else 0.0 for k in (*coefficients[:2], coefficients[4]))
     roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.array([1.0, 3 * k1, 5 * k2, 7 * k3]), "b"))
     squares = [root.real for root in roots if abs(root.imag) < _RAY_TOLERANCE and root.real > 0]

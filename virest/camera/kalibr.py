@@ -1,8 +1,8 @@
 """Kalibr's ``camchain-imucam.yaml`` and ``imu.yaml``, read and written.
 
-Kalibr's conventions are ours where it speaks: ``x_cam = T_cam_imu x_imu`` and ``t_imu = t_cam + timeshift_cam_imu``.
-What it does not know (curve, sideways readout, bias, clock rate) stays unknown when read, and becomes a comment when
-written; ``line_delay_nanoseconds`` of its rolling-shutter calibration is the readout time of one row, top to bottom.
+The conventions agree: ``x_cam = T_cam_imu x_imu`` and ``t_imu = t_cam + timeshift_cam_imu``.  What Kalibr lacks
+(response curve, sideways readout, bias, clock rate) stays unknown when read, and becomes a comment when written;
+``line_delay_nanoseconds`` of its rolling-shutter calibration is the readout time of one row, top to bottom.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ DEFAULT_TOPIC = "/imu0"
 USUAL_GYRO_WALK, USUAL_ACCEL_WALK = 2.2e-6, 8.6e-5
 """Random walks of a phone's inertial sensor (BMI160, Schubert et al., IROS 2018), rad/s²/√Hz and m/s³/√Hz."""
 NOISE_WINDOW = 32
-"""Samples of a window whose liveliness is judged at once."""
+"""Samples per window; windows with the least motion are used."""
 STILLEST_PART = 0.25
 MIN_NOISE_SAMPLES = 2 * NOISE_WINDOW
 DIFFERENCE_ORDER, DIFFERENCE_GAIN = 5, 252.0
-"""Variance of white noise's fifth difference: 1 + 25 + 100 + 100 + 25 + 1. A tremor of 12 Hz at 200 Hz passes with a
-two-thousandth of its amplitude; a lower order lets through as much of it as there is noise."""
+"""Variance gain of the fifth difference for white noise: 1 + 25 + 100 + 100 + 25 + 1.  A tremor of 12 Hz sampled at
+200 Hz passes with 1/2000 of its amplitude; with a lower order as much of it would pass as there is noise."""
 NORMAL_MEDIAN = 0.6745
-WALK_COMMENT = "not measured, which takes hours at rest: a usual value of phones"
+WALK_COMMENT = "not measured, which takes hours at rest: a typical value of phones"
 
 
 @dataclass(frozen=True, slots=True)
 class ImuNoise:
-    """What ``imu.yaml`` holds: continuous-time noise of an inertial sensor. None: unknown."""
+    """The content of ``imu.yaml``: continuous-time noise of an inertial sensor. None: unknown."""
 
     update_rate_hz: float
     gyro_density: float | None
@@ -66,16 +66,16 @@ def is_kalibr(content: dict[str, Any]) -> bool:
 
 
 def parse_camchain(content: dict[str, Any], name: str = "camchain", which: str = "cam0") -> CameraProfile:
-    """A camera of the chain, the first unless told, as a profile; ``name`` is used in messages.
+    """A camera of the chain, by default the first, as a profile; ``name`` is used in messages.
 
-    Raises SettingsError with the key that is missing or not usable.
+    Raises SettingsError with the missing or unusable key.
     """
     camera = content.get(which)
     if not isinstance(camera, dict):
         raise SettingsError(f"{name}: {which} has no keys", hint="is it a Kalibr camchain?")
     if camera.get("camera_model", "pinhole") != "pinhole":
-        said = str(camera["camera_model"])[:40]
-        raise SettingsError(f"{name}: camera_model {said!r}", hint="only pinhole can be read")
+        model = str(camera["camera_model"])[:40]
+        raise SettingsError(f"{name}: camera_model {model!r}", hint="only pinhole is supported")
     width, height = _numbers(camera, "resolution", 2, name)
     fx, fy, cx, cy = _numbers(camera, "intrinsics", 4, name)
     line_delay_ns = camera.get("line_delay_nanoseconds")
@@ -102,9 +102,9 @@ def parse_camchain(content: dict[str, Any], name: str = "camchain", which: str =
 
 
 def parse_imu(content: dict[str, Any], name: str = "imu.yaml") -> ImuNoise:
-    """Read the noise of ``imu.yaml``, as Kalibr takes it (flat) or writes it (below ``imu0``).
+    """Read the noise of ``imu.yaml``, in Kalibr's input form (flat) or output form (below ``imu0``).
 
-    Raises SettingsError with the key that is missing or not usable.
+    Raises SettingsError with the missing or unusable key.
     """
     block = content.get("imu0", content)
     if not isinstance(block, dict):
@@ -126,7 +126,7 @@ def _distortion(camera: dict[str, Any], name: str) -> dict[str, Any]:
     kind = camera.get("distortion_model", "none")
     if not isinstance(kind, str) or kind not in _DISTORTIONS:
         known = ", ".join(_DISTORTIONS)
-        raise SettingsError(f"{name}: distortion_model {str(kind)[:40]!r}", hint=f"one of {known} can be read")
+        raise SettingsError(f"{name}: distortion_model {str(kind)[:40]!r}", hint=f"supported are {known}")
     model, names = _DISTORTIONS[kind]
     values = _numbers(camera, "distortion_coeffs", len(names), name) if names else []
     return {"model": model, **dict(zip(names, values, strict=True))}
@@ -167,12 +167,12 @@ def format_camchain(
     command: str = "calibrate",
     instant_s: float | None = None,
 ) -> str:
-    """Write a profile as a camera chain of one camera; what Kalibr cannot hold is said in comments.
+    """Write a profile as a camera chain of one camera; comments list what Kalibr cannot hold.
 
-    exposure_s: typical logged exposure, for stamps that do not mean its start.  Of a readout that is not top to bottom
-    Kalibr knows nothing: the time shift then is that of the picture's middle row, as for a global shutter.
-    instant_s: for tools that take every picture for one instant, the seconds from its stamp to that; no line delay
-    then.  Raises SettingsError where the focal length is unknown.
+    exposure_s: typical logged exposure, for timestamps that do not mark its start.  Kalibr knows only readouts from top
+    to bottom: for others the time shift is that of the picture's middle row, as for a global shutter.  instant_s: for
+    tools that treat every picture as instantaneous, the seconds from its timestamp to that instant; without a line
+    delay.  Raises SettingsError if the focal length is unknown.
     """
     lens = profile.intrinsics
     if lens is None:
@@ -201,33 +201,34 @@ def format_camchain(
 
 
 def field_notes(profile: CameraProfile, off_px: float) -> list[str]:
-    """Sentences on fields that other tools' files cannot hold; off_px: largest error of the lens that is written."""
-    said = []
+    """Notes on fields that other tools' files cannot hold; off_px: largest error of the written lens."""
+    notes = []
     lens, uneven = profile.intrinsics, profile.shutter.uneven
     if lens is not None and lens.displaced is not None:
-        said.append(f"the displacement over the picture is written as distortion, within {off_px:.2g} px")
+        notes.append(f"the displacement over the picture is written as distortion, within {off_px:.2g} px")
     if uneven is not None:
         late_ms = 1e3 * float(np.abs(uneven.values).max())
-        said.append(f"rows that start up to {late_ms:.2g} ms early or late (a field over the row) are left out")
+        notes.append(f"the rows' uneven start of up to {late_ms:.2g} ms (a field over the row) is left out")
     kinds = {f"{field.kind} over {', '.join(field.covariates)}": 1 for field in profile.extensions.field}
-    return [*said, *(f"the field of {name} is left out" for name in kinds)]
+    return [*notes, *(f"the field of {name} is left out" for name in kinds)]
 
 
 def _one_instant(profile: CameraProfile) -> list[str]:
-    """Sentences on a picture that counts as taken at once."""
-    said = ["timeshift_cam_imu leads to the one instant that a picture stands for, as tools without rows want it"]
+    """Notes on pictures that are treated as instantaneous."""
+    notes = ["timeshift_cam_imu refers to a single instant of each picture, for tools without a rolling shutter"]
     if profile.time_offset_s is None:
-        said = ["the time offset is unknown: no timeshift_cam_imu"]
+        notes = ["the time offset is unknown: no timeshift_cam_imu"]
     if profile.readout_known and profile.shutter.readout_time_s:
         shutter = profile.shutter
-        said.append(f"which is its middle: rows are read {shutter.readout_direction} in {shutter.readout_time_s:.6g} s")
-    return said
+        rows = f"rows are read {shutter.readout_direction} in {shutter.readout_time_s:.6g} s"
+        notes.append(f"the instant is the middle of the picture: {rows}")
+    return notes
 
 
 def format_imu(noise: ImuNoise, command: str = "calibrate") -> str:
     """Write noise as Kalibr's ``imu.yaml``, which needs every value: a typical random walk replaces an unknown one.
 
-    An unknown density is left out with a comment, for Kalibr to ask for it.
+    An unknown density is left out, with a comment, so that Kalibr asks for it.
     """
     entries: list[tuple[str, float | None, str]] = [
         ("accelerometer_noise_density", noise.accel_density, "m/s^2/sqrt(Hz)"),
@@ -237,8 +238,8 @@ def format_imu(noise: ImuNoise, command: str = "calibrate") -> str:
         ("update_rate", noise.update_rate_hz, "Hz"),
     ]
     lines = [
-        f"# Kalibr inertial sensor, written by virest {command}. The densities are those of the stillest quarter of",
-        "# the capture, above a hand's motion: a lower bound where the phone filters its data.",
+        f"# Kalibr inertial sensor, written by virest {command}. The densities are measured in the quarter of the",
+        "# capture with the least motion, above the band of hand motion: a lower bound if the phone filters its data.",
     ]
     for key, value, remark in entries:
         lines.append(f"# {key}: unknown" if value is None else f"{key}: {_digits(value)}  # {remark}")
@@ -263,7 +264,7 @@ def _has_line_delay(profile: CameraProfile) -> bool:
 
 
 def _shift_for_kalibr_s(profile: CameraProfile, exposure_s: float | None) -> float:
-    """Seconds from what our stamp means to the instant that a camera chain's stamp means when we read it back."""
+    """Seconds from the instant that the profile's timestamps mark to the one that a camera chain's are read to mark."""
     shutter = profile.shutter
     to_start_s = float(shutter.first_row_start_s(np.zeros(1), np.array([exposure_s or 0.0]))[0])
     return to_start_s if _has_line_delay(profile) else to_start_s + 0.5 * shutter.readout_time_s
@@ -272,36 +273,36 @@ def _shift_for_kalibr_s(profile: CameraProfile, exposure_s: float | None) -> flo
 def _not_held(
     profile: CameraProfile, coefficients: dict[str, float], names: tuple[str, ...], exposure_s: float | None
 ) -> list[str]:
-    """Sentences on what is lost."""
+    """Notes on what is lost."""
     shutter = profile.shutter
-    said = []
+    notes = []
     if not profile.readout_known:
-        said.append("the readout time is unknown: no line_delay_nanoseconds")
+        notes.append("the readout time is unknown: no line_delay_nanoseconds")
     elif not _has_line_delay(profile):
-        said.append(
+        notes.append(
             f"the rows are read {shutter.readout_direction} in {1e3 * shutter.readout_time_s:.4g} ms, which Kalibr "
             "cannot hold: timeshift_cam_imu is that of the picture's middle, as for a global shutter"
         )
     if profile.time_offset_s is None:
-        said.append("the time offset is unknown: no timeshift_cam_imu")
+        notes.append("the time offset is unknown: no timeshift_cam_imu")
     elif exposure_s is not None:
         middle_ms = 5e2 * float(shutter.true_exposure_s(np.array([exposure_s]))[0])
-        said.append(f"timeshift_cam_imu leads to the start of the exposure; its middle is {middle_ms:.4g} ms later")
+        notes.append(f"timeshift_cam_imu refers to the start of the exposure; its middle is {middle_ms:.4g} ms later")
     elif shutter.timestamp != "exposure_start":
-        said.append(f"stamps mean {shutter.timestamp}, and the exposure is unknown: timeshift_cam_imu is as for them")
-    said += [f"{key}: {value:.6g} is left out" for key, value in coefficients.items() if value and key not in names]
+        notes.append(f"timeshift_cam_imu refers to the timestamps, which mark {shutter.timestamp}; exposure unknown")
+    notes += [f"{key}: {value:.6g} is left out" for key, value in coefficients.items() if value and key not in names]
     lost = {
         "clock_skew": (profile.clock_skew, 0.0),
         "gyro_bias_rad_s": (list(profile.gyro_bias_rad_s), [0.0] * 3),
         "gyro_scale": (list(profile.gyro_scale), [1.0] * 3),
         "exposure_scale": (shutter.exposure_scale, 1.0),
     }
-    said += [f"Kalibr has no {key}: {value}" for key, (value, plain) in lost.items() if value != plain]
+    notes += [f"Kalibr has no {key}: {value}" for key, (value, plain) in lost.items() if value != plain]
     if profile.response is not None:
-        said.append(f"Kalibr has no exposure curve: {profile.response.kind}")
+        notes.append(f"Kalibr has no response curve: {profile.response.kind}")
     if replace(profile.extensions, field=()) != Extensions():
-        said.append("Kalibr has none of the profile's extensions")
-    return said
+        notes.append("Kalibr has none of the profile's extensions")
+    return notes
 
 
 def _commented(lines: list[str]) -> str:
@@ -312,11 +313,11 @@ def _commented(lines: list[str]) -> str:
 
 
 def measure_imu_noise(time_s: Array, gyro_rad_s: Array, accel_m_s2: Array) -> ImuNoise | None:
-    """Measure the noise of samples (n,), (n, 3), (n, 3) that were taken in motion; None where there are too few.
+    """Measure the noise of samples (n,), (n, 3), (n, 3) taken in motion; None for too few samples.
 
-    Model: white noise on a hand's smooth motion.  High differences keep the noise and suppress what is slow; windows
-    are chosen by their motion and not by their noise, so the choice does not bias it.  Too high below 100 Hz.
-    NaN in the accelerometer: its density is unknown.
+    Model: white noise on smooth hand motion.  Fifth differences keep the noise and suppress slow motion; windows are
+    chosen by their motion and not by their noise, so the choice does not bias it.  Too high for sampling rates below
+    100 Hz.  NaN in the accelerometer: its density is unknown.
     """
     if len(time_s) < MIN_NOISE_SAMPLES:
         return None
@@ -332,8 +333,8 @@ def _density(samples: Array, rate_hz: float) -> float | None:
         return None
     windows = samples[: count * NOISE_WINDOW].reshape(count, NOISE_WINDOW, -1)
     smooth = windows.reshape(count, 4, NOISE_WINDOW // 4, -1).mean(axis=2)
-    liveliness = np.square(np.diff(smooth, axis=1)).sum(axis=(1, 2))
-    still = windows[np.argsort(liveliness)[: max(round(STILLEST_PART * count), 1)]]
+    motion = np.square(np.diff(smooth, axis=1)).sum(axis=(1, 2))
+    still = windows[np.argsort(motion)[: max(round(STILLEST_PART * count), 1)]]
     jumps = np.diff(still, n=DIFFERENCE_ORDER, axis=1)
     deviation = np.median(np.abs(jumps), axis=(0, 1)) / NORMAL_MEDIAN / np.sqrt(DIFFERENCE_GAIN)
     density = float(np.sqrt(np.mean(deviation**2) / rate_hz))

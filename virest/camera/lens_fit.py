@@ -1,4 +1,4 @@
-"""The standard lens that is nearest to one with a displacement, for formats that hold no field."""
+"""The standard lens closest to one with a displacement field, for formats without fields."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from virest.camera.intrinsics import Intrinsics
 
 Array = NDArray[np.float64]
 GRID = (25, 19)
-"""Points over the picture that the lenses must agree in: eight numbers of a smooth lens are well held by them."""
+"""Grid over the picture on which the lenses are matched: ample for the eight parameters of a smooth lens."""
 
 
 def standard_lens(lens: Intrinsics) -> tuple[Intrinsics, float]:
-    """The lens without a displacement that sends the same rays to nearly the same pixels, and the largest distance, px.
+    """The lens without a displacement that maps rays to nearly the same pixels, and the largest deviation, px.
 
-    Focal lengths, principal point and coefficients of the lens's own model (``radtan`` for one without distortion; k3
-    only where the lens has one, since few formats hold it) are fitted by least squares over a grid of the picture.  A
-    tangential displacement becomes p1 and p2.
+    Focal lengths, principal point and coefficients of the lens's own model (``radtan`` for a lens without distortion;
+    k3 only if the lens has one, since few formats support it) are fitted by least squares over a grid of the picture.
+    A tangential displacement becomes p1 and p2.
     """
     if lens.displaced is None:
         return lens, 0.0

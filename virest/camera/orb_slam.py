@@ -1,6 +1,6 @@
 """Settings of ORB-SLAM3 (Campos et al., IEEE T-RO 2021) for one camera, with or without an inertial sensor.
 
-Its reader wants the type of each number to be seen: real ones with a point, whole ones without.
+Its reader infers the type of each number: reals need a decimal point, integers must have none.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ VIEWER = {
 def format_orb_slam(
     profile: CameraProfile, rate_hz: float, noise: ImuNoise | None, comments: list[str], command: str = "export"
 ) -> str:
-    """Write settings; noise None or without a density: no inertial block, the camera alone.
+    """Write settings; without noise or one of its densities there is no inertial block, only the camera.
 
-    Raises SettingsError where the focal length is unknown.
+    Raises SettingsError if the focal length is unknown.
     """
     lens = profile.intrinsics
     if lens is None:
@@ -62,7 +62,7 @@ def format_orb_slam(
 
 
 def _inertial(profile: CameraProfile, noise: ImuNoise | None) -> list[str]:
-    """The IMU block: where the camera sits on the inertial sensor, and the sensor's noise."""
+    """The IMU block: the camera's pose on the inertial sensor, and the sensor's noise."""
     if noise is None or not noise.gyro_density or not noise.accel_density:
         return ["# no inertial block: too few samples, or no accelerometer"]
     pose = np.eye(4)
@@ -84,7 +84,7 @@ def _inertial(profile: CameraProfile, noise: ImuNoise | None) -> list[str]:
 
 
 def real(value: float) -> str:
-    """A number with a point in it, ten digits."""
+    """A number with a decimal point and ten significant digits."""
     text = f"{value + 0.0:.10g}"
     mantissa, mark, exponent = text.partition("e")
     return (mantissa if "." in mantissa else f"{mantissa}.0") + mark + exponent

@@ -1,4 +1,4 @@
-"""Readout times of known phones and cameras, each with its source.  A readout holds for one video mode only."""
+"""Readout times of known phones and cameras, each with its source, for a single video mode."""
 
 from __future__ import annotations
 
@@ -70,6 +70,6 @@ READOUTS: tuple[Readout, ...] = (
 
 
 def find_readouts(text: str) -> tuple[Readout, ...]:
-    """Entries whose device's name holds every word of the text, in any case."""
+    """Entries whose device name contains every word of the text, ignoring case."""
     words = text.lower().split()
     return tuple(entry for entry in READOUTS if all(word in entry.device.lower() for word in words))

@@ -1,6 +1,6 @@
 """The camera profile: everything known about one phone, as records.
 
-``None`` means unknown; what can be estimated from a capture then is.  Read and written by
+``None`` means unknown: the value is then estimated from the capture where possible.  Read and written by
 :mod:`virest.camera.profile_file`.
 """
 
@@ -20,14 +20,14 @@ from virest.camera.shutter import Shutter
 from virest.errors import SettingsError
 
 BRIDGE_SLACK_S = 1e-3
-"""A bridge may end this far from its stretch, as either is rounded."""
+"""Largest distance between the ends of a bridge and its stretch, which are rounded separately."""
 ANDROID_R_CAM_IMU = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-"""Stored portrait picture of an Android phone's rear camera against the device axes."""
+"""Rotation from the device axes to the stored portrait picture of an Android phone's rear camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value that was found in data, with what it is worth."""
+    """An estimated value with its standard deviation and source."""
 
     value: float | list[float] | str
     std: float | list[float] | None
@@ -36,7 +36,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Extensions:
-    """What a diagnosis added to the nominal model (contract, section 4); the defaults are off."""
+    """Effects that a diagnosis added to the nominal model (contract, section 4); off by default."""
 
     focal_drift_per_s: float = 0.0
     stabilisation_fraction: float = 0.0
@@ -52,14 +52,14 @@ class Extensions:
     gyro_lowpass_hz: float = 0.0
     """Cutoff of the gyroscope's own low pass (:mod:`virest.camera.gyro_filter`); 0: none."""
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
-    """θ about x and y with which the inertial log begins; fitted on the way, and in no file: it is soon forgotten."""
+    """θ about x and y at the start of the inertial log; fitted but not stored in files: its effect decays soon."""
     field: tuple[ModelField, ...] = ()
-    """Fields of kind ``scale`` and ``rate``; the shutter and the lens hold theirs."""
+    """Fields other than those that the shutter and the lens hold."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraProfile:
-    """One phone. ``None`` stands for unknown."""
+    """One phone's camera and IMU. ``None``: unknown."""
 
     width: int
     height: int
@@ -68,7 +68,7 @@ class CameraProfile:
     """None while the focal length is unknown."""
     shutter: Shutter = field(default_factory=Shutter)
     readout_known: bool = True
-    """False where the profile says ``readout_time_s: null``; the shutter then holds 0."""
+    """False if the profile has ``readout_time_s: null``; the shutter then holds 0."""
     r_cam_imu: tuple[tuple[float, ...], ...] = ANDROID_R_CAM_IMU
     """Rotation, x_cam = r_cam_imu @ x_imu."""
     p_cam_imu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ class CameraProfile:
     gyro_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """measured = scale x true + bias."""
     response: ResponseCurve | None = None
-    """None while unknown; sRGB then stands in, with a warning. Holds the extensions response_gamma, black_level."""
+    """None: unknown; sRGB is then used, with a warning. Holds the extensions response_gamma and black_level."""
     sensor_width_mm: float | None = None
     sensor_height_mm: float | None = None
     focal_length_mm: float | None = None
@@ -92,7 +92,7 @@ class CameraProfile:
     imu_untrusted_stamp_0_ns: int | None = None
     """First stamp of the only capture that these stretches belong to; None: any."""
     lens_shape: Intrinsics | None = None
-    """Principal point and distortion where these are known and the focal length is not: its focal length is nominal."""
+    """Principal point and distortion if known without the focal length; its own focal length is nominal."""
 
     @property
     def fields(self) -> tuple[ModelField, ...]:
@@ -103,22 +103,22 @@ class CameraProfile:
 
     @property
     def unbridged_s(self) -> tuple[tuple[float, float], ...]:
-        """Untrusted stretches of the inertial log that no field of the rate over their time bridges."""
+        """Untrusted stretches of the inertial log that no field of the rate over time bridges."""
         return tuple(span for span in self.imu_untrusted_s if not self.bridges(*span))
 
     def bridges(self, from_s: float, to_s: float) -> bool:
-        """Whether a field of the rate over time bridges just this stretch of the inertial log."""
+        """Whether a field of the rate over time bridges exactly this stretch of the inertial log."""
         knots = [f.knots[0] for f in self.extensions.field if f.kind == "rate" and f.covariates == ("time",)]
         return any(max(abs(k[0] - from_s), abs(k[-1] - to_s)) < BRIDGE_SLACK_S for k in knots)
 
     def with_fields(self, fields: Sequence[ModelField]) -> CameraProfile:
-        """The profile with these fields and no others. Raises SettingsError for two of a kind of which one is held."""
+        """The profile with exactly these fields. Raises SettingsError for two fields of a kind that must be unique."""
         held: dict[str, list[ModelField]] = {"delay": [], "displacement": [], "": []}
         for entry in fields:
             held[entry.kind if entry.is_single else ""].append(entry)
         if max(len(held["delay"]), len(held["displacement"])) > 1:
             raise SettingsError(
-                "extensions.field: one delay over the row and one displacement at most", hint="add their values up"
+                "extensions.field: at most one delay over the row and one displacement", hint="add up their values"
             )
         uneven, displaced = (next(iter(held[kind]), None) for kind in ("delay", "displacement"))
         lens = self.intrinsics
@@ -153,7 +153,7 @@ class CameraProfile:
 
     @property
     def _wanders(self) -> list[ModelField]:
-        """Delays over time alone: of whole frames."""
+        """Fields of delay over time alone, which apply to whole frames."""
         return [f for f in self.extensions.field if (f.kind, f.covariates) == ("delay", ("time",))]
 
     def _late_s(self, camera_time_s: Any) -> Any:
@@ -161,7 +161,7 @@ class CameraProfile:
         return sum(late) if late else 0.0
 
     def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:
-        """The profile with fields changed and the change's origin noted."""
+        """The profile with changes, recorded as an estimate with its source."""
         return replace(self, estimates={**self.estimates, name: Estimate(value, std, source)}, **changes)
 
     def with_focal(self, focal_px: float, std_px: float, source: str) -> CameraProfile:
@@ -169,7 +169,7 @@ class CameraProfile:
         return self.with_estimate("fx_px", focal_px, std_px, source, intrinsics=self.lens_of(focal_px))
 
     def lens_of(self, fx_px: float, fy_px: float | None = None) -> Intrinsics:
-        """A lens of this focal length; principal point and distortion as known, or the middle and none."""
+        """A lens of this focal length, with the known principal point and distortion, or the centre and none."""
         fy_px = fx_px if fy_px is None else fy_px
         if self.lens_shape is not None:
             return replace(self.lens_shape, fx_px=fx_px, fy_px=fy_px)

@@ -1,4 +1,4 @@
-"""The profile as a YAML file (contract, section 3): read strictly, and written."""
+"""Read (strictly) and write the profile as a YAML file (contract, section 3)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfi
 
 
 def require_usable(profile: CameraProfile, name: str = "profile") -> None:
-    """Hold a profile that was built in memory to what a file must keep. Raises SettingsError with the key."""
+    """Check that a profile built in memory satisfies the limits of a file. Raises SettingsError with the key."""
     parse_profile(profile_mapping(profile), name)
 
 
@@ -127,7 +127,7 @@ def _intrinsics(model: ProfileFile, width: int, height: int) -> Intrinsics | Non
 
 
 def _lens_shape(model: ProfileFile) -> Intrinsics | None:
-    """Principal point and distortion as stated, of a nominal focal length; None where nothing is."""
+    """The stated principal point and distortion, with a nominal focal length; None if none is stated."""
     lens, size = model.intrinsics, float(max(model.image.width, model.image.height))
     shape = _lens(model, size, size)
     return shape if lens.cx_px is not None or lens.cy_px is not None or any(shape.coefficients) else None
@@ -183,7 +183,7 @@ def response_block(curve: ResponseCurve) -> dict[str, Any]:
 
 
 def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
-    """The profile as the plain mapping that YAML and JSON take; infinity becomes the text ``inf``."""
+    """The profile as a plain mapping for YAML and JSON; infinity becomes the text ``inf``."""
     lens, ext = profile.intrinsics, profile.extensions
     distortion: Any = "none"
     shape = lens or profile.lens_shape
@@ -220,8 +220,9 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         extensions["defocus"] = {"sigma_px": ext.defocus_sigma_px}
     if ext.gyro_lowpass_hz:
         extensions["gyro_lowpass_hz"] = ext.gyro_lowpass_hz
+    # a field over the logged focal length belongs to the capture, not to the file
     if own := [entry for entry in profile.fields if entry.covariates != ("focal",)]:
-        extensions["field"] = [_field_block(entry) for entry in own]  # what the capture's log says stays there
+        extensions["field"] = [_field_block(entry) for entry in own]
     stretches: dict[str, Any] = {}
     if profile.imu_untrusted_s:
         stretches["imu_untrusted_s"] = [list(stretch) for stretch in profile.imu_untrusted_s]

@@ -1,4 +1,4 @@
-"""What a profile file may hold: its keys, their types and limits."""
+"""The schema of a profile file: its keys, their types and limits."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from virest.camera.intrinsics import COEFFICIENT_NAMES
 
 MAX_SIDE_PX = 20_000
 LARGEST = 1e12
-"""No value of a profile is larger: between clocks of different epochs lie 2e9 s.  Far beyond, products overflow."""
+"""Upper bound of any value of a profile: clocks of different epochs differ by 2e9 s.  Far larger products overflow."""
 
 
 def _number(value: Any) -> Any:
-    """YAML 1.1 reads 1e-3 as text; accept it, and refuse what is no finite number (inf only where asked for)."""
+    """Accept 1e-3, which YAML 1.1 reads as text; refuse what is not a finite number (inf only where allowed)."""
     if isinstance(value, bool):
         raise ValueError("is true or false, not a number")
     if isinstance(value, str):
@@ -42,7 +42,7 @@ class _Strict(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _unknown_is_as_absent(cls, values: Any) -> Any:
-        """``null`` under a known key, a block's or a value's, means unknown, as if the key were not there."""
+        """``null`` under a known key, of a block or a value, means unknown, as if the key were absent."""
         if not isinstance(values, dict):
             return values
         return {key: value for key, value in values.items() if value is not None or key not in cls.model_fields}
@@ -103,17 +103,17 @@ class _Imu(_Strict):
         if len(self.T_cam_imu) not in (3, 4) or any(len(row) != 4 for row in self.T_cam_imu):
             raise ValueError("T_cam_imu must be 4 rows of 4 numbers")
         rotation = np.array(self.T_cam_imu)[:3, :3]
-        with np.errstate(over="ignore", invalid="ignore"):  # rows so long that their products are no numbers
+        with np.errstate(over="ignore", invalid="ignore"):  # products of huge entries overflow
             error, determinant = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation)
         if not error <= 1e-2 or determinant < 0:
-            raise ValueError(f"T_cam_imu is no rotation: R Rᵀ is off by {error:.2g}, determinant {determinant:.3g}")
+            raise ValueError(f"T_cam_imu is not a rotation: R Rᵀ is off by {error:.2g}, determinant {determinant:.3g}")
         if len(self.T_cam_imu) == 4 and self.T_cam_imu[3] != [0, 0, 0, 1]:
             raise ValueError("the last row of T_cam_imu must be 0, 0, 0, 1")
         return self
 
 
 class ResponseBlock(_Strict):
-    """The exposure curve."""
+    """The response curve."""
 
     kind: Literal["linear", "srgb", "gamma", "five_segment", "table"]
     gamma: Positive = 2.2
@@ -175,7 +175,7 @@ class FieldBlock(_Strict):
 
 
 class ExtensionsBlock(_Strict):
-    """What a diagnosis added."""
+    """Effects that a diagnosis added."""
 
     focal_drift: _FocalDrift = _FocalDrift()
     stabilisation: _Stabilisation = _Stabilisation()

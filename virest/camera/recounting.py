@@ -1,4 +1,4 @@
-"""A profile for times that are counted anew: from a later stamp, or on the camera's own clock."""
+"""Convert a profile to times counted from a later timestamp, or to the camera's own clock."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from virest.camera.profile import CameraProfile
 
 
 def counted_from(profile: CameraProfile, later_s: float, stamp_ns: int | None) -> CameraProfile:
-    """The profile with its times counted from a stamp this much later on the camera's clock.
+    """The profile with its times counted from a timestamp this much later on the camera's clock.
 
-    ``t_imu − s = (t − s)(1 + skew) + offset`` about another s has the offset ``offset + skew · later``;
-    ``f (1 + drift t)`` about another time has another f and drift, flicker another phase.  What belongs to one capture
-    belongs to the one that begins with the later stamp; None: of that nothing is known.
+    ``t_imu − s = (t − s)(1 + skew) + offset`` for another s has the offset ``offset + skew · later``;
+    ``f (1 + drift t)`` has another f and drift, flicker another phase.  Values of a single capture now belong to the
+    one that starts with the later timestamp stamp_ns; None: unknown.
     """
     extensions, lens = profile.extensions, profile.intrinsics
     drift = extensions.focal_drift_per_s
@@ -39,9 +39,9 @@ def counted_from(profile: CameraProfile, later_s: float, stamp_ns: int | None) -
 
 
 def on_camera_clock(profile: CameraProfile) -> CameraProfile:
-    """The profile of a log whose times were brought to the camera's clock: offset, skew and delays over time are gone.
+    """The profile for a log converted to the camera's clock: without offset, skew and delays over time.
 
-    What drifts, pulses or belongs to stretches of the log is told on that clock.
+    Focal drift, flicker and untrusted stretches of the log are converted to that clock.
     """
 
     def camera_s(imu_s: float) -> float:
@@ -70,7 +70,7 @@ def on_camera_clock(profile: CameraProfile) -> CameraProfile:
 
 
 def _of_longer(field: Field, scale: float) -> Field:
-    """A field of the focal length, as a part of a length that is longer by this factor; other fields as they are."""
+    """A field of the focal length, relative to a length multiplied by this factor; other fields are unchanged."""
     if field.kind != "scale" or scale == 1.0:
         return field
     return field.with_values(np.array(field.values) / scale, np.array(field.std) / scale if field.std else None)

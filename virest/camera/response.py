@@ -1,14 +1,14 @@
-"""The exposure characteristic curve E: exposure -> grey, and its inverse E' (eqs 1, 19-22).
+"""The response curve E: exposure -> grey, and its inverse E' (eqs 1, 19-22).
 
 Both axes run over [0, 1]: grey 1 is level 255; exposure is in the curve's own unit.  Kinds:
 
 - ``linear``, ``srgb`` (IEC 61966-2-1), ``gamma`` (grey = light^(1/gamma));
-- ``five_segment``: the paper's curve A B C D in its kink-free reading, zero below x_a, a quadratic toe, a line,
-  a quadratic shoulder, constant y_d above x_d;
-- ``table``: monotone samples, joined by straight lines.
+- ``five_segment``: the paper's curve A B C D without kinks: zero below x_a, a quadratic toe, a line, a quadratic
+  shoulder, constant y_d above x_d;
+- ``table``: monotone samples, interpolated linearly.
 
-On top of any kind come the two extensions of the contract: ``grey = black + (1 - black) * curve(light)^gamma``.
-Below A and above D nothing can be inverted: those pixels are *censored* (:meth:`ResponseCurve.censored`).
+Two extensions of the contract apply to any kind: ``grey = black + (1 - black) * curve(light)^gamma``.
+Below A and above D the curve has no inverse: those pixels are *censored* (:meth:`ResponseCurve.censored_table`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LEVELS = np.arange(256) / 255.0
 
 @dataclass(frozen=True, slots=True)
 class ResponseCurve:
-    """A monotone exposure curve."""
+    """A monotone response curve."""
 
     kind: str = "srgb"
     gamma: float = 2.2
@@ -38,7 +38,7 @@ class ResponseCurve:
     c: tuple[float, float] = (1.0, 1.0)
     """Of ``five_segment``: end of the line, (x_c, y_c)."""
     y_max: float = 1.0
-    """Of ``five_segment``: y_d, the grey that no light exceeds."""
+    """Of ``five_segment``: y_d, the maximal grey."""
     x: tuple[float, ...] = ()
     """Of ``table``: exposures, rising."""
     y: tuple[float, ...] = ()
@@ -46,14 +46,14 @@ class ResponseCurve:
     extra_gamma: float = 1.0
     """Extension ``response_gamma``: the curve's output raised to this power."""
     black_level: float = 0.0
-    """Extension ``black_level``: grey where there is no light."""
+    """Extension ``black_level``: grey without light."""
 
     def __post_init__(self) -> None:
         _require_curve(self)
 
     @property
     def knots(self) -> tuple[float, float]:
-        """(x_a, x_d) of the five-segment curve: where toe and shoulder end, from slopes that meet at B and C."""
+        """(x_a, x_d) of the five-segment curve: ends of toe and shoulder, from continuous slopes at B and C."""
         slope = (self.c[1] - self.b[1]) / (self.c[0] - self.b[0])
         return self.b[0] - 2 * self.b[1] / slope, self.c[0] + 2 * (self.y_max - self.c[1]) / slope
 
@@ -89,19 +89,19 @@ class ResponseCurve:
     def slope_table(self) -> NDArray[np.float32]:
         """dE/dx in grey levels (of 255) per unit of exposure, at each of the 256 grey levels, (256,).
 
-        Taken over one grey level on both sides, so it stays finite at kinks and ends.
+        A central difference over one grey level on both sides, hence finite at kinks and ends.
         """
         return _slope_table(self).copy()
 
     def censored_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
-        """Which of the 256 grey levels carry no measured light: at or beyond A and D, (256,)."""
+        """Mask (256,) of the grey levels without measured light: at or beyond A and D."""
         clipped = self.clipped_table(margin_levels)
         if self.light_range[0] <= 1e-3:
             return clipped
         return (np.arange(256) <= _end_levels(self)[0] + margin_levels) | clipped
 
     def clipped_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
-        """Which of the 256 grey levels are at or beyond D: light of any strength, (256,)."""
+        """Mask (256,) of the clipped grey levels, at or beyond D, where the light may have any strength."""
         return np.arange(256) >= min(_end_levels(self)[1], 255.0) - margin_levels
 
     def describe(self) -> str:
@@ -127,7 +127,7 @@ def _slope_table(curve: ResponseCurve) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=32)
 def _end_levels(curve: ResponseCurve) -> tuple[float, float]:
-    """Grey levels at both ends of the light that can be told."""
+    """Grey levels at both ends of the invertible range."""
     low, high = (255.0 * float(curve.encode(np.array(end))) for end in curve.light_range)
     return low, high
 
@@ -191,6 +191,6 @@ def _require_curve(curve: ResponseCurve) -> None:
     if curve.kind == "table":
         x, y = np.asarray(curve.x), np.asarray(curve.y)
         if x.size < 2 or x.size != y.size or not (np.all(np.diff(x) > 0) and np.all(np.diff(y) > 0)):
-            refuse("table needs two lists x and y of one length, at least two values, both strictly rising")
+            refuse("table needs lists x and y of equal length, with at least two values, both strictly rising")
         if y[0] < 0 or y[-1] > 1:
             refuse(f"table: y runs from {y[0]:g} to {y[-1]:g}, outside 0 to 1")

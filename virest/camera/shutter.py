@@ -13,7 +13,7 @@ from virest.errors import SettingsError
 
 READOUT_DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
 STAMP_FRACTION = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
-"""Where in the first row's exposure a frame's time stamp lies."""
+"""Fraction of the first row's exposure at which a frame's timestamp lies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +25,11 @@ class Shutter:
     readout_direction: str = "top_to_bottom"
     """In the stored picture; one of READOUT_DIRECTIONS."""
     timestamp: str = "exposure_start"
-    """What a stamp means, of the first row read; a key of STAMP_FRACTION."""
+    """The instant of the first row's exposure that a timestamp marks; a key of STAMP_FRACTION."""
     exposure_scale: float = 1.0
     """True exposure = logged exposure x this."""
     uneven: Field | None = None
-    """By how much later than evenly the rows start; None: they are read evenly."""
+    """Delay of the rows' start relative to an even readout; None: the readout is even."""
 
     def __post_init__(self) -> None:
         if self.readout_direction not in READOUT_DIRECTIONS:
@@ -45,7 +45,7 @@ class Shutter:
     def readout_fraction(self, points_px: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
         """Fraction s of the readout time at which pixels (..., 2) start, 0 for the first row read.
 
-        Not clipped, so it also holds a little outside the picture.
+        Not clipped, so it is also valid slightly outside the picture.
         """
         even = self.row_fraction(points_px, width, height)
         if self.uneven is None or not self.readout_time_s:
@@ -53,7 +53,7 @@ class Shutter:
         return even + self.uneven.at(even)[..., 0] / self.readout_time_s
 
     def row_fraction(self, points_px: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
-        """Place of pixels (..., 2) among the rows, linear, 0 for the first row read."""
+        """Position of pixels (..., 2) among the rows as a fraction, linear, 0 for the first row read."""
         points = np.asarray(points_px, float)
         match self.readout_direction:
             case "top_to_bottom":
@@ -66,10 +66,10 @@ class Shutter:
                 return 1.0 - (points[..., 0] + 1.0) / width
 
     def true_exposure_s(self, logged_exposure_s: Any) -> Any:
-        """The exposure that the sensor really made."""
+        """The sensor's true exposure."""
         return logged_exposure_s * self.exposure_scale
 
     def first_row_start_s(self, stamp_s: Any, logged_exposure_s: Any) -> Any:
-        """Start of the first row's exposure, on the clock of the stamps."""
+        """Start of the first row's exposure, on the timestamps' clock."""
         fraction = STAMP_FRACTION[self.timestamp]
         return stamp_s if fraction == 0.0 else stamp_s - fraction * self.true_exposure_s(logged_exposure_s)

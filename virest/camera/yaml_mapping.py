@@ -1,4 +1,4 @@
-"""YAML files of bounded size as plain mappings, and what is said of a wrong one: the key, and its nearest neighbour."""
+"""YAML files of bounded size as plain mappings, with error messages that name the key and the nearest known one."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from virest.errors import SettingsError
 MAX_PROFILE_BYTES = 1_000_000
 MAX_DEPTH = 20
 OPENCV_HEAD = re.compile(r"\A\ufeff?%YAML:1\.0[^\n]*")
-"""First line of OpenCV's files, which is no YAML directive."""
+"""First line of OpenCV's files, which is not a valid YAML directive."""
 MAX_DIGITS = 250
-"""No number of this many digits, be it hexadecimal or of base 60, is beyond a float or what Python writes out."""
+"""Numbers of up to this many digits, even hexadecimal or in base 60, fit in a float and in what Python prints."""
 NUMERIC = re.compile(r"[-+]?[\d.][\dA-Fa-fxXoO_:.+-]*")
 
 
 def load_yaml_mapping(path: Path) -> dict[str, Any]:
-    """A YAML file whose top level is a mapping, by ``safe_load``, aliases refused. Raises SettingsError."""
+    """Read a YAML file whose top level is a mapping, by ``safe_load``; aliases are refused. Raises SettingsError."""
     try:
         if not path.is_file():
             what = "is not a regular file" if path.exists() else "no such file"
@@ -41,8 +41,8 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
         raise SettingsError(f"{path.name}:{where} is not plain YAML: {problem}", hint="see docs/profile.md") from None
     except (UnicodeDecodeError, RecursionError):
         raise SettingsError(f"{path.name}: is not YAML text", hint="is it a profile?") from None
-    except (ValueError, LookupError, AttributeError, OverflowError):  # of the library, for dates and tagged values
-        text = f"{path.name}: a value is not of the kind that it is written as, such as a date that is none"
+    except (ValueError, LookupError, AttributeError, OverflowError):  # raised by yaml for dates and tagged values
+        text = f"{path.name}: a value does not match its form, such as an impossible date"
         raise SettingsError(text, hint="write plain numbers and words, see docs/profile.md") from None
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}", hint="check the path and its permissions") from None
@@ -52,21 +52,21 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
 
 
 def _require_plain(text: str, name: str) -> None:
-    """Refuse aliases, deep nesting and endless numbers before anything is built of them."""
+    """Refuse aliases, deep nesting and very long numbers before anything is built from them."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
             raise SettingsError(f"{name}: YAML aliases are not accepted", hint="write the values out")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_DIGITS and NUMERIC.fullmatch(event.value):
             shown = f"{event.value[:20]}…"
-            raise SettingsError(f"{name}: {shown} has {len(event.value)} digits", hint=f"at most {MAX_DIGITS} are read")
+            raise SettingsError(f"{name}: {shown} has {len(event.value)} digits", hint=f"at most {MAX_DIGITS} allowed")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
             raise SettingsError(f"{name}: nested more than {MAX_DEPTH} deep", hint="is it a profile?")
 
 
 def _require_keys_once(node: yaml.Node | None, name: str) -> None:
-    """Refuse a key that stands twice in one block: the last would hold, and nobody would know."""
+    """Refuse duplicate keys in a block, of which YAML would silently use the last."""
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
             _require_keys_once(item, name)
@@ -84,7 +84,7 @@ def _require_keys_once(node: yaml.Node | None, name: str) -> None:
 
 
 def explain_validation(error: ValidationError, model: type[BaseModel], name: str) -> SettingsError:
-    """One line for the first fault of a pydantic validation, with the nearest known key for an unknown one."""
+    """One line for the first error of a pydantic validation; for an unknown key, with the nearest known one."""
     first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
     path = _key_path(first)
     where = _printable(".".join(path))
@@ -100,7 +100,7 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
 
 
 def _key_path(fault: Any) -> list[str]:
-    """Where a fault of pydantic lies: its keys, without the names of the forms that pydantic tried between them."""
+    """The keys of a pydantic error's location, without the type names that pydantic inserts."""
     *above, last = map(str, fault["loc"] or ("",))
     forms = ("_", "literal", "function-", "constrained")
     is_key = last and not last.startswith(forms)
@@ -113,7 +113,7 @@ def _printable(text: str) -> str:
 
 
 def _nearest(key: str, known: list[str]) -> str | None:
-    """The known key that is meant: one that begins alike before one that only looks alike."""
+    """The closest known key; a common prefix takes precedence over mere similarity."""
     alike = [k for k in known if k.startswith(key) or key.startswith(k)]
     return next(iter(alike or difflib.get_close_matches(key, known, n=1, cutoff=0.5)), None)
 

@@ -236,7 +236,7 @@ _POINTS = (
         (Parameter("rotation_rad", lambda p, given: by.rotation_between(given, p).tolist(), _each),),
         "imu.T_cam_imu",
         "the rotation between IMU and camera differs from the profile's",
-        "the IMU is rotated against the camera by {rotation_rad} rad",
+        "the IMU-to-camera rotation is off by {rotation_rad} rad",
         Steps(by.rotate_imu, by.rotation_between, (1e-3,) * 3, (0.1,) * 3, (INF,) * 3, SENSOR_TURNED),
         calibrated=Calibrated("rotation_rad", lambda p: None, by.keep_value("r_cam_imu"), 0.01),
     ),

@@ -1,8 +1,8 @@
 """The space-variant blur as an operator: forward and adjoint (Hirsch et al. 2010, doi:10.1109/CVPR.2010.5540158).
 
 g = Σ_r w_r · (k_r ⋆ f): every tile correlates the sharp picture with its own kernel, and windows w_r that sum to one
-blend the results.  f is larger than g by a border on every side, so nothing is circular and nothing is invented: what
-lies outside the picture is unknown, and stays so.
+blend the results.  f is larger than g by a border on every side, so there is no wrap-around and no assumption about the
+scene outside the picture: it stays unknown.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ class TileGrid:
     height: int
     width: int
     tops: tuple[int, ...]
-    """First row of each band of tiles."""
+    """First row of each row of tiles."""
     lefts: tuple[int, ...]
-    """First column of each stack of tiles."""
+    """First column of each column of tiles."""
     side: int
     """Rows and columns of a tile's window."""
     overlap: int
 
     @property
     def centres_px(self) -> NDArray[np.float64]:
-        """(n, 2) middle of each tile's window, x then y, held inside the picture."""
+        """(n, 2) middle of each tile's window, x then y, clipped to the picture."""
         x, y = np.meshgrid(np.array(self.lefts) + (self.side - 1) / 2, np.array(self.tops) + (self.side - 1) / 2)
         return np.stack([np.clip(x, 0, self.width - 1), np.clip(y, 0, self.height - 1)], -1).reshape(-1, 2)
 
@@ -52,7 +52,7 @@ class TileGrid:
 
 @lru_cache(maxsize=24)
 def _windows(grid: TileGrid) -> list[Image]:
-    """The same for every frame of a movie, and one array for all that are alike; not to be written to."""
+    """Shared by all frames of a movie, with one array for identical windows; treat as read-only."""
     rows = _ramps(grid.tops, grid.side, grid.overlap)
     columns = _ramps(grid.lefts, grid.side, grid.overlap)
     windows: dict[tuple[bytes, bytes], Image] = {}
@@ -64,7 +64,7 @@ def _windows(grid: TileGrid) -> list[Image]:
 
 
 def tile_grid(height: int, width: int, side: int, overlap: int) -> TileGrid:
-    """Cover a picture by tiles of ``side`` that overlap by at least ``overlap``; the last ones may reach beyond it."""
+    """Cover a picture by tiles of ``side`` that overlap by ``overlap``; the last ones may extend beyond it."""
     step = side - overlap
     tops = tuple(range(0, max(height - overlap, 1), step))
     lefts = tuple(range(0, max(width - overlap, 1), step))
@@ -86,14 +86,14 @@ def _ramps(starts: tuple[int, ...], side: int, overlap: int) -> list[NDArray[np.
 
 
 def fast_size(at_least: int) -> int:
-    """The next size at which the Fourier transform is quick."""
+    """The next size at which the Fourier transform is fast."""
     return next((size for size in FAST_SIZES if size >= at_least), cv2.getOptimalDFTSize(at_least))
 
 
 class SpaceVariantBlur:
     """g = Σ_r w_r · (k_r ⋆ f) and its adjoint, for float32 pictures.
 
-    f: (height + 2 border, width + 2 border); g: (height, width).  One channel a call.
+    f: (height + 2 border, width + 2 border); g: (height, width).  One channel per call.
     """
 
     def __init__(self, grid: TileGrid, kernels: Image) -> None:
@@ -107,7 +107,7 @@ class SpaceVariantBlur:
         self._transformed, self._moved = np.empty((2, self._size, self._size), np.float32)
 
     def apply(self, sharp: Image) -> Image:
-        """The blurred picture of a sharp one."""
+        """Blur a sharp picture."""
         grid, side, patch, size = self.grid, self.grid.side, self._patch, self._size
         padded = self._padded(sharp, patch)
         blurred = np.zeros((grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
@@ -143,7 +143,7 @@ class SpaceVariantBlur:
         return transforms.forward(buffer)
 
     def _correlate(self, buffer: Image, spectrum: Image, conjugate: bool) -> Image:
-        """Good until the next."""
+        """The result is valid until the next call, which reuses its array."""
         transformed = transforms.forward(buffer, self._transformed)
         product = cv2.mulSpectrums(transformed, spectrum, 0, transformed, conjB=conjugate)
         return transforms.inverse(product, self._moved)

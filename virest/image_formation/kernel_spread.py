@@ -1,10 +1,10 @@
-"""How well kernels are known: the spread of their spectra where the blur path's end is uncertain.
+"""Uncertainty of kernels: variance of their spectra from an uncertain end of the blur path.
 
-A path d(t) that is known up to a + a constant speed, d(t) + a τ(t) with a of covariance C (pixels over the exposure)
-and τ the part of the exposure since the anchor, has a kernel whose spectrum K(f) has a mean and a variance.  The
-expected data term ‖K x − g‖² is then (|E K|² + Var K)|x|² − …: where the phase of K is not known, E K is small beside
-Var K, and nothing is restored.  Var is found exactly at the four points ±√2 σ along the axes of C, which have its mean
-and covariance (Julier & Uhlmann 1997, doi:10.1117/12.280797), and not by a slope, which would grow without bound.
+If a blur path d(t) is known up to a constant speed, d(t) + a τ(t) with a of covariance C (pixels over the exposure) and
+τ the fraction of the exposure since the anchor, then the kernel's spectrum K(f) has a mean and a variance.  The
+expected data term ‖K x − g‖² is (|E K|² + Var K)|x|² − …: where the phase of K is unknown, E K is small relative to
+Var K, and nothing is restored.  Var K is evaluated at the four points ±√2 σ along the axes of C, which reproduce its
+mean and covariance (Julier & Uhlmann 1997, doi:10.1117/12.280797); a linearisation would grow without bound.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from scipy import fft
 from virest.image_formation.kernels import KernelField
 
 Array = NDArray[np.float64]
-PLACES = 3
-"""Places each way at which the spread is looked at; it changes as slowly over a picture as the motion does."""
+GRID = 3
+"""Grid points along each side at which the spread is evaluated; it varies over a picture as slowly as the motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class KernelSpread:
-    """Kernels at some places, as they would be with the path's end moved."""
+    """Kernels at grid points, for displaced ends of the blur path."""
 
     fields: tuple[KernelField, ...]
-    """One for each of the points."""
+    """One per displacement."""
 
     def scaled(self, scale: float) -> KernelSpread:
         """The same in a picture ``scale`` times as large."""
         return KernelSpread(tuple(field.scaled(scale) for field in self.fields))
 
     def variance(self, size: int, scale: float = 1.0) -> NDArray[np.float32]:
-        """Var K over half a spectrum (size, size / 2 + 1), mean over the places; of a picture ``scale`` times as large.
+        """Var K over half a spectrum (size, size / 2 + 1), mean over the grid; for a picture ``scale`` times as large.
 
-        |K|² of a kernel of radius r has an autocorrelation of radius 2 r, so 4 r + 1 frequencies per axis
-        determine it: only these are computed, the others are interpolated exactly.
+        |K|² of a kernel of radius r has an autocorrelation of radius 2 r, so 4 r + 1 frequencies per axis determine it:
+        only these are computed, the others are interpolated exactly.
         """
         fields = [field.scaled(scale) for field in self.fields]
         radius = min(max(field.radius_px for field in fields), (size - 1) // 2)
@@ -56,11 +56,11 @@ class KernelSpread:
 def kernel_spread(
     field: Callable[[Array], KernelField], width: int, height: int, covariance_px2: Array
 ) -> KernelSpread | None:
-    """The spread of a picture's kernels; None where the covariance (2, 2) of the path's end is nil."""
+    """The spread of a picture's kernels; None if the covariance (2, 2) of the path's end is zero."""
     variances, axes = np.linalg.eigh(covariance_px2)
     if variances.max() <= 0:
         return None
-    x, y = ((np.arange(PLACES) + 0.5) * length / PLACES for length in (width, height))
+    x, y = ((np.arange(GRID) + 0.5) * length / GRID for length in (width, height))
     at = field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
     samples = at.paths_px.shape[1]
     since = ((np.arange(samples) + 0.5) / samples - at.anchor)[:, None]

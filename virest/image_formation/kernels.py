@@ -1,7 +1,7 @@
 """Blur paths and kernels (eqs 3, 12-18; forward_model, sections 5 and 6).
 
-The sharp picture f that restoration looks for shows each row at its *anchor*, a fixed part of its own exposure.
-What pixel p gathers during its row's exposure lies in f along a path:  g(p) = mean over t of f(p + d(p, t)).
+The sharp picture f that restoration estimates shows each row at its *anchor*, a fixed fraction of its exposure.
+Pixel p integrates f along its blur path during the row's exposure:  g(p) = mean over t of f(p + d(p, t)).
 A kernel is that path splatted onto the pixel grid; g is the *correlation* of f with it.
 """
 
@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 SAMPLES_PER_PX = 2.0
 MIN_SAMPLES = 16
 NODE_STEP_S = 2e-3
-"""Instants at which a path is worked out, with a cubic spline between: at 100 Hz off by 0.7 % of the vibration."""
+"""Spacing of a path's computed instants, with a cubic spline between: errs by 0.7 % of a vibration at 100 Hz."""
 MIN_NODES = 8
 ACROSS_PX, MIN_KNOTS = 160, 5
-"""Knots of splines over the picture: largest spacing in pixels, and least number each way."""
+"""Knots of splines over the picture: largest spacing in pixels, and smallest number along each side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,32 +37,33 @@ class KernelField:
     """One blur kernel per tile."""
 
     centres_px: Array
-    """(n, 2) where each kernel holds exactly."""
+    """(n, 2) pixels at which each kernel is exact."""
     paths_px: Array
-    """(n, m, 2) displacement d into the anchored picture, at m instants evenly over the exposure."""
+    """(n, m, 2) displacement d into the anchored picture, at m instants evenly spaced over the exposure."""
     anchor: float
-    """Part of the exposure that the sharp picture shows."""
+    """Fraction of the exposure at which the sharp picture shows each row."""
     light: Array | None = None
-    """(n, m) relative brightness of the light at those instants; None: even."""
+    """(n, m) relative brightness of the light at those instants; None: constant."""
     defocus_sigma_px: Array | float = 0.0
-    """Standard deviation of a Gaussian that comes on top of the paths: (n,), or of all."""
+    """Standard deviation of an additional Gaussian, (n,) or common to all."""
 
     @property
     def radius_px(self) -> int:
-        """Half size of an array that holds every kernel with its splatting margin."""
+        """Half size of an array that contains every kernel with its splatting margin."""
         reach_px = np.abs(self.paths_px).max(initial=0.0) + 3.5 * np.max(self.defocus_sigma_px, initial=0.0)
         return int(np.ceil(reach_px)) + 2
 
     @property
     def length_px(self) -> Array:
-        """(n,) length of each path, along it."""
+        """(n,) arc length of each path."""
         return np.linalg.norm(np.diff(self.paths_px, axis=1), axis=-1).sum(axis=1)
 
     def arrays(self, radius_px: int | None = None, positive: bool = False) -> NDArray[np.float32]:
         """Kernels (n, 2r + 1, 2r + 1), each summing to 1, indexed [row, column] with d = 0 in the middle.
 
         Splatted by cubic convolution (Keys 1981, doi:10.1109/TASSP.1981.1163711), whose spectrum stays flat where
-        bilinear splatting would blur by another 0.4 px; ``positive`` takes the bilinear one, for methods that need it.
+        bilinear splatting would blur by another 0.4 px; ``positive`` uses bilinear splatting, for methods that need
+        non-negative kernels.
         """
         taps = _linear_taps if positive else _cubic_taps
         kernels = splat_paths(self.paths_px, radius_px or self.radius_px, taps, self.light)
@@ -81,7 +82,7 @@ class KernelField:
 
 
 def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inverse_depth: Any = None) -> KernelField:
-    """Blur paths of the tiles centred at pixels (n, 2), exact to the rows' own times on both sides.
+    """Blur paths of tiles centred at pixels (n, 2), with the rows' own times in both pictures.
 
     inverse_depth: (n,) of each tile, 1/m; None: that of the frame's plane.  Flicker and defocus are the profile's.
     """
@@ -89,9 +90,9 @@ def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inve
 
 
 def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], KernelField]:
-    """:func:`kernel_field` of any centres inside the picture, from paths worked out once at the knots of splines.
+    """:func:`kernel_field` for any centres inside the picture, from paths computed once at the knots of splines.
 
-    Before relief paths bend at depth edges, where splines would swing: each is worked out.
+    With relief, paths change at depth edges, where splines would oscillate: each path is then computed.
     """
     if motion.translation is not None and motion.translation.relief is not None:
         return lambda centres_px: kernel_field(motion, centres_px, anchor)
@@ -100,7 +101,7 @@ def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], Ke
 
 
 def splined_nodes(motion: RowMotion, nodes: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """Path nodes (n, k, 2) of any centres (n, 2) inside the picture, by splines over a few at which they are found.
+    """Path nodes (n, k, 2) for any centres (n, 2) inside the picture, by splines over a few computed ones.
 
     A knot for every ACROSS_PX pixels, and for every NODE_STEP_S of the readout.
     """
@@ -147,7 +148,7 @@ def field_along(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: f
 
 @lru_cache(maxsize=8)
 def _spline(length: int, knots: int) -> CubicSpline:
-    """Weights of evenly spaced knots from the first pixel to the last, as functions of the place."""
+    """Weights of evenly spaced knots from the first pixel to the last, as functions of the position."""
     return CubicSpline(np.linspace(0.0, length - 1.0, knots), np.eye(knots))
 
 
@@ -161,7 +162,7 @@ def _light(motion: RowMotion, centres_px: Array, samples: int) -> Array | None:
 
 @lru_cache(maxsize=64)
 def _between(count: int, samples: int) -> Array:
-    """Weights (samples, count) of a cubic spline's evenly spaced nodes in the middles of ``samples`` equal pieces."""
+    """Weights (samples, count) of a cubic spline's evenly spaced nodes at the middles of ``samples`` equal pieces."""
     middles = (np.arange(samples) + 0.5) / samples
     return np.asarray(CubicSpline(np.linspace(0.0, 1.0, count), np.eye(count))(middles))
 
@@ -182,7 +183,7 @@ def angle_and_length(chords_px: Array) -> tuple[Array, Array]:
 
 
 def splat_paths(paths_px: Array, radius_px: int, taps: Any, light: Array | None = None) -> NDArray[np.float32]:
-    """Paths (n, m, 2), with the light (n, m) at their instants, as arrays (n, 2r + 1, 2r + 1) whose sums are 1."""
+    """Splat paths (n, m, 2), with the light (n, m) at their instants, into arrays (n, 2r + 1, 2r + 1) of sum 1."""
     count, samples, _ = paths_px.shape
     size = 2 * radius_px + 1
     base = np.floor(paths_px).astype(np.intp)
@@ -199,7 +200,7 @@ def splat_paths(paths_px: Array, radius_px: int, taps: Any, light: Array | None 
 
 
 def _defocused(kernels: NDArray[np.float32], sigma_px: Array | float) -> NDArray[np.float32]:
-    """Kernels (n, k, k) with a Gaussian on top, of (n,) or one size; light outside the arrays is none."""
+    """Kernels (n, k, k) convolved with Gaussians of (n,) or one common size, zero outside the arrays."""
     blurred = [
         cv2.GaussianBlur(kernel, (0, 0), float(sigma), borderType=cv2.BORDER_CONSTANT) if sigma else kernel
         for kernel, sigma in zip(kernels, np.broadcast_to(sigma_px, len(kernels)), strict=True)

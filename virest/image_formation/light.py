@@ -1,8 +1,9 @@
-"""How bright: flicker over the rows and vignetting over the picture (contract, section 4).
+"""Brightness: flicker over the rows and vignetting over the picture (contract, section 4).
 
-Light is what reaches the sensor, before the curve.  Flicker: light × (1 + amplitude sin(2π frequency t + phase)) at
-every instant t of an exposure, IMU clock from stamp_0.  Vignetting: light × (1 − corner_loss (r / r_corner)²) about
-the picture's centre.  A gain common to a whole frame goes through every linear step unchanged and is not undone.
+Light is what reaches the sensor, before the response curve.  Flicker: light × (1 + amplitude sin(2π frequency t +
+phase)) at every instant t of an exposure, IMU clock from stamp_0.  Vignetting: light × (1 − corner_loss (r /
+r_corner)²) about the picture's centre.  A gain common to a whole frame commutes with every linear step and is not
+undone.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from virest.image_formation.warp import grid_filled, straightened_points
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 LEAST_LIGHT = 0.05
-"""Less than this part of the light is not brought back: it would be noise."""
+"""Smallest fraction of the light that is compensated; below it mostly noise would be amplified."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +31,14 @@ class FrameLight:
     """Factors on the light of one frame, (height, width) each."""
 
     recorded: Image
-    """What each pixel's light was multiplied by when it was recorded."""
+    """Flicker times vignetting of each recorded pixel."""
     vignetting: Image
-    """The part of it that belongs to the place in the picture."""
+    """Vignetting of each recorded pixel."""
     kept: Image
-    """Vignetting of the place to which straightening takes each recorded pixel."""
+    """Vignetting at the position to which rolling-shutter correction moves each recorded pixel."""
 
     def evened(self, light: Image, clipped: Image | None) -> Image:
-        """The light of a channel without flicker and vignetting; clipped light is not darkened for a bright row."""
+        """The light of a channel without flicker and vignetting; clipped light is not darkened in bright rows."""
         even = light / self.recorded
         if clipped is None:
             return even
@@ -45,12 +46,12 @@ class FrameLight:
 
     @property
     def most_change(self) -> float:
-        """Greatest relative change of light between what was recorded and what the restored picture shows."""
+        """Largest relative change of light from the recorded to the restored picture."""
         return float(np.abs(self.kept / self.recorded - 1).max())
 
 
 def frame_light(motion: RowMotion, anchor: float, straighten: bool) -> FrameLight | None:
-    """The factors of one frame, whose rows are seen at their anchor; None where the profile knows of none."""
+    """The factors of one frame, with rows at their anchor; None if the profile has neither flicker nor vignetting."""
     extensions = motion.profile.extensions
     shaded = bool(extensions.vignetting_corner_loss or light_maps(motion.profile))
     if not extensions.flicker_amplitude and not shaded:
@@ -66,7 +67,7 @@ def frame_light(motion: RowMotion, anchor: float, straighten: bool) -> FrameLigh
 
 
 def _along_readout(profile: CameraProfile) -> Array:
-    """One pixel of each row (height, 1, 2), or of each column (1, width, 2) where columns are read."""
+    """One pixel of each row (height, 1, 2), or of each column (1, width, 2) if columns are read."""
     if profile.shutter.reads_columns:
         x, y = np.meshgrid(np.arange(profile.width, dtype=float), [0.0])
     else:
@@ -75,7 +76,7 @@ def _along_readout(profile: CameraProfile) -> Array:
 
 
 def flicker(profile: CameraProfile, middle_s: Any, lasting_s: Any = 0.0) -> Array:
-    """Mean factor on the light (...) over spans of ``lasting_s``, one or (...), about times (...)."""
+    """Mean factor on the light (...) over spans of ``lasting_s``, one or (...), around times (...)."""
     extensions = profile.extensions
     # the mean of a sine over a span is the sine at its middle times sin(x) / x of half the span
     amplitude = extensions.flicker_amplitude * np.sinc(extensions.flicker_frequency_hz * lasting_s)
@@ -89,7 +90,7 @@ def row_light(motion: RowMotion, points_px: Array) -> Array:
 
 
 def vignetting(profile: CameraProfile, x_px: Any, y_px: Any) -> Any:
-    """Part of the light that is left at pixels (x, y), with the profile's fields of gain; float32 stays float32."""
+    """Fraction of the light that remains at pixels (x, y), with the profile's fields of gain; float32 stays float32."""
     x, y = np.subtract(x_px, 0.5 * (profile.width - 1)), np.subtract(y_px, 0.5 * (profile.height - 1))
     corner_squared = 0.25 * (profile.width**2 + profile.height**2)
     left = _left(profile.extensions.vignetting_corner_loss / corner_squared, x * x + y * y)
@@ -114,9 +115,9 @@ def _left(loss: float, radius_squared: Any) -> Any:
 
 
 def defocus_px(profile: CameraProfile, points_px: Array) -> Array:
-    """Standard deviation (...) of the Gaussian that the lens lays over the light at pixels (..., 2) of one frame.
+    """Standard deviation (...) of the lens's Gaussian blur at pixels (..., 2) of one frame.
 
-    The variances of an even defocus and of fields over the distance from the principal point add up.
+    The variances of a uniform defocus and of fields over the distance from the principal point add up.
     """
     lens, middle = profile.intrinsics, ((profile.width - 1) / 2, (profile.height - 1) / 2)
     radius_px = np.linalg.norm(points_px - np.array(middle if lens is None else (lens.cx_px, lens.cy_px)), axis=-1)
@@ -125,13 +126,13 @@ def defocus_px(profile: CameraProfile, points_px: Array) -> Array:
 
 
 def most_defocus_px(profile: CameraProfile) -> float:
-    """The same where it is largest."""
+    """Largest standard deviation of the lens's Gaussian blur in the picture."""
     largest = [max(value for (value,) in field.values) for field in _softness(profile)]
     return float(np.hypot.reduce([profile.extensions.defocus_sigma_px, *largest]))
 
 
 def equivalent_length_px(length_px: Any, defocus_px: Any) -> Any:
-    """Length (...) of an even path that spreads light as much as a path of ``length_px`` and a defocus together."""
+    """Length (...) of a uniform path with the variance of a path of ``length_px`` and a defocus together."""
     return np.hypot(length_px, np.sqrt(12.0) * defocus_px)
 
 

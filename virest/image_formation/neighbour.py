@@ -1,9 +1,9 @@
-"""A neighbour of a frame, seen from the frame: where its pixels lie in the frame's picture, and along which paths.
+"""A neighbouring frame relative to a frame: where its pixels lie in the frame's picture, and their blur paths there.
 
-Both frames of a movie look at one scene.  With f the frame's sharp picture, its rows at their anchors, a neighbour's
-pixel q gathers f along a path too: at each instant t of its row's exposure the frame's rows see what it sees at
-another place, p(q, t), by the one map of :mod:`warp` (forward_model, section 5).  So the neighbour's picture, brought
-to the frame's pixels, is a blur of the same f by other kernels.
+Both frames show one scene.  With f the frame's sharp picture, its rows at their anchors, a neighbour's pixel q also
+integrates f along a path: at each instant t of its row's exposure, what it sees lies at p(q, t) in the frame, by the
+one map of :mod:`warp` (forward_model, section 5).  So the neighbour's picture, warped to the frame's pixels, is a blur
+of the same f by other kernels.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from virest.motion.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 STEP_RAD = 1e-5
-"""Of numerical slopes: a hundredth of a pixel."""
+"""Step of numerical slopes: about 0.01 px."""
 
 
 @dataclass(frozen=True, slots=True)
 class NeighbourView:
-    """Two frames' rows under one motion: poses are those of the frame, about its reference time."""
+    """Two frames' rows under one motion: poses are relative to the frame's reference time."""
 
     frame: RowMotion
     """With the frame's row clock."""
     neighbour: RowMotion
     """The same motion with the neighbour's row clock."""
     anchor: float
-    """Part of their exposure at which rows are seen in both pictures."""
+    """Fraction of their exposure at which rows are seen in both pictures."""
 
     def places_px(self, points_px: Array) -> Array:
-        """Where the neighbour recorded what the frame's anchored picture shows at pixels (..., 2)."""
+        """Pixels at which the neighbour recorded what the frame's anchored picture shows at pixels (..., 2)."""
         seen_s = self.frame.row_time_s(points_px, self.anchor)
         return seen_by_rows(self.neighbour, points_px, seen_s, self.anchor, None, PIXELS_WITHIN_PX)
 
     def apart_s(self, points_px: Array) -> Array:
-        """(n,) time from the frame's to the neighbour's view of what the frame shows at pixels (n, 2)."""
+        """(n,) time from the frame's to the neighbour's observation of what the frame shows at pixels (n, 2)."""
         seen_s = self.frame.row_time_s(points_px, self.anchor)
         return self.neighbour.row_time_s(self.places_px(points_px), self.anchor) - seen_s
 
@@ -54,15 +54,15 @@ class NeighbourView:
     def map_px(
         self, moved: Callable[[Array], Array] = lambda points_px: points_px, times: int = 1
     ) -> NDArray[np.float32]:
-        """:meth:`places_px` of every pixel, (height, width, 2), as cv2.remap takes it.
+        """:meth:`places_px` of every pixel, (height, width, 2), as cv2.remap expects it.
 
-        moved: where pixels (..., 2) are looked for instead, a smooth map.  times: of pictures that are smaller.
+        moved: a smooth map applied to pixels (..., 2) first.  times: factor by which the pictures are reduced.
         """
         found = grid_filled(self.frame, lambda points_px: self.places_px(moved(points_px)), times=times)
         return found if times == 1 else (found + np.float32(0.5)) / np.float32(times) - np.float32(0.5)
 
     def field(self) -> Callable[[Array], KernelField]:
-        """Kernels of the neighbour's picture once it is brought to the frame's pixels, at any centres (n, 2)."""
+        """Kernels of the neighbour's picture after warping to the frame's pixels, at any centres (n, 2)."""
 
         def nodes(centres_px: Array) -> Array:
             places = self.places_px(centres_px)
@@ -83,9 +83,9 @@ def neighbour_view(
     anchor: float = 0.5,
     further: FurtherTurn | None = None,
 ) -> NeighbourView:
-    """Look from one frame at another; lens: of the whole trajectory.
+    """The view of one frame from another; lens: for the whole trajectory.
 
-    further: what the trajectory lacks, over both frames.
+    further: rotation that the trajectory lacks, over both frames.
     """
     both = covering_both(frame, neighbour, trajectory, lens)
     if further is not None:
@@ -94,7 +94,7 @@ def neighbour_view(
 
 
 def turn_jacobian_px(motion: RowMotion, points_px: Array) -> Array:
-    """Pixels per radian, (n, 2, 3), by which points (n, 2) move as the camera's axes turn: x' = exp(angle) x."""
+    """Pixels per radian, (n, 2, 3), by which points (n, 2) move under a rotation of the camera: x' = exp(angle) x."""
     rays = motion.optics.rays(points_px, motion.reference_s)
     turned = [rays + STEP_RAD * np.cross(axis, rays) for axis in np.eye(3)]
     here = motion.optics.project(rays, motion.reference_s)

@@ -1,13 +1,13 @@
-"""Where tracked points should be: one model of clock, gyroscope, lens, readout, translation and depth (eqs 4-14, 28).
+"""Prediction of tracked points: one model of clock, gyroscope, lens, readout, translation and depth (eqs 4-14, 28).
 
 A point seen at p₁ in one frame is seen in the next at
 
     p₂ = project(R(t₂)ᵀ (R(t₁) r₁ + (c(t₁) − c(t₂)) ρ)),   r₁ = rays(p₁),
 
 with R, c the camera's orientation and centre in world axes and each t the middle of the exposure of the point's row.
-A point's blurred image sits at the mean of its path, so R is taken as the mean over the exposure, R exp(ω' E²/24).
+A point's blurred image lies at the mean of its blur path, so R is the mean over the exposure, R exp(ω' E²/24).
 ρ is the inverse depth of r₁ on the plane m · X = 1, whose origin is the camera's centre at the window's middle:
-ρ = m · R r₁ / (1 − m · c).  Windows are stretches of a few seconds, each with its own velocity and plane.
+ρ = m · R r₁ / (1 − m · c).  Windows are a few seconds long, each with its own velocity and plane.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from virest.motion.trajectory import Orientations, Trajectory
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 SMALLEST_DEPTH = 0.05
-"""Points are held at least this part of the typical depth before the camera."""
+"""Smallest depth of points in front of the camera, relative to the typical depth."""
 RAY_STEP = 1e-5
 SHIFT_STEP_S = 2e-3
-"""Grid of a stabiliser's path: at 10 rad/s² a straight line over it is off by 5e-6 rad, far below tracking's noise."""
+"""Step of a stabiliser's path: at 10 rad/s² linear interpolation errs by 5e-6 rad, far below the tracking noise."""
 
 
 _PER_POINT = (
@@ -68,7 +68,7 @@ class TrackTable:
     second_px: Array
     """(n, 2)."""
     first_stamp_s: Array
-    """(n,) the frame's stamp from stamp_0, camera clock."""
+    """(n,) the frame's timestamp from stamp_0, camera clock."""
     second_stamp_s: Array
     first_exposure_s: Array
     """(n,) as logged; 0 where unknown."""
@@ -76,7 +76,7 @@ class TrackTable:
     origin_s: Array
     """(windows,) middle of each window, camera clock from stamp_0."""
     noise_px: Array
-    """(pairs,) standard deviation of a tracked step per coordinate, measured without any camera model."""
+    """(pairs,) standard deviation of a tracked step per coordinate, measured without a camera model."""
 
     def __len__(self) -> int:
         return len(self.pair)
@@ -98,7 +98,7 @@ class TrackTable:
 
 @dataclass(frozen=True, slots=True)
 class IntegratedMotion:
-    """What a profile makes of the inertial samples: kept while its gyroscope and lens stay the same."""
+    """Inertial samples integrated with a profile: reusable while its gyroscope and lens parameters stay the same."""
 
     profile: CameraProfile
     trajectory: Trajectory
@@ -109,16 +109,16 @@ class IntegratedMotion:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What the inertial samples say whatever the profile: the work that is done once."""
+    """Results from the inertial samples that do not depend on the profile and are computed once."""
 
     gyro: MeasuredRate
     force: tuple[Array, Array] | None
-    """As :func:`force_at_samples` gives it."""
+    """The result of :func:`force_at_samples`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """When the points were seen and how the camera was turned then: the same for every lens and scene."""
+    """Times of the points' observations and the camera's orientations then: the same for every lens and scene."""
 
     trajectory: Trajectory
     exposure_scale: float
@@ -126,21 +126,21 @@ class Poses:
     """(n,) IMU clock."""
     second_s: Array
     first_exposure_s: Array
-    """(n,) about those times, over which everything that moves is seen at its mean."""
+    """(n,) around those times, over which motion is averaged."""
     second_exposure_s: Array
     before: Orientations
-    """At the first sight."""
+    """At the first observation."""
     after: Orientations
-    """At the second."""
+    """At the second observation."""
 
     def again(self, lens: MovingLens, rays: Array) -> Array:
-        """Pixels (n, 2) at which a lens shows rays (n, 3), camera axes, at the second sight."""
+        """Pixels (n, 2) of rays (n, 3), camera axes, at the second observation."""
         return lens.project(rays, self.second_s, self.second_exposure_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """Rays through the first points with the stabiliser at rest: the same for every motion of one lens."""
+    """Rays through the first points with the stabiliser at rest: the same for every motion of a lens."""
 
     lens: Intrinsics
     rays: Array
@@ -149,7 +149,7 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Points as the model sees them, and how they depend on the scene and on the camera's translation."""
+    """Predicted points, and their dependence on the scene and on the camera's translation."""
 
     second_px: Array
     """(n, 2)."""
@@ -159,27 +159,27 @@ class Prediction:
     slopes: Array | None = None
     """(n, 2, k) change per entry of the motion's vector."""
     moved: Moved | None = None
-    """How the camera moved between the two sights; None without translation."""
+    """The camera's motion between the two observations; None without translation."""
     per_step: Array | None = None
-    """(n, 2, 3) change of second_px per unit of the camera's step over a point's depth, world axes; where asked for."""
+    """(n, 2, 3) change of second_px per unit of the camera's step over a point's depth, world axes; if requested."""
     sights: Sightings | None = None
-    """Through which the first points are seen."""
+    """Rays through the first points."""
 
     @property
     def first_s(self) -> Array:
-        """(n,) when the first points were seen, IMU clock."""
+        """(n,) times of the first points, IMU clock."""
         return self.poses.first_s
 
     @property
     def second_s(self) -> Array:
-        """(n,) when the second points were seen, IMU clock."""
+        """(n,) times of the second points, IMU clock."""
         return self.poses.second_s
 
 
 def ground(
     imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None
 ) -> IntegratedMotion:
-    """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier ground."""
+    """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier call."""
     measured = measured or Measured(measured_rate(imu), force_at_samples(imu) if translation else None)
     trajectory = integrate_gyro(imu, profile, measured.gyro)
     displacement = integrate_accelerometer(imu, profile, trajectory, measured.force) if translation else None
@@ -187,7 +187,7 @@ def ground(
 
 
 def with_profile(known: IntegratedMotion, imu: ImuSamples, profile: CameraProfile) -> IntegratedMotion:
-    """Return the ground for another profile; what does not depend on the change is kept."""
+    """The integrated motion for another profile, reusing everything that the change does not affect."""
     change = touched(known.profile, profile)
     if change.rates:
         return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
@@ -200,7 +200,7 @@ def with_profile(known: IntegratedMotion, imu: ImuSamples, profile: CameraProfil
 
 
 def _turned_about(known: IntegratedMotion, turn: Array) -> IntegratedMotion:
-    """The ground with the camera's axes turned on the IMU, (3, 3): everything in camera and world axes turns along."""
+    """The integrated motion with the camera's axes rotated by (3, 3) on the IMU; world axes rotate with them."""
     way = known.trajectory
     trajectory = Trajectory(way.time_s, turn @ way.rotation_world_cam @ turn.T, turn @ way.rate_polynomials)
     displacement = None if known.displacement is None else known.displacement.turned(turn, trajectory)
@@ -208,7 +208,7 @@ def _turned_about(known: IntegratedMotion, turn: Array) -> IntegratedMotion:
 
 
 def seen_s(profile: CameraProfile, points_px: Array, stamp_s: Array, exposure_s: Array) -> Array:
-    """Middle of the exposure of the points' rows, IMU clock (n,); under pulsing lamps the mean time of the light."""
+    """Middle of the exposure of the points' rows, IMU clock (n,); with flicker, the mean time of the light."""
     middle_s = RowClock(profile).seen_s(points_px, stamp_s, exposure_s)
     if not profile.extensions.flicker_amplitude:
         return middle_s
@@ -216,7 +216,7 @@ def seen_s(profile: CameraProfile, points_px: Array, stamp_s: Array, exposure_s:
 
 
 def pulse_delay_s(profile: CameraProfile, middle_s: Array, exposure_s: Array) -> Array:
-    """How much later than its middle the light of an exposure arrives on the mean, (n,), under pulsing lamps.
+    """Mean delay (n,) of the light relative to the middle of an exposure, with flicker.
 
     Mean of τ over |τ| < E/2 weighted by 1 + a sin(ω(t + τ) + φ): a cos(ωt + φ) (sin x − x cos x) 2/ω² over the light,
     E + a sin(ωt + φ) 2 sin(x)/ω, x = ωE/2.
@@ -239,7 +239,7 @@ def predict(
 ) -> Prediction:
     """Predict the second points (n, 2); scene None: rotation only.
 
-    like: an earlier prediction of the same table; what it shares with this one is not worked out again.
+    like: an earlier prediction of the same table, whose unaffected parts are reused.
     """
     poses, sights = _poses(known, table, like), _sights(known.lens, table, like)
     at_rest = known.lens.rays_at_rest(table.first_px, poses.first_s) if sights is None else sights.rays
@@ -260,9 +260,9 @@ def predict(
 
 
 def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sightings | None:
-    """Rays through the first points where they do not depend on the time, an earlier prediction's if the lens is its.
+    """Rays through the first points, reused from an earlier prediction with the same lens.
 
-    None: the focal length changes.
+    None: the focal length changes, so rays depend on the time.
     """
     if lens.focal_drift_per_s or lens.zoom:
         return None
@@ -278,7 +278,7 @@ def _lens_slope(lens: MovingLens, rays: Array, poses: Poses, expected: Array) ->
 
 
 def _poses(known: IntegratedMotion, table: TrackTable, like: Prediction | None) -> Poses:
-    """Sightings and turns of the points; those of an earlier prediction where they are the same."""
+    """Times and orientations of the points' observations; those of an earlier prediction if they are the same."""
     profile, scale = known.profile, known.profile.shutter.exposure_scale
     first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
     second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
@@ -294,7 +294,7 @@ def _poses(known: IntegratedMotion, table: TrackTable, like: Prediction | None) 
 
 @dataclass(frozen=True, slots=True)
 class Paths:
-    """What the accelerometer knows of the camera's centre at one sight of each point, from its window's middle."""
+    """Parts of the camera's centre at one observation of each point, relative to its window's middle."""
 
     since_s: Array
     """(n,) from the window's middle."""
@@ -318,7 +318,7 @@ class Moved:
     step: Array
     """(n, 3)."""
     paths: tuple[Paths, Paths] | None
-    """At both sights, of a path by the accelerometer."""
+    """At both observations, if the path is from the accelerometer."""
     inverse_depth: Array
     """(n,)."""
     per_entry: Array | None
@@ -382,6 +382,6 @@ def _shared_slopes(each: Array, since: Array, bias: Array, delay: Array) -> Arra
 def centre(
     displacement: Displacement, scene: InertialMotion, velocity: Array, time_s: Array, origin_s: Array
 ) -> tuple[Array, Array, Array]:
-    """Camera centre (n, 3) from its place at origin_s, world axes, and its changes per bias (n, 3, 3), delay (n, 3)."""
+    """Camera centre (n, 3) relative to origin_s, world axes, and its changes per bias (n, 3, 3), delay (n, 3)."""
     path = Paths(time_s - origin_s, *displacement.at(time_s, origin_s))
     return path.centre(scene, velocity), path.per_bias, path.per_delay

@@ -1,8 +1,8 @@
-"""The row clock: when a row of a frame gathers light (forward_model, section 1).
+"""The row clock: when a row of a frame is exposed (forward_model, section 1).
 
-A row that starts at the fraction s of the readout, 0 for the first row read, is exposed to the share h of its exposure
-at t = t_first_row + s · readout + h · exposure.  t_first_row comes from the frame's stamp, through the clock offset
-and skew; readout and true exposure last as long as the profile says, in seconds of the IMU's clock.
+A row that starts at the fraction s of the readout, 0 for the first row read, reaches the fraction h of its exposure
+at t = t_first_row + s · readout + h · exposure.  t_first_row follows from the frame's timestamp by the clock offset and
+skew; readout and true exposure are the profile's, in seconds of the IMU clock.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from virest.camera.profile import CameraProfile
 
 Array = NDArray[np.float64]
 ROW_START, ROW_MIDDLE, ROW_END = 0.0, 0.5, 1.0
-"""Shares of an exposure."""
+"""Fractions of an exposure."""
 ROWS = np.linspace(0.0, 1.0, 41)
-"""Fractions at which one frame's delays are told: as many knots as a field over rows may have."""
+"""Fractions of the readout at which one frame's delays are tabulated: the most knots of a field over rows."""
 
 
 def row_time_s(
     first_row_s: Any, readout_time_s: Any, readout_fraction: Any, exposure_s: Any = 0.0, exposure_share: Any = 0.0
 ) -> Any:
-    """When rows that start at a fraction of the readout are exposed to a share of their exposure; shapes broadcast.
+    """Time at which rows that start at a fraction of the readout reach a share of their exposure; shapes broadcast.
 
     first_row_s: start of the first row's exposure.  exposure_s: true, not logged.
     """
@@ -34,7 +34,7 @@ def row_time_s(
 
 
 def of_frame(profile: CameraProfile, stamp_s: float, logged_exposure_s: float) -> CameraProfile:
-    """The profile with the readout and the defocus of one frame, where these differ from frame to frame."""
+    """The profile with the readout and defocus of one frame, if these change from frame to frame."""
     blurs = [f for f in profile.extensions.field if f.kind == "blur" and f.covariates != ("radius",)]
     if blurs:
         even = profile.extensions.defocus_sigma_px
@@ -59,21 +59,21 @@ def _changing_rows(profile: CameraProfile) -> list[Field]:
 
 @dataclass(frozen=True, slots=True)
 class RowClock:
-    """The row clock of a profile; an unknown offset counts as 0, an unknown exposure is given as 0.
+    """The row clock of a profile; an unknown offset counts as 0, an unknown exposure is passed as 0.
 
-    All its methods take arrays and floats that broadcast.  Stamps are on the camera's clock, from stamp_0.
+    All methods take arrays and floats that broadcast.  Timestamps are on the camera's clock, from stamp_0.
     """
 
     profile: CameraProfile
 
     def readout_fraction(self, points_px: NDArray[Any]) -> Array:
-        """Fraction (...) of the readout at which the rows through pixels (..., 2) start; rows may be read unevenly."""
+        """Fraction (...) of the readout at which the rows through pixels (..., 2) start; the readout may be uneven."""
         return self.profile.shutter.readout_fraction(points_px, self.profile.width, self.profile.height)
 
     def time_s(
         self, stamp_s: Any, logged_exposure_s: Any, readout_fraction: Any = 0.0, exposure_share: Any = ROW_START
     ) -> Any:
-        """IMU time at which rows that start at a fraction of the readout are exposed to a share of their exposure."""
+        """IMU time at which rows that start at a fraction of the readout reach a share of their exposure."""
         shutter = self.profile.shutter
         begin_s = shutter.first_row_start_s(stamp_s, logged_exposure_s)
         first_row_s = self.profile.imu_time_s(begin_s)
@@ -103,7 +103,7 @@ class RowClock:
 
 
 def right_way_round(profile: CameraProfile) -> CameraProfile:
-    """A negative readout along one sense is a positive one along the other: t₀' = t₀ + r (1 − 1 / rows)."""
+    """Convert a negative readout to a positive one in the opposite direction: t₀' = t₀ + r (1 − 1 / rows)."""
     shutter = profile.shutter
     if shutter.readout_time_s >= 0:
         return profile

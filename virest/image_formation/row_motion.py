@@ -1,4 +1,4 @@
-"""How the camera moved while one frame was taken, row by row (forward_model, sections 1, 2 and 5)."""
+"""The camera's motion during one frame, row by row (forward_model, sections 1, 2 and 5)."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_fr
 
 Array = NDArray[np.float64]
 STEP_S = 2e-4
-"""Grid of the tabulated motion: at 50 rad/s² a straight line over it is off by 2.5e-7 rad."""
+"""Step of the tabulated motion: at 50 rad/s² linear interpolation errs by 2.5e-7 rad."""
 OUTSIDE_FRACTION = 0.25
-"""The table reaches this part of the readout beyond the first and last row, for points outside the picture."""
+"""The table extends this fraction of the readout beyond the first and last row, for points outside the picture."""
 
 _LEAST_DISTANCE = 0.05
-"""The camera never comes nearer to the scene than this part of its distance at the reference time."""
+"""Smallest distance of the camera from the scene, relative to that at the reference time."""
 _RELIEF_STEPS = 3
-"""Where a point lies on the surface depends on its depth: each step shrinks the error by surface's slope × parallax."""
+"""A point's position on the surface depends on its depth: each step reduces the error by the slope × parallax."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTranslation:
-    """How the camera's centre moved while one frame was taken, and what it looked at.
+    """The motion of the camera's centre during one frame, and the scene in front of it.
 
     All in camera axes at the frame's reference time t_ref: the centre is at v (t − t_ref) + ½ a (t − t_ref)².
     """
@@ -42,11 +42,11 @@ class FrameTranslation:
     depth_m: float | None = None
     """At the picture's centre, for the log; None: unknown."""
     source: str = "none"
-    """Where the depth is from: ``triangulated``, ``profile`` or ``none``."""
+    """Source of the depth: ``triangulated``, ``profile`` or ``none``."""
     relief: Relief | None = None
-    """What stands out of the plane, at the reference time; None: nothing is known to."""
+    """Relief on the plane, at the reference time; None: unknown or none."""
     in_metres: bool = True
-    """False: only velocity over depth is known; lengths are in a common unit that no log may call metres."""
+    """False: only velocity over depth is known; lengths have a common unknown unit and must not be logged as metres."""
 
     def position_m(self, since_reference_s: Array) -> Array:
         """Centre (..., 3) at times (...) from the reference."""
@@ -54,7 +54,7 @@ class FrameTranslation:
         return since * (np.asarray(self.velocity_m_s) + 0.5 * since * np.asarray(self.acceleration_m_s2))
 
     def inverse_depth(self, rays: Array) -> Array:
-        """1 / depth (...) along the optical axis at the reference time, of what rays (..., 3), z = 1, meet."""
+        """1 / depth (...) along the optical axis at the reference time, where rays (..., 3), z = 1, meet the scene."""
         plane = rays @ np.asarray(self.inverse_depth_plane, float)
         return np.maximum(plane if self.relief is None else plane + self.relief.at(rays), 0.0)
 
@@ -66,7 +66,7 @@ class FrameTranslation:
 
 @dataclass(frozen=True, slots=True)
 class FurtherTurn:
-    """What the camera sees turns by a further rate, x' = exp(rate · t) x over a short t, beside what is predicted.
+    """An additional rotation rate beyond the predicted motion: x' = exp(rate · t) x over a short t, camera axes.
 
     Linear between instants, constant before and after them.
     """
@@ -77,7 +77,7 @@ class FurtherTurn:
     """(n, 3) about the camera's axes at those instants."""
 
     def since(self, time_s: Array, rotation: Array) -> Array:
-        """Rotation vectors (m, 3), in the axes that ``rotation`` starts from, turned since the first of the instants.
+        """Accumulated rotation vectors (m, 3) since the first instant, in the axes that ``rotation`` starts from.
 
         time_s: (m,) evenly spaced.  rotation: (m, 3, 3) of the predicted motion, to the camera's axes at each.
         """
@@ -89,7 +89,7 @@ class FurtherTurn:
 
 @dataclass(frozen=True, slots=True)
 class RowMotion:
-    """The camera's pose over one frame, against its pose at the reference time.
+    """The camera's pose over one frame, relative to its pose at the reference time.
 
     x_t = R_t_ref x_ref + t_t_ref takes camera coordinates at the reference time to those at time t.
     """
@@ -111,11 +111,11 @@ class RowMotion:
     lens: MovingLens | None = None
     """At every instant of the frame; None: no focal length, no geometry."""
     translation: FrameTranslation | None = None
-    """What translation_m was tabulated from; None: unknown, rotation only."""
+    """The source of translation_m; None: unknown, rotation only."""
 
     @property
     def optics(self) -> MovingLens:
-        """The lens; raises ValueError where there is none."""
+        """The lens; raises ValueError if there is none."""
         if self.lens is None:
             raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
         return self.lens
@@ -131,7 +131,7 @@ class RowMotion:
         return float(row_time_s(self.start_s, self.readout_time_s, 1.0, self.exposure_s, ROW_END))
 
     def row_time_s(self, points_px: Array, exposure_share: Any) -> Array:
-        """When the rows through pixels (..., 2) are exposed to a share of their exposure."""
+        """Time at which the rows through pixels (..., 2) reach a share of their exposure."""
         fraction = RowClock(self.profile).readout_fraction(points_px)
         return np.asarray(row_time_s(self.start_s, self.readout_time_s, fraction, self.exposure_s, exposure_share))
 
@@ -160,10 +160,10 @@ class RowMotion:
         return rotation, t_to - np.squeeze(rotation @ t_from[..., None], -1)
 
     def inverse_depth(self, rays: Array, time_s: Any) -> Array:
-        """1 / depth (...) along the optical axis at times (...) of where rays (..., 3), z = 1, meet the scene.
+        """1 / depth (...) along the optical axis at times (...), where rays (..., 3), z = 1, meet the scene.
 
-        0 without a plane.  n · X = 1 at the reference becomes (R n) · X = 1 + (R n) · t at another time.  With relief
-        the place on the plane is the first guess of where the point is seen at the reference time.
+        0 without a plane.  n · X = 1 at the reference becomes (R n) · X = 1 + (R n) · t at another time.  With relief,
+        the intersection with the plane is the starting point of an iteration.
         """
         rotation, shift = self.pose(time_s)
         if self.translation is None or shift is None:
@@ -180,7 +180,7 @@ class RowMotion:
         return nearness
 
     def turned(self, further: FurtherTurn) -> RowMotion:
-        """The motion with a further turn of the camera, none at the reference time; travel stays as it is."""
+        """The motion with an additional rotation, zero at the reference time; the translation is unchanged."""
         rotation = rotation_from_vector(self.rotation_vector)
         since = further.since(self.time_s, rotation)
         at_reference = np.array([np.interp(self.reference_s, self.time_s, along) for along in since.T])
@@ -206,9 +206,9 @@ def row_motion(
 ) -> RowMotion:
     """Tabulate the motion around one frame.
 
-    stamp_s: the frame's stamp, camera clock from stamp_0.  reference: ``exposure-start`` of the first row read, or
-    ``frame-middle`` = that + readout/2 + exposure/2.  translation: of the camera's centre; None: unknown.  lens: of the
-    whole trajectory, where that is at hand; it is worked out otherwise.
+    stamp_s: the frame's timestamp, camera clock from stamp_0.  reference: ``exposure-start`` of the first row read, or
+    ``frame-middle`` = that + readout/2 + exposure/2.  translation: of the camera's centre; None: unknown.  lens: for
+    the whole trajectory, if available; otherwise it is computed.
     """
     exposure_s = profile.shutter.true_exposure_s(logged_exposure_s or 0.0)
     start_s, reference_s = frame_times_s(profile, stamp_s, logged_exposure_s, reference)
@@ -220,9 +220,9 @@ def row_motion(
 
 
 def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, lens: MovingLens) -> RowMotion:
-    """The motion of one frame, tabulated over the rows of another frame too; its row clock and reference stay.
+    """The motion of one frame, tabulated over the rows of another frame too; its row clock and reference are kept.
 
-    lens: of the whole trajectory.  Travel goes on with the frame's own acceleration.
+    lens: for the whole trajectory.  The translation is extrapolated with the frame's own acceleration.
     """
     span_s = min(motion.start_s, other.start_s), max(motion.end_s, other.end_s)
     return _tabulated(
@@ -232,7 +232,7 @@ def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, l
 
 
 def with_row_clock_of(motion: RowMotion, other: RowMotion) -> RowMotion:
-    """The same motion about the same reference time, its rows read and exposed when another frame's are."""
+    """The same motion and reference time, with the row clock of another frame."""
     return replace(
         motion, start_s=other.start_s, exposure_s=other.exposure_s, readout_time_s=other.readout_time_s,
         profile=other.profile,
@@ -249,7 +249,7 @@ def _tabulated(
     lens: MovingLens | None,
     translation: FrameTranslation | None,
 ) -> RowMotion:
-    """A motion's table over a span, and what points just outside the picture need."""
+    """A motion's table over a span, extended for points just outside the picture."""
     readout_s = profile.shutter.readout_time_s
     first_s = span_s[0] - OUTSIDE_FRACTION * readout_s - STEP_S
     last_s = span_s[1] + OUTSIDE_FRACTION * readout_s + STEP_S

@@ -1,8 +1,8 @@
-"""Fourier transforms of real tiles in OpenCV's packed form, by the library that is faster in this installation.
+"""Fourier transforms of real tiles in OpenCV's packed form, by the faster library of this installation.
 
-OpenCV is faster where its build has Intel's IPP.  Without it (other processors, or switched off) pocketfft takes
-about half of OpenCV's time for tiles of 160 px and more.  The choice follows from the build and the size, never from a
-clock, so all processes of a run choose alike; the results differ by rounding only.  `virest doctor` measures both.
+OpenCV is faster if built with Intel's IPP.  Without it (other processors, or switched off) pocketfft takes about half
+of OpenCV's time for tiles of 160 px or more.  The choice depends on the build and the size, never on timings, so all
+processes of a run agree; the results differ only by rounding.  `virest doctor` measures both.
 
 Packed form ("CCS") of a spectrum with even height and width: columns 1 to width − 2 hold the real and imaginary parts
 of the horizontal frequencies 1 to width / 2 − 1 side by side.  The first and the last column hold frequencies 0 and
@@ -21,10 +21,10 @@ from scipy import fft
 
 Image = NDArray[np.float32]
 Transform = Callable[[Image, Image | None], Image]
-"""A picture or its packed spectrum, (height, width) float32; where to put the result, or None for a new array."""
+"""Takes a picture or its packed spectrum, (height, width) float32, and an output array, or None for a new one."""
 OPENCV, POCKETFFT = "OpenCV", "scipy's pocketfft"
 LEAST_POCKETFFT_PX = 128
-"""Smaller tiles stay with OpenCV: repacking costs what the transform saves (`virest doctor`, both libraries)."""
+"""Smaller tiles use OpenCV, because repacking costs what the transform saves (`virest doctor`, both libraries)."""
 
 
 def opencv_forward(picture: Image, out: Image | None = None) -> Image:
@@ -74,15 +74,15 @@ def library(height: int, width: int) -> str:
 
 
 def in_use() -> str:
-    """Name of the library that transforms large tiles here; with the other one the last bits of a picture differ."""
+    """Name of the library that transforms large tiles here; the other one gives different last bits."""
     return library(LEAST_POCKETFFT_PX, LEAST_POCKETFFT_PX)
 
 
 def forward(picture: Image, out: Image | None = None) -> Image:
-    """Packed spectrum of a picture, (height, width) float32; out: where to put it."""
+    """Packed spectrum of a picture, (height, width) float32; out: array for the result."""
     return (opencv_forward if library(*picture.shape) == OPENCV else pocketfft_forward)(picture, out)
 
 
 def inverse(spectrum: Image, out: Image | None = None) -> Image:
-    """Picture of a packed spectrum, (height, width) float32; out: where to put it."""
+    """Picture of a packed spectrum, (height, width) float32; out: array for the result."""
     return (opencv_inverse if library(*spectrum.shape) == OPENCV else pocketfft_inverse)(spectrum, out)

@@ -1,7 +1,7 @@
-"""A camera that turns, and any of its frames at once: the map of `warp` in one call for many frames.
+"""A rotating camera and any number of its frames: the map of `warp` in one call for many frames.
 
-A :class:`RowMotion` tabulates one frame's motion, travel and depth included.  Here poses come from the trajectory
-itself, and stamps broadcast with the points.  Both are motions for `warp`.
+A :class:`RowMotion` tabulates one frame's motion, with translation and depth.  Here poses come from the trajectory
+directly, and timestamps broadcast with the points.  Both are motions for `warp`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TurningCamera:
     """At every instant of the trajectory."""
 
     def frames(self, stamp_s: Any, exposure_s: Any) -> TurningFrames:
-        """Frames with such stamps and logged exposures; see :class:`TurningFrames`."""
+        """Frames with these timestamps and logged exposures; see :class:`TurningFrames`."""
         return TurningFrames(self, stamp_s, exposure_s)
 
     def frame(self, frame: Frame) -> TurningFrames:
@@ -41,7 +41,7 @@ class TurningCamera:
 
 @dataclass(frozen=True, slots=True)
 class TurningFrames:
-    """Some frames of a turning camera."""
+    """Some frames of a rotating camera."""
 
     camera: TurningCamera
     stamp_s: Any
@@ -56,11 +56,11 @@ class TurningFrames:
 
     @property
     def readout_time_s(self) -> float:
-        """From the first row to the last."""
+        """Readout time of the profile's shutter, s."""
         return self.camera.profile.shutter.readout_time_s
 
     def row_time_s(self, points_px: Array, exposure_share: Any) -> Array:
-        """When the rows through pixels (..., 2) of the frames are exposed to a share of their exposure, IMU clock."""
+        """IMU time at which the rows through pixels (..., 2) of the frames reach a share of their exposure."""
         return RowClock(self.camera.profile).seen_s(points_px, self.stamp_s, self.exposure_s, exposure_share)
 
     def pose(self, time_s: Any) -> tuple[Array, None]:
@@ -73,5 +73,5 @@ class TurningFrames:
 
 
 def turning_camera(trajectory: Trajectory, profile: CameraProfile) -> TurningCamera:
-    """A camera along a trajectory; raises ValueError where the profile has no focal length."""
+    """A camera along a trajectory; raises ValueError if the profile has no focal length."""
     return TurningCamera(profile, trajectory, moving_lens(trajectory, profile))

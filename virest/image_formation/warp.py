@@ -1,8 +1,8 @@
-"""Where points go: the one map p(t) ~ K (R_t_ref K⁻¹ p_ref + t_t_ref / Z) (forward_model, section 5; eqs 23-28).
+"""Motion of image points: the one map p(t) ~ K (R_t_ref K⁻¹ p_ref + t_t_ref / Z) (forward_model, section 5; eqs 23-28).
 
 Rolling shutter, blur paths and the log's corner points are this map between different times.  Points are undistorted
-before it and distorted after it, by the lens as it is at either time.  Depth is along the optical axis where a point is
-seen first, in metres; its inverse 0 means rotation only, and None that of the frame's plane or surface.
+before it and distorted after it, by the lens at the respective time.  Depth is along the optical axis at the first
+time, in metres; an inverse of 0 means rotation only, and None the frame's plane or surface.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from virest.motion.optics import MovingLens
 
 Array = NDArray[np.float64]
 FIXED_POINT_PX = 1e-5
-"""Rows are known well enough once points move less than this."""
+"""The iteration over row times ends when points move less than this."""
 PIXELS_WITHIN_PX = 1e-3
-"""The same where points name pixels of a picture; what is then left is a thirtieth of it."""
+"""The same for positions of a picture's pixels; the remaining error is about 1/30 of it."""
 FIXED_POINT_STEPS = 8
-"""Row times depend on where a point lands; each step shrinks the error about thirtyfold."""
+"""Row times depend on where a point lands; each step reduces the error about 30-fold."""
 CELLS_PER_KNOT, MIN_KNOTS = 3, 12
-"""Cells of a map's grid for each knot of its splines, and least number of knots: one in about 2 ms of a readout."""
+"""Cells of a map's grid per knot of its splines, and smallest number of knots: one in about 2 ms of a readout."""
 
 
 class CameraMotion(Protocol):
-    """What the map asks of a motion: of one frame (`RowMotion`), or of many at once (`TurningFrames`)."""
+    """A motion for the map: of one frame (`RowMotion`), or of many at once (`TurningFrames`)."""
 
     @property
     def optics(self) -> MovingLens:
@@ -39,34 +39,34 @@ class CameraMotion(Protocol):
 
     @property
     def readout_time_s(self) -> float:
-        """From the first row to the last."""
+        """Readout time of the shutter, s."""
 
     def pose(self, time_s: Any) -> tuple[Array, Array | None]:
         """(R (..., 3, 3), t (..., 3) or None) from fixed axes to the camera's at times (...)."""
 
     def row_time_s(self, points_px: Array, exposure_share: Any) -> Array:
-        """When the rows through pixels (..., 2) are exposed to a share of their exposure."""
+        """Time at which the rows through pixels (..., 2) reach a share of their exposure."""
 
     def inverse_depth(self, rays: Array, time_s: Any) -> Array:
-        """1 / depth (...) of what rays (..., 3), z = 1, meet at times (...)."""
+        """1 / depth (...) where rays (..., 3), z = 1, meet the scene at times (...)."""
 
 
 def moved_between(motion: CameraMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = None) -> Array:
-    """Where points seen at pixels (..., 2) at one time are seen at another."""
+    """Pixels (..., 2) at another time of points seen at pixels (..., 2) at one time."""
     return _shown(motion, *_fixed_points(motion, points_px, from_s, inverse_depth), to_s)
 
 
 def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
-    """p_g of eq 28: where points of the recorded picture, (..., 2), belong at the reference time.
+    """p_g of eq 28: positions at the reference time of points of the recorded picture, (..., 2).
 
-    anchor: the part of its exposure at which each row is taken to be seen; 0 its start (the paper), 0.5 its middle.
+    anchor: the fraction of its exposure that stands for each row; 0 its start (the paper), 0.5 its middle.
     """
     seen_s = motion.row_time_s(points_px, anchor)
     return moved_between(motion, points_px, seen_s, motion.reference_s, inverse_depth)
 
 
 def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
-    """The inverse of :func:`straightened_points`: where points of the picture at the reference time were recorded."""
+    """The inverse of :func:`straightened_points`: recorded positions of points of the picture at the reference time."""
     return seen_by_rows(motion, points_px, motion.reference_s, anchor, inverse_depth)
 
 
@@ -78,10 +78,10 @@ def seen_by_rows(
     inverse_depth: Any = None,
     within_px: float = FIXED_POINT_PX,
 ) -> Array:
-    """Where points seen at pixels (..., 2) at time ``at_s`` lie in the picture whose rows are seen at their anchors.
+    """Positions in the picture of anchored rows of points seen at pixels (..., 2) at time ``at_s``.
 
-    A fixed point, since the row that sees a point depends on where it sees it; found once steps are below within_px.
-    Where many frames are seen at once, the motion is that of the frames that see; its poses hold at ``at_s`` too.
+    Found by fixed-point iteration until steps are below within_px, since the row that sees a point depends on its
+    position.  For many frames at once, the motion is that of the target frames; its poses must also cover ``at_s``.
     """
     seen = points_px
     fixed = _fixed_points(motion, points_px, at_s, inverse_depth)
@@ -99,9 +99,9 @@ def corner_points(width: int, height: int) -> Array:
 
 
 def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = None) -> NDArray[np.float32]:
-    """:func:`recorded_points` of every pixel, (height, width, 2) as cv2.remap takes it.
+    """:func:`recorded_points` of every pixel, (height, width, 2), as cv2.remap expects it.
 
-    Computed on a grid and filled in; the map is smooth, so this is off by less than 0.01 px.
+    Computed on a grid and interpolated; the map is smooth, so the error is below 0.01 px.
     """
 
     def recorded(points: Array) -> Array:
@@ -113,12 +113,12 @@ def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_de
 def grid_filled(
     motion: RowMotion, mapping: Callable[[Array], Array], spacing_px: int = 16, times: int = 1
 ) -> NDArray[np.float32]:
-    """A smooth map of pixels, (height, width, 2): worked out at the knots of cubic splines, which give it on a grid.
+    """A smooth map of all pixels, (height, width, 2): computed at knots, by cubic splines on a grid, bilinear between.
 
-    times: at the middles of squares of this many pixels, a divisor of ``spacing_px``; (height // times, ...) of them.
+    times: evaluate at the centres of squares of this side, a divisor of ``spacing_px``; (height // times, ...) of them.
 
-    Straight lines between the grid's nodes are the quickest way to all pixels, splines the one from fewest knots.
-    Before relief a map bends at depth edges, where splines would swing: every node is worked out.
+    Splines need the fewest computed knots; bilinear interpolation is the fastest way from the grid to all pixels.  With
+    relief, a map has kinks at depth edges, where splines would oscillate: every grid node is then computed.
     """
     width, height = motion.profile.width, motion.profile.height
     bent = motion.translation is not None and motion.translation.relief is not None
@@ -132,7 +132,7 @@ def grid_filled(
 
 
 def _nodes(length: int, spacing: int) -> Array:
-    """Middles of cells of ``spacing`` pixels over 0 ... length − 1, and of one more cell on both sides."""
+    """Centres of cells of ``spacing`` pixels over 0 ... length − 1, and of one more cell on each side."""
     cells = np.arange(-1, int(np.ceil(length / spacing)) + 1, dtype=np.float64)
     return (cells + 0.5) * spacing - 0.5
 
@@ -146,7 +146,7 @@ def _all_nodes(length: int, spacing: int) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=8)
 def _knots(length: int, spacing: int) -> tuple[Array, Array]:
-    """Knots (m,) of a spline over :func:`_nodes`, and the weights (nodes, m) that give its values there."""
+    """Knots (m,) of a spline over :func:`_nodes`, and the weights (nodes, m) of its values there."""
     nodes = _nodes(length, spacing)
     count = min(max(MIN_KNOTS, -(-len(nodes) // CELLS_PER_KNOT)), len(nodes))
     knots = np.linspace(nodes[0], nodes[-1], count)

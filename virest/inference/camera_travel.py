@@ -108,7 +108,8 @@ class Stretch:
     def seen_velocity(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
         """Velocity (n, 3) in the camera's axes at stamps (n,), camera clock, and its covariance (n, 3, 3)."""
         velocity, _, slope, _ = self._seen(window, stamp_s)
-        covariance = self.fit.doubt.of(slope) + SHARED_RELIEF**2 * self.fit.doubt.by_relief(slope)
+        model = self.fit.covariance_model
+        covariance = model.propagate(slope) + SHARED_RELIEF**2 * model.propagate_relief(slope)
         scale = ACCEL_SCALE_STD**2 * velocity[:, :, None] * velocity[:, None, :]
         return velocity, covariance + scale + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
 
@@ -120,7 +121,8 @@ class Stretch:
         velocity, nearness, slope, nearness_slope = self._seen(window, stamp_s)
         slope = nearness[:, None, None] * slope + velocity[:, :, None] * nearness_slope[:, None, :]
         floor = self.velocity_floor_m_s[window] * nearness
-        return nearness[:, None] * velocity, self.fit.doubt.of(slope) + (floor**2)[:, None, None] * np.eye(3)
+        covariance = self.fit.covariance_model.propagate(slope) + (floor**2)[:, None, None] * np.eye(3)
+        return nearness[:, None] * velocity, covariance
 
     def _seen(self, window: int, stamp_s: Array) -> tuple[Array, Array, Array, Array]:
         """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the optical axis, and their slopes.
@@ -168,7 +170,8 @@ class Stretch:
     def plane_std_per_m(self, window: int) -> float:
         """Standard deviation of the plane's inverse depth along the optical axis at the window's middle."""
         _, nearness, _, slope = self._seen(window, self.table.origin_s[[window]])
-        return float(np.hypot(np.sqrt(self.fit.doubt.of(slope[:, None, :])[0, 0, 0]), ACCEL_SCALE_STD * nearness[0]))
+        variance = self.fit.covariance_model.propagate(slope[:, None, :])[0, 0, 0]
+        return float(np.hypot(np.sqrt(variance), ACCEL_SCALE_STD * nearness[0]))
 
     def place(self, window: int, time_s: Array) -> Array:
         """Camera's centre (n, 3) from its place at the window's middle, world axes."""

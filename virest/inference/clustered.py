@@ -61,7 +61,7 @@ class CovarianceModel:
     """(regions, k) change of the values if an image region lies off the plane by the spread of depths; None: no relief
     is modelled."""
 
-    def by_relief(self, slope: Array) -> Array:
+    def propagate_relief(self, slope: Array) -> Array:
         """Covariance (..., m, m), from fixed relief, of what changes by slope (..., m, k) per unit of the values.
 
         The error cancels for a camera that moves to and fro, but not for one that keeps moving in one direction.
@@ -71,7 +71,7 @@ class CovarianceModel:
         pulled = slope @ self.relief.T
         return np.asarray(pulled @ np.swapaxes(pulled, -1, -2))
 
-    def of(self, slope: Array) -> Array:
+    def propagate(self, slope: Array) -> Array:
         """Covariance (..., m, m) of quantities that change by slope (..., m, k) per unit of the values.
 
         Errors shared by image regions widen it; no variance is below that of the curvature.

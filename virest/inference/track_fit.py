@@ -1,9 +1,9 @@
-"""Fit a camera profile to tracked points: named terms of the profile, with the scene's motion beside them.
+"""Fit a camera profile to tracked points: named terms of the profile together with the scene's motion.
 
-Each term changes a profile by a small step.  The camera's velocity, gravity, the accelerometer's bias and delay and the
-scene's plane are fitted along where the accelerometer tells a displacement.  Differences are whitened by the noise of
-their pair and, along the parallax, by the spread of depths about the plane; Cauchy weights bear moving objects.
-Covariances come from the scatter between blocks of time, since points of one frame are not independent.
+Each term changes a profile by a small step.  With an accelerometer, the camera's velocity, gravity, the accelerometer's
+bias and delay and the scene's plane are fitted too.  Residuals are whitened by the noise of their pair and, along the
+parallax, by the spread of depths about the plane; Cauchy weights tolerate moving objects.  Covariances come from the
+scatter between time blocks, since points of one frame are not independent.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4
 REGIONS = 5
-"""The picture is divided into this many parts each way: a wall or a ceiling fills some of them."""
+"""Image regions along each side; a wall or a ceiling fills some of them."""
 ONE_DIRECTION = 1.15
-"""One direction of travel for the whole capture stays if it leaves less than this many times what one a pair leaves."""
+"""Use one direction of travel for the whole capture if its residual is below this times that of one per pair."""
 SPREAD_PASSES, SPREAD_TOLERANCE = 3, 0.2
-"""The spread of depths is measured anew after each descent until it changes by less than this part."""
+"""The spread of depths is measured again after each descent until its relative change is below this."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackFit:
-    """A fitted profile with what it leaves."""
+    """A fitted profile with its residuals and covariances."""
 
     profile: CameraProfile
     scene: Motion | None
@@ -67,38 +67,37 @@ class TrackFit:
     """(k,) total change of the terms' values from the starting profile."""
     covariance: Array
     """(k + scene, k + scene): the terms first."""
-    doubt: CovarianceModel
-    """What the covariance is made of, for what is linear in the values."""
+    covariance_model: CovarianceModel
+    """Parts of the covariance, for linear combinations of the values."""
     scale: float
-    """Robust standard deviation of the whitened differences; 1 where the model explains all."""
+    """Robust standard deviation of the whitened residuals; 1 if the model is complete."""
     depth_spread_per_m: float
     """Standard deviation of points' inverse depths about the plane."""
     difference_px: Array
-    """(n, 2) tracked minus predicted; of a directed motion the part across its parallax."""
+    """(n, 2) tracked minus predicted; for a directed motion only the part across its parallax."""
     weight: Array
     """(n,) Cauchy weights, 0 to 1."""
     distance: Array
     """(n,) whitened length of each difference, in standard deviations."""
     stretches: Array
-    """(k,) on how many blocks of time each value of the terms rests: (Σ share)² / Σ share² of its information."""
+    """(k,) effective number of time blocks that inform each value: (Σ share)² / Σ share² of its information."""
     cost: float
-    """Σ of the robust loss over the points, whitened: comparable between fits of one table."""
+    """Σ of the robust loss over the whitened points: comparable between fits of one table."""
     ground: IntegratedMotion
     seconds: Array
-    """(n,) when the second points were seen, IMU clock."""
+    """(n,) times of the second points, IMU clock."""
     noise_px: Array
-    """(n,) of each point's step, per coordinate."""
+    """(n,) noise of each point's step, per coordinate."""
     along_px: Array | None
-    """(n, 2) change of the second points per unit of inverse depth; None where no relief is allowed for."""
+    """(n, 2) change of the second points per unit of inverse depth; None if no relief is modelled."""
     by_coding: Array
-    """(k + scene,) deviations of the values where coding draws points to their neighbours' motion; 0 where covariances
-    were not asked for."""
+    """(k + scene,) errors of the values from block motion prediction (`coded_motion`); 0 without covariances."""
     slices: dict[str, slice] = field(default_factory=dict)
 
     def distance_at(self, depth_spread_per_m: float) -> Array:
-        """Whitened distances (n,) as if points' inverse depths spread by this deviation about the plane.
+        """Whitened residual lengths (n,) for this standard deviation of points' inverse depths about the plane.
 
-        Fits are comparable at one spread only: a wrong plane calls for a wide one, and is then no further off.
+        Fits are comparable only at the same spread: a wrong plane gets a wide spread, which hides its residuals.
         """
         left = self.difference_px / self.noise_px[:, None]
         if self.along_px is None:
@@ -109,7 +108,7 @@ class TrackFit:
         return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
 
     def across_relief_px(self) -> Array:
-        """Differences (n, 2) in px, along the parallax only what the points' spread of depths does not explain."""
+        """Residuals (n, 2), px, reduced along the parallax by the points' spread of depths."""
         if self.along_px is None:
             return self.difference_px
         length, way = lengths_and_ways(self.along_px)
@@ -117,7 +116,7 @@ class TrackFit:
         return self.difference_px - (shrink * (self.difference_px * way).sum(axis=-1))[:, None] * way
 
     def relief_cost(self) -> Array:
-        """What the points' spread of depths costs in the likelihood (n,): the logarithm of their standard deviation."""
+        """Log-likelihood penalty (n,) of the points' spread of depths: the logarithm of their standard deviation."""
         if self.along_px is None:
             return np.zeros(len(self.distance))
         ratio = np.linalg.norm(self.along_px, axis=-1) / self.noise_px
@@ -126,13 +125,13 @@ class TrackFit:
     @property
     def curvature(self) -> Array:
         """The covariance from the curvature alone, as if points were independent."""
-        return self.doubt.curvature
+        return self.covariance_model.curvature
 
     @property
     def by_relief(self) -> Array:
-        """By how much values err (k + scene,) where the picture's parts lie off the plane by the spread of depths."""
+        """Errors of the values (k + scene,) if image regions lie off the plane by the spread of depths."""
         each = np.eye(len(self.covariance))[:, None, :]
-        return np.asarray(np.sqrt(self.doubt.by_relief(each)[:, 0, 0]))
+        return np.asarray(np.sqrt(self.covariance_model.propagate_relief(each)[:, 0, 0]))
 
     def std(self, name: str) -> Array:
         """Standard deviations (k,) of a term's values."""
@@ -147,7 +146,7 @@ class TrackFit:
 def start_scene(
     imu: ImuSamples, known: IntegratedMotion, table: TrackTable, inverse_depth_per_m: float
 ) -> InertialMotion:
-    """Begin at rest before a plane across the first sight, with gravity as the mean specific force says."""
+    """Start at rest in front of a plane across the optical axis, with gravity from the mean specific force."""
     origin = np.asarray(known.profile.imu_time_s(table.origin_s))
     axis = known.trajectory.orientation(origin)[:, :, 2]
     gravity = np.zeros(3)
@@ -173,8 +172,7 @@ def fit_tracks(
 ) -> TrackFit:
     """Gauss-Newton from a profile; scene None: rotation only. Raises ImuError for too few inertial samples.
 
-    covariances: False leaves the last slopes where they were taken: values and differences are the same, covariances
-    are coarse.
+    covariances: False skips re-evaluating the final slopes: values and residuals are the same, covariances are coarse.
     """
     terms = tuple(terms)
     inertial = isinstance(scene, InertialMotion)
@@ -182,7 +180,7 @@ def fit_tracks(
         known = ground(imu, profile, translation=inertial)
     known = with_profile(known, imu, profile)
     if inertial and known.displacement is None:
-        raise ImuError("no accelerometer to tell the camera's path", hint="fit a free motion")
+        raise ImuError("no accelerometer to determine the camera's path", hint="fit a free motion")
     directed = isinstance(scene, DirectedMotion)
     state = State(known, scene, np.zeros(sum(map(len, terms))), ANY_DEPTH if directed else 0.0)
     evidence = TrackEvidence(imu, table, terms, scene)
@@ -207,13 +205,13 @@ def _conclude(
 ) -> TrackFit:
     inverse, state, prediction = system.inverse(), system.state, system.look.prediction
     relief = _relief(table, system, inverse, depth_spread)
-    doubt = replace(_doubt(table, system, inverse, blocks), relief=relief)
+    model = replace(_covariance_model(table, system, inverse, blocks), relief=relief)
     stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
     noise_px, directed = table.noise_px[table.pair], isinstance(state.scene, DirectedMotion)
     difference = system.left * noise_px[:, None] if directed else table.second_px - prediction.second_px
     parts = zip((term.name for term in terms), slices(map(len, terms)), strict=True)
     return TrackFit(
-        state.known.profile, state.scene, terms, state.change, doubt.of(np.eye(len(inverse))), doubt,
+        state.known.profile, state.scene, terms, state.change, model.propagate(np.eye(len(inverse))), model,
         float(system.scale), depth_spread,
         difference, system.weight, np.sqrt(system.squared), stretches,
         system.cost(1.0), state.known, prediction.second_s, noise_px,
@@ -224,26 +222,26 @@ def _conclude(
 # ── covariance ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _doubt(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> CovarianceModel:
-    """Scatter of the points' pull on the values, by blocks of time and by parts of the picture.
+def _covariance_model(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> CovarianceModel:
+    """Scatter of the points' scores by time blocks and by image regions.
 
-    Points of one moment share its errors, and points of one part of the picture share the relief that stands there as
-    long as the camera travels on: S counts both (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
+    Points of one time block share errors, and points of one image region share relief while the camera keeps moving in
+    one direction: S includes both (Cameron, Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
     """
     count = min(blocks, table.n_pairs)
     if count < MIN_BLOCKS or not inverse.size:
         return CovarianceModel(inverse)
     block = even_blocks(table.pair, table.n_pairs, count)
     moved = system.score @ inverse / _true_curvature(system)
-    place = _regions(table.first_px)
-    by_region = scatter(moved, place, about_mean=True) - scatter(moved, block * REGIONS**2 + place, about_mean=True)
+    region = _regions(table.first_px)
+    by_region = scatter(moved, region, about_mean=True) - scatter(moved, block * REGIONS**2 + region, about_mean=True)
     return CovarianceModel(
         inverse, scatter(moved, block, about_mean=True), by_region, inverse @ (system.prior[:, None] * inverse)
     )
 
 
 def _by_coding(evidence: TrackEvidence, system: TrackSystem) -> Array:
-    """What steps that are drawn to the left and upwards do to the values (k,), together."""
+    """Errors of the values (k,) from steps biased towards the left and upper neighbours, combined."""
     table, state, at = evidence.table, system.state, system.look.prediction
     if not system.prior.size:
         return np.zeros(0)
@@ -253,7 +251,7 @@ def _by_coding(evidence: TrackEvidence, system: TrackSystem) -> Array:
 
 
 def _relief(table: TrackTable, system: TrackSystem, inverse: Array, depth_spread: float) -> Array | None:
-    """What depths that are off by their spread in each part of the picture do to the values (places, k)."""
+    """Errors of the values (regions, k) from depths that are off by their spread in each image region."""
     along_px = system.look.prediction.along_px
     if along_px is None or not inverse.size or depth_spread == ANY_DEPTH:
         return None
@@ -261,28 +259,28 @@ def _relief(table: TrackTable, system: TrackSystem, inverse: Array, depth_spread
     ratio = length / table.noise_px[table.pair]
     pull = system.weight / system.scale**2 * ratio / np.sqrt(1 + (depth_spread * ratio) ** 2)
     moved = np.einsum("ni,nik->nk", way, system.rows) @ inverse * pull[:, None]
-    place = _regions(table.first_px)
-    points = np.maximum(np.bincount(place), 1)[:, None]
-    together = np.stack([np.bincount(place, column) for column in moved.T], axis=-1)
+    region = _regions(table.first_px)
+    points = np.maximum(np.bincount(region), 1)[:, None]
+    together = np.stack([np.bincount(region, column) for column in moved.T], axis=-1)
     return np.asarray(depth_spread * np.sqrt(len(table)) * together / np.sqrt(points))
 
 
 def _regions(points_px: Array) -> Index:
-    """Number of the part of the picture (n,) that each point lies in: REGIONS by REGIONS of them."""
+    """Number of each point's image region (n,), of REGIONS by REGIONS."""
     low, high = points_px.min(axis=0), points_px.max(axis=0)
     cell = ((points_px - low) / np.maximum(high - low, 1.0) * REGIONS).astype(np.intp).clip(0, REGIONS - 1)
     return np.asarray(cell[:, 0] * REGIONS + cell[:, 1])
 
 
 def _true_curvature(system: TrackSystem) -> float:
-    """Curvature of the Cauchy loss over that of its weights, which the normal equations take for it."""
+    """Curvature of the Cauchy loss over that of its weights, which the normal equations use instead."""
     ways = 2 if isinstance(system.state.scene, DirectedMotion) else 1
     bent = ways * system.weight**2 * system.squared / (CAUCHY * system.scale) ** 2
     return max(float((system.weight - bent).sum() / max(system.weight.sum(), 1e-12)), 0.3)
 
 
 def _stretches(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> Array:
-    """Effective number of blocks that inform each parameter, (k,): about one where a single moment decides."""
+    """Effective number of blocks that inform each parameter, (k,): about 1 if a single block dominates."""
     count = min(blocks, table.n_pairs)
     if not inverse.size:
         return np.zeros(0)
@@ -297,17 +295,17 @@ def _stretches(table: TrackTable, system: TrackSystem, inverse: Array, blocks: i
 
 
 def one_direction() -> DirectedMotion:
-    """A vehicle: one direction for the whole capture, to be found."""
+    """One unknown direction for the whole capture, as for a vehicle."""
     return DirectedMotion(np.zeros((1, 3)))
 
 
 def many_directions(table: TrackTable) -> DirectedMotion:
-    """A direction for each pair, to be found."""
+    """An unknown direction for each pair."""
     return DirectedMotion(np.zeros((table.n_pairs, 3)))
 
 
 def for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
-    """The motion for a table whose pairs may be others."""
+    """The motion for a table with possibly different pairs."""
     if isinstance(scene, DirectedMotion) and len(scene.direction) > 1:
         return many_directions(table)
     return scene
@@ -316,9 +314,9 @@ def for_table(scene: Motion | None, table: TrackTable) -> Motion | None:
 def fit_directed(
     imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: Sequence[Term], many: TrackFit | None = None
 ) -> TrackFit:
-    """Fit across the parallax of one direction of travel where that explains the points, else of one for each pair.
+    """Fit across the parallax of one direction of travel if that explains the points, else of one for each pair.
 
-    many: the latter fit, where it is known already.
+    many: the latter fit, if already known.
     """
     many = many or fit_tracks(imu, table, profile, terms, many_directions(table))
     one = fit_tracks(imu, table, profile, terms, one_direction())

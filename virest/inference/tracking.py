@@ -1,6 +1,6 @@
-"""Points followed from one frame to the next (pyramidal Lucas-Kanade, Bouguet 2001), checked forwards and back.
+"""Track points from frame to frame (pyramidal Lucas-Kanade, Bouguet 2001), with a forward-backward check.
 
-A guide (`guidance`) may say where to look for them: pictures are then compared through the map that it predicts.
+A guide (`guidance`) may predict their positions: the first picture is then warped by the predicted map before matching.
 """
 
 from __future__ import annotations
@@ -21,61 +21,61 @@ Picture = NDArray[np.uint8]
 Points = NDArray[np.float32]
 Stream = Iterable[tuple[int, Picture | None]]
 PART_FRAMES = 60
-"""Frames that are followed in one go: a part begins a few frames early, and before it lies what must be decoded."""
+"""Frames in one part; each part also decodes its lead frames and everything from the key frame before them."""
 LEAD_FRAMES = 2
-"""The frame before a part's first, for the pair of the two, and one more, which that frame may repeat."""
+"""The frame before a part's first, to pair with it, and one more, to detect whether that frame is a repeat."""
 CORNER_BLOCK_PX = 5
 CORNER_SPACING_PX = 7
-"""A corner is the strongest of a square of this side."""
+"""A corner is the strongest in a square of this side."""
 OUTSIDE_PX = 1e6
-"""Outside of any picture, and finite: where a lens's terms grow without bound they put points anywhere."""
+"""Finite bound outside any picture for positions where the lens model diverges."""
 REPEATS = 1.9
-"""Two patches that differ by noise alone, of some 100 independent pixels, differ by up to this ratio of their squared
-differences but for one in 1000 (F distribution)."""
+"""Ratio of squared differences below which two patches of about 100 independent pixels are equally similar: noise
+alone exceeds it in 1 of 1000 cases (F distribution)."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """How points are picked and followed. Lengths are pixels of the picture after halving."""
+    """How points are selected and tracked. Lengths are pixels of the reduced picture."""
 
     halve_above_px: int = 800
-    """Pictures with a longer side are halved first, again and again."""
+    """Pictures are halved repeatedly until their longer side is at most this."""
     grid: tuple[int, int] = (8, 8)
     """(columns, rows) of cells over the picture; each gives its best corners."""
     points_per_cell: int = 4
     window_px: int = 21
     pyramid_levels: int = 4
-    """Levels above the picture itself: 4 with this window follow some 70 px."""
+    """Pyramid levels above the picture: 4 with this window track up to about 70 px."""
     guided_levels: int = 2
-    """The same where a guide says where the points are: errors of some 20 px."""
+    """The same with a guide: prediction errors of up to about 20 px."""
     repeats_from_px: float = 4.0
-    """Found further than this from where the guide puts it, a point may have been taken for its like."""
+    """A point found further than this from its prediction may be a repetition of the texture."""
     max_forward_backward_px: float = 0.3
-    """A point that does not come back to within this is dropped."""
+    """Points with a larger forward-backward distance are dropped."""
     min_corner_levels: float = 1.5
-    """Least gradient of a corner, grey levels a pixel along the weaker axis; noise of 2 levels makes about 1."""
+    """Smallest gradient of a corner along its weaker axis, grey levels per pixel; noise of 2 levels gives about 1."""
     border_px: int = 6
-    """Points nearer to the picture's edge than this are dropped."""
+    """Points closer to the picture's edge are dropped."""
 
 
 class Between(Protocol):
-    """Where what two pictures show lies, as a guide predicts it."""
+    """A guide's map between two pictures."""
 
     def second_of(self, points_px: Array) -> Array:
-        """Where points (n, 2) of the first picture are in the second."""
+        """Positions in the second picture of points (n, 2) of the first."""
 
     def carried(self, first: Picture) -> Picture:
-        """The first picture as the second one should show it, as blurred as the second where that is more."""
+        """The first picture warped to the second, and blurred if the second is more blurred."""
 
     def evened(self, second: Picture) -> Picture:
-        """The second picture, as blurred as the first where that is more."""
+        """The second picture, blurred if the first is more blurred."""
 
 
 class Guide(Protocol):
-    """Says where points are to be looked for; picklable where parts are handed to processes."""
+    """Predicts the positions of points; picklable if parts are sent to processes."""
 
     def seen_before(self, first: int, second: int, shape: tuple[int, int], factor: int) -> Between | None:
-        """The map between two frames' pictures, (height, width), shrunk ``factor`` times; None: not known."""
+        """The map between two frames' pictures, (height, width), reduced by ``factor``; None: unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class TrackPair:
     points_second_px: Array
     """(n, 2), the same points."""
     forward_backward_px: Array | None = None
-    """(n,) distance between a point and where tracking back puts it."""
+    """(n,) distance between a point and its position after tracking forwards and back."""
 
     def __len__(self) -> int:
         return len(self.points_first_px)
@@ -102,13 +102,13 @@ def track_pairs(
     progress: Callable[[int], None] | None = None,
     guide: Guide | None = None,
 ) -> list[TrackPair]:
-    """Follow points between each two consecutive frames of a stream of (movie index, grey (h, w) or None).
+    """Track points between consecutive frames of a stream of (movie index, grey (h, w) or None).
 
-    guide: says where the points of one frame are to be looked for in the next; see :mod:`virest.inference.guidance`.
+    guide: predicts the points' positions in the next frame; see :mod:`virest.inference.guidance`.
 
-    Fresh corners are picked in every first frame, so pairs are independent of each other.  None and jumps in the index
-    begin anew.  A picture identical to the one before it shows another time than its stamp: it gives no pair, neither
-    backwards nor forwards.  Two pictures are in memory at a time.  progress is called with each index.
+    New corners are selected in every first frame, so pairs are independent of each other.  None and jumps in the index
+    interrupt the sequence.  A frame identical to its predecessor has content of another time, and gives no pair with
+    either neighbour.  Two pictures are in memory at a time.  progress is called with each index.
     """
     settings = settings or TrackingSettings()
     pairs: list[TrackPair] = []
@@ -138,23 +138,23 @@ def track_frames(
     progress: Callable[[int], None] | None = None,
     guide: Guide | None = None,
 ) -> list[TrackPair]:
-    """Follow points through frames (movie indices, rising), part by part; the same as in one stream of them.
+    """Track points through frames (movie indices, rising) in parts, with the same result as in a single stream.
 
-    gray: gives (index, picture) of the frames asked for; picklable where ``each`` hands parts to processes.  progress
-    is called with the number of frames that a finished part had.
+    gray: yields (index, picture) of the requested frames; picklable if ``each`` sends parts to processes.  progress is
+    called with the number of frames of each finished part.
     """
     parts = _parts(frames)
     sizes = [sum(index >= first for index in part) for part, first in parts]
     found = each(
         _track_part,
         [(gray, part, first, guide) for part, first in parts],
-        None if progress is None else lambda place: progress(sizes[place]),
+        None if progress is None else lambda number: progress(sizes[number]),
     )
     return [pair for pairs in found for pair in pairs]
 
 
 def _parts(frames: Sequence[int]) -> list[tuple[list[int], int]]:
-    """Parts of the runs of neighbours, each with its lead, and the index of the first frame that is a part's own."""
+    """Parts of the runs of consecutive frames, each with its lead frames, and the index of its first own frame."""
     rising = np.array(sorted(set(frames)), np.intp)
     parts: list[tuple[list[int], int]] = []
     for run in np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1):
@@ -194,7 +194,7 @@ def find_corners(picture: NDArray[np.uint8], settings: TrackingSettings) -> NDAr
 
 
 def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
-    """How many earlier entries have the same group."""
+    """Number of earlier entries with the same group."""
     order = np.argsort(group, kind="stable")
     ordered = group[order]
     start = np.searchsorted(ordered, ordered, side="left")
@@ -204,7 +204,7 @@ def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def shrink_factor(width: int, height: int, limit_px: int = TrackingSettings().halve_above_px) -> int:
-    """How many stored pixels a pixel of the pictures that are tracked is wide."""
+    """Width of a tracked picture's pixel in stored pixels."""
     factor = 1
     while max(width, height) // factor > limit_px and min(width, height) // factor >= 64:
         factor *= 2
@@ -212,7 +212,7 @@ def shrink_factor(width: int, height: int, limit_px: int = TrackingSettings().ha
 
 
 def _halved(picture: NDArray[np.uint8], limit_px: int) -> tuple[NDArray[np.uint8], int]:
-    """Return the picture halved until it fits, by means of 2 x 2 pixels, and the factor."""
+    """The picture halved until it fits, by means over 2 x 2 pixels, and the factor."""
     factor = shrink_factor(picture.shape[0], picture.shape[1], limit_px)
     for _ in range(factor.bit_length() - 1):
         even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
@@ -238,10 +238,10 @@ def _track(
 def _guided(
     first: Picture, second: Picture, start: Points, settings: TrackingSettings, between: Between
 ) -> tuple[Points, NDArray[np.bool_], NDArray[np.float32]]:
-    """Follow points from where the guide puts them; those that are not found there, as without a guide.
+    """Track points from their predicted positions; points not found there are tracked without the guide.
 
-    The first picture is compared as the guide carries it into the second, turned and sheared.  A point found far from
-    where it was put does not count where the carried picture shows the same there: texture that repeats.
+    The first picture is warped into the second, rotation and shear included, before matching.  A point found far from
+    its prediction is dropped if the warped picture looks the same there: repetitive texture.
     """
     put = np.clip(between.second_of(start.astype(float)), -OUTSIDE_PX, OUTSIDE_PX).astype(np.float32)
     carried, evened = between.carried(first), between.evened(second)
@@ -261,9 +261,9 @@ def _guided(
 def _repeats(
     carried: Picture, second: Picture, put: Points, ahead: Points, settings: TrackingSettings
 ) -> NDArray[np.bool_]:
-    """Whether (n,) what the guide puts at the places found looks as much like what is there as the point itself does.
+    """Mask (n,): the warped picture at the found position matches the second picture about as well as the point itself.
 
-    Squared differences of patches, mean and contrast left out, of which both are noise where texture repeats.
+    Compares squared differences of patches normalised in mean and contrast; for repetitive texture both are noise.
     """
     if not len(put):
         return np.zeros(0, bool)
@@ -274,7 +274,7 @@ def _repeats(
 
 
 def _patches(picture: Picture, points: Points, side: int) -> NDArray[np.float32]:
-    """Patches (n, side²) about points (n, 2), of mean 0 and norm 1."""
+    """Patches (n, side²) around points (n, 2), of mean 0 and norm 1."""
     offset = np.arange(side, dtype=np.float32) - (side - 1) / 2
     x = np.broadcast_to(points[:, :1, None] + offset[None, None, :], (len(points), side, side))
     y = np.broadcast_to(points[:, 1:, None] + offset[None, :, None], (len(points), side, side))
@@ -287,7 +287,7 @@ def _patches(picture: Picture, points: Points, side: int) -> NDArray[np.float32]
 def _there_and_back(
     first: Picture, second: Picture, start: Points, settings: TrackingSettings, levels: int
 ) -> tuple[Points, NDArray[np.bool_], NDArray[np.float32]]:
-    """Where points (n, 2) are found, whether they count (n,), and how far from their start tracking back puts them."""
+    """Found positions (n, 2) of points, mask of the accepted ones (n,), and forward-backward distances (n,)."""
     ahead, found = _follow(first, second, start, settings, levels)
     back, returned = _follow(second, first, ahead, settings, levels)
     distance = np.linalg.norm(back - start, axis=-1)

@@ -1,20 +1,19 @@
-"""The unsharp mask that a phone put on its pictures, from what stands above the plateau beside an edge.
+"""Estimate the unsharp mask that a phone applied to its pictures, from the overshoot beside edges.
 
-No blur of light takes a picture above the plateau beside an edge or below it, and no response curve does; an unsharp
-mask y + amount (y − G_radius ∗ y) does both (Polesel, Ramponi & Mathews 2000, doi:10.1109/83.826787).  Only the side
-that is looked at must be flat: beyond the edge may lie another plateau, or the other side of a stroke of print.  A line
-of contrast h and width w, spread by a Gaussian of width s, leaves beside it, as part of what it goes down from the
-plateau,
+Neither blur nor a response curve takes a picture above or below the plateau beside an edge; an unsharp mask
+y + amount (y − G_radius ∗ y) does both (Polesel, Ramponi & Mathews 2000, doi:10.1109/83.826787).  Only the analysed
+side must be flat: beyond the edge may be another plateau, or the other side of a printed stroke.  Beside a line of
+contrast h and width w, blurred by a Gaussian of width s, the profile relative to the depth below the plateau is
 
     z(u) = 1 − L_s(u) − amount (L_s(u) − L_t(u)),   L_s(u) = h (Φ(−u/s) − Φ(−(u + w)/s)),   t² = s² + radius²;
 
-a step is a wide line.  Where the edge is wider than the mask, amount and radius show as amount · radius² alone; what
-phones use then decides.
+a step is a wide line.  If the edge is wider than the mask, only amount · radius² is observable, and the priors of
+phones' masks decide.
 
-A mask M that may be there leaves M K x of a picture x.  Of all that is known of M, the filter of least expected error
-is 1 / K over (E M² + N / (S |K|²)) / E M: a spread of M makes it weaker by 1 + Var M / (E M)² alone, which is 1.04 for
-a mask of 0.3 ± 0.25, at all frequencies that come through alike.  So what is to be expected of the amount is undone,
-and its spread is left out.
+An uncertain mask M turns a picture x into M K x.  Given the distribution of M, the filter of least expected error
+is 1 / K over (E M² + N / (S |K|²)) / E M: the uncertainty of M only attenuates it by 1 + Var M / (E M)², which is 1.04
+for a mask of 0.3 ± 0.25, equally at all frequencies that pass.  So the expected amount is undone, and its uncertainty
+is neglected.
 """
 
 from __future__ import annotations
@@ -38,54 +37,53 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 RADIUS_PX, RADIUS_SPREAD = 1.2, 0.3
-"""Of phones' unsharp masks, and how far it varies (in the logarithm): 0.9 to 1.6 px."""
+"""Prior mean and standard deviation (of the logarithm) of the radius of phones' unsharp masks: 0.9 to 1.6 px."""
 AMOUNT, AMOUNT_SPREAD = 0.6, 0.4
-"""Of phones' unsharp masks, and how far it varies."""
+"""Prior mean and standard deviation of the amount of phones' unsharp masks."""
 FALSE_ALARM = 5e-3
-"""Probability that pictures that nobody sharpened are taken for surely sharpened ones.  A mask that is not undone costs
-up to 2 dB where blur is short, one that is not there and undone, some tenths."""
+"""Probability that unsharpened pictures are classified as certainly sharpened.  Missing a mask costs up to 2 dB for
+short blur; undoing one that does not exist costs a few tenths of a dB."""
 SHARPENED = 0.25
 """Prior probability that a phone sharpened its movie.
 
-Between 0.12 and 0.5 it changes the mean gain by no more than 0.02 dB on 13 simulated captures, sharpened and not, whose
-edges leave the question open.  A lower value costs less where nobody sharpened."""
+Values from 0.12 to 0.5 change the mean gain by at most 0.02 dB on 13 simulated captures, sharpened and not, whose edges
+leave the question open.  A lower value costs less for unsharpened pictures."""
 BARE_ALL, BARE_SHARPEST = (0.001, 0.003), (0.0056, 0.0056)
-"""Overshoot of movies that nobody sharpened, as part of the step: mean, and how far it varies, of all edges and of the
-sharpest, over 65 simulated captures of five scenes at 320 x 240 and 640 x 480, gentle and fast, coded finely and
-coarsely, in focus and not; what the number of edges makes it scatter by is not in it.  ``python -m virest.app.bench
---only edges`` measures it on others.
+"""Overshoot of unsharpened movies relative to the step, mean and standard deviation, for all edges and the sharpest.
 
-The most are 0.009, a board's at 320 x 240, and 0.025.  The profile that the mask is fitted to may be wrong by as much
-as the sharpest edges vary: neighbours within a pixel share the error."""
+From 65 simulated captures of five scenes at 320 x 240 and 640 x 480, slow and fast, coded finely and coarsely, in and
+out of focus; excludes the scatter from the number of edges.  ``python -m virest.app.bench --only edges`` measures it on
+others.  The largest are 0.009, of a board at 320 x 240, and 0.025.  The profile to which the mask is fitted may be off
+by the same standard deviation as the sharpest edges: neighbours within 1 px share the error."""
 EDGES = EdgeSettings(edges_per_frame=600, cell_px=16, min_slope_levels=6.0)
 MOST_FRAMES = 4
 STILL_PX = 0.6
 """Edges across which the blur path's standard deviation is below this are used."""
 SHARPEST = 0.4
-"""Part of the edges that the mask is fitted to, by the width of their other half: a soft step overshoots less, and the
-tails of natural edges hide it.
+"""Fraction of the edges, the sharpest by the width of their far half, to which the mask is fitted: soft steps overshoot
+less, and the tails of natural edges hide it.
 
-In photographs a mask of 0.7 with a radius of 1 px overshoots by 0.04 to 0.09 among these, and by nothing in the median
-of all.  That of all tells weak masks of print and plain surfaces, where the sharpest vary more.
+In photographs a mask of 0.7 with a radius of 1 px overshoots by 0.04 to 0.09 at these edges, and not at all in the
+median of all edges.  The latter reveals weak masks on print and plain surfaces, where the sharpest vary more.
 """
 LEAST_EDGES = 40
-"""The median of fewer is moved by a few odd ones."""
-ALIKE = 4
-"""Edges that count as one: several lie on one contour, and one place is seen in several frames."""
+"""With fewer edges a few outliers shift the median."""
+EDGES_PER_SAMPLE = 4
+"""Edges that count as one independent sample: several lie on one contour, and some are seen in several frames."""
 MEDIAN_STD = 1.2533
-"""Of the median over the mean's, for normal deviates."""
+"""Standard deviation of the median over that of the mean, for normal deviates."""
 ALONG_PX = np.arange(-9.0, 9.0 + 1e-9, 0.5)
 FLAT_FROM_PX, MAX_FLAT_RMS = 4.0, 0.04
-"""Where the plateau begins, and its greatest rms as part of the step."""
+"""Start of the plateau, and its largest rms relative to the step."""
 MIN_STEP_LEVELS = 30.0
 UNCLIPPED_LEVELS = (6.0, 249.0)
-"""Of a plateau.  What stands above it may be clipped: the mask is then taken for less than it is."""
+"""Range of an unclipped plateau.  The overshoot itself may be clipped, so that the mask is underestimated."""
 MAX_OFF_PX = 1.5
-"""Between a crest of the slope and the middle of its edge."""
+"""Largest distance between the maximum of the gradient and the middle of its edge."""
 GRID_PX = np.arange(-4.0, 6.0 + 1e-9, 0.25)
 FITTED = GRID_PX >= -1.0
-LEFT = 0.02
-"""Part of the mask's change that may remain: at an edge of 100 levels a tenth of a level."""
+RESIDUAL_CHANGE = 0.02
+"""Fraction of the mask's change that may remain: 0.1 level at an edge of 100 levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,34 +97,34 @@ class UnsharpMask:
 
 @dataclass(frozen=True, slots=True)
 class Overshoot:
-    """How far edges stand above the plateaus beside them, as part of the step."""
+    """Overshoot of edges above the plateaus beside them, relative to the step."""
 
     of_all: float
-    """In the median of all edges."""
+    """Median over all edges."""
     of_sharpest: float
     p_value: float
-    """Probability of the more significant of the two where nobody sharpened, for two that were asked."""
+    """p-value of the more significant of the two for unsharpened pictures, corrected for two tests."""
     sharpest_std: float
-    """One standard deviation of that of the sharpest, where nobody sharpened."""
+    """Standard deviation of the sharpest edges' overshoot for unsharpened pictures."""
     sharpest: Array
     """(m,) median profile of the sharpest on GRID_PX."""
 
     def mask(self) -> UnsharpMask:
-        """What fits the sharpest; its amount is 0 or less where nothing overshoots."""
+        """The mask fitted to the sharpest edges; its amount is 0 or less without overshoot."""
         _, amount, log_radius, *_ = _fitted(self.sharpest)
         return UnsharpMask(float(amount), float(np.exp(log_radius)))
 
     def expected_mask(self) -> UnsharpMask:
-        """The mask that fits, as strong as it is on the mean of its being there and not."""
+        """The fitted mask, with the amount's expectation over its being present or not."""
         theta = _fitted(self.sharpest)
         amount = max(float(theta[1]), 0.0) * (1.0 if self.p_value <= FALSE_ALARM else self._chance(theta))
         return UnsharpMask(amount, float(np.exp(theta[2])))
 
     def _chance(self, theta: Array) -> float:
-        """Probability that the movie was sharpened, by how far the sharpest overshoot, normal with and without a mask.
+        """Probability that the movie was sharpened, from the sharpest edges' overshoot, normal with and without a mask.
 
-        With one they overshoot by as much as a usual one makes edges of the fitted width do, give or take how far its
-        amount varies.  0 where that is less likely than none: a profile holds that nothing speaks against.
+        With a mask, the mean is the overshoot that a usual mask causes at edges of the fitted width, and its standard
+        deviation includes that of the amount.  0 if the overshoot is more likely without a mask.
         """
         usual = np.array([theta[0], AMOUNT, *theta[2:]])
         more = float(_beside_line(usual).max() - _beside_line(usual * (1, 0, 1, 1, 1, 1)).max())
@@ -137,7 +135,7 @@ class Overshoot:
 
 
 def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | None:
-    """The mask to expect by what some frames' edges show; None: none, or too few edges tell.
+    """The expected mask from the edges of some frames; None: no mask, or too few edges.
 
     pictures: grey (h, w), and the motion over the frame.
     """
@@ -149,7 +147,7 @@ def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | No
 
 
 def overshoot(pictures: Iterable[tuple[Picture, RowMotion]]) -> Overshoot | None:
-    """What some frames' edges do beside their plateaus; None where too few tell.  Arguments as of :func:`seen_mask`."""
+    """Overshoot of some frames' edges; None if there are too few.  Arguments as of :func:`seen_mask`."""
     found = [np.zeros((0, len(GRID_PX))), *(_profiles(picture, motion) for picture, motion in pictures)]
     profiles = np.concatenate(found)
     if len(profiles) < LEAST_EDGES:
@@ -163,17 +161,17 @@ def overshoot(pictures: Iterable[tuple[Picture, RowMotion]]) -> Overshoot | None
 
 
 def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:
-    """A picture (h, w) or (h, w, 3) as it was before the mask, y = (1 + amount) x − amount G ∗ x on its luma.
+    """A picture (h, w) or (h, w, 3) before the mask y = (1 + amount) x − amount G ∗ x on its luma.
 
-    x ← (y + amount G ∗ x) / (1 + amount) falls to the solution by amount / (1 + amount) a step at least (Banach).  Its
-    gain lies between 1 / (1 + amount) and 1: no noise is amplified.  What may be clipped stays as it is: taken down it
-    would pass for light that was measured, and a lamp's streak for a dim line.
+    x ← (y + amount G ∗ x) / (1 + amount) converges at least by a factor amount / (1 + amount) per step (Banach).  Its
+    gain is between 1 / (1 + amount) and 1, so noise is not amplified.  Possibly clipped pixels are kept: darkened, they
+    would pass for measured light, and the streak of a clipped highlight for a dim line.
     """
     luma = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     sharp = luma.astype(np.float32)
     falls = mask.amount / (1 + mask.amount)
     soft = sharp
-    for _ in range(max(int(np.ceil(np.log(LEFT) / np.log(falls))), 1)):
+    for _ in range(max(int(np.ceil(np.log(RESIDUAL_CHANGE) / np.log(falls))), 1)):
         soft = cv2.addWeighted(sharp, 1 - falls, cv2.GaussianBlur(soft, (0, 0), mask.radius_px), falls, 0.0)
     change = cv2.subtract(soft, sharp)
     if picture.ndim == 3:
@@ -187,9 +185,9 @@ def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:
 
 
 def _profiles(picture: Picture, motion: RowMotion) -> Array:
-    """Profiles (n, m) on GRID_PX across edges that hardly moved, 1 at a flat plateau, 0 at the least within reach.
+    """Profiles (n, m) on GRID_PX across edges with little blur, 1 on a flat plateau, 0 at the minimum within reach.
 
-    Each edge is looked at from both its sides.
+    Each edge is analysed from both sides.
     """
     points, normals = find_edges(picture, EDGES)
     if not len(points):
@@ -201,7 +199,7 @@ def _profiles(picture: Picture, motion: RowMotion) -> Array:
 
 
 def _beside_plateau(levels: Array) -> Array:
-    """Those profiles (n, m) on ALONG_PX that end on a plateau from below, scaled, their middle at 0."""
+    """The profiles (n, m) on ALONG_PX that rise to a plateau, scaled, with their middle at 0."""
     flat, near = ALONG_PX >= FLAT_FROM_PX, (ALONG_PX > -FLAT_FROM_PX) & (ALONG_PX < 1)
     plateau, lowest = np.median(levels[:, flat], axis=1), levels[:, near].min(axis=1)
     step = np.maximum(plateau - lowest, 1e-3)
@@ -229,7 +227,7 @@ def _moved(part: Array, middle: Array) -> Array:
 
 
 def _inner_width(profiles: Array) -> Array:
-    """(n,) from the middle of an edge to where it has gone down to 0.16, away from the plateau."""
+    """(n,) distance from the middle of an edge to where it has fallen to 0.16, away from the plateau."""
     inside = profiles[:, GRID_PX <= 0][:, ::-1]
     after = np.argmax(inside <= 0.16, axis=1)
     rows = np.arange(len(inside))
@@ -239,22 +237,22 @@ def _inner_width(profiles: Array) -> Array:
 
 
 def _crest(profiles: Array) -> tuple[int, float]:
-    """Where on GRID_PX their median is highest beyond the edge, and how high."""
+    """Index on GRID_PX of the highest median beyond the edge, and its height."""
     median = np.median(profiles, axis=0)
     at = int(np.argmax(np.where(GRID_PX > 0, median, 0.0)))
     return at, float(median[at])
 
 
 def _overshoot(profiles: Array, bare_std: float) -> tuple[float, float]:
-    """How far they stand above their plateaus, and the deviation of that; bare_std: that of bare movies alone."""
+    """Overshoot of profiles and its standard deviation; bare_std: that of unsharpened movies alone."""
     at, crest = _crest(profiles)
     typical = robust_std(profiles[:, at] - crest)
-    noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / ALIKE)
+    noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / EDGES_PER_SAMPLE)
     return crest - 1, float(np.hypot(noise, bare_std))
 
 
 def _fitted(mean: Array) -> Array:
-    """Width, amount, log radius, line's width and contrast, and the middle; amount and radius have priors."""
+    """Fitted edge width, amount, log radius, line width, contrast and middle; all but the edge width have priors."""
     share = np.sqrt(GRID_PX[1] - GRID_PX[0]) / BARE_SHARPEST[1]
 
     def off(theta: Array) -> Array:
@@ -269,8 +267,8 @@ def _fitted(mean: Array) -> Array:
 _USUAL = np.array([AMOUNT, np.log(RADIUS_PX), 4.0, 1.0, 0.0])
 _SPREAD = np.array([AMOUNT_SPREAD, RADIUS_SPREAD, 3.0, 0.2, 0.2])
 _BOUNDS = ([0.3, -0.5, np.log(0.5), 0.5, 0.5, -1.0], [3.0, 3.0, np.log(3.0), 20.0, 3.0, 1.0])
-"""Of amount, log radius, the line's width in pixels, its contrast, and the middle: what is usual, and how far it
-varies; and the bounds, of the edge's width too."""
+"""Prior means and standard deviations of amount, log radius, line width (px), contrast and middle; bounds of these and,
+first, of the edge width."""
 
 
 def _beside_line(theta: Array) -> Array:

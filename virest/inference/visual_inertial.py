@@ -1,10 +1,10 @@
-"""Where the camera went, in metres: tracked points, gyroscope and accelerometer together (eqs 4-6; after VINS-Mono).
+"""The camera's metric translation from tracked points, gyroscope and accelerometer (eqs 4-6; after VINS-Mono).
 
-A capture is cut into stretches, each with its own gravity, accelerometer bias and delay; a stretch into windows of a
-few seconds, each with its own velocity and plane.  Within a window the velocity at any instant follows from the
-accelerometer.  Scale comes from accelerations only: whether the motion determines it is judged window by window, and
-a window that fails gives its reason instead of a velocity.  What a picture shows is velocity over depth, which needs no
-scale: it is judged for itself, and serves to restore where metres are not known.
+A capture is divided into stretches, each with its own gravity, accelerometer bias and delay; a stretch into windows of
+a few seconds, each with its own velocity and plane.  Within a window the velocity at any instant follows from the
+accelerometer.  Scale comes from accelerations only: each window is checked for whether its motion determines it, and a
+window that fails has a reason instead of a metric velocity.  Frames show velocity over depth, which needs no scale: it
+is checked separately, and is used for restoration without a metric velocity.
 """
 
 from __future__ import annotations
@@ -32,35 +32,35 @@ from virest.motion.scene_motion import InertialMotion
 
 Array = NDArray[np.float64]
 STRETCH_S = 14.0
-"""Windows that share gravity and the accelerometer's bias; in this time a gyroscope drifts by a few mrad."""
+"""Length of stretches with common gravity and accelerometer bias; in this time a gyroscope drifts by a few mrad."""
 RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
-"""Frames to be tracked: runs of consecutive ones, spread over each window."""
+"""Frames to track: number of runs spread over each window, and consecutive frames in each."""
 POINTS_PER_WINDOW = 800
 MIN_POINTS = 200
 START_INVERSE_DEPTH_PER_M = 0.5
 MAX_RELATIVE_STD = 0.1
-"""Of the scale, and of the velocity over its rms within a window; beyond it no metres are said."""
+"""Largest relative standard deviation of scale and velocity (over its rms in a window) of a metric velocity."""
 MAX_FLOW_STD = 0.2
-"""Of velocity over depth, part of its rms, where metres are not known: rotation alone errs by all of it.  Inertial data
-of another recording, bent until they fit, leave 0.3 and more; those of the recording itself hardly 0.12."""
+"""Largest standard deviation of velocity over depth relative to its rms, without a metric velocity; rotation alone has
+an error of 1.  Inertial data of another recording, fitted anyway, give 0.3 or more, those of the same up to 0.12."""
 MAX_PRIOR_STD = 3.0
 """Reject fits that move a parameter of the profile by more than this many prior standard deviations."""
 MIN_PARALLAX = 1.15
-"""Rotation alone must leave this many times what is left with translation."""
-MAX_LEFT = 0.15
-"""Part of the parallax's power that the accelerometer's path may leave unexplained."""
+"""Smallest residual of rotation alone relative to the residual with translation."""
+MAX_UNEXPLAINED = 0.15
+"""Largest fraction of the parallax's power that the accelerometer's path may leave unexplained."""
 MAX_SPREAD = 0.6
-"""Spread of inverse depths about the plane, as part of its inverse depth."""
+"""Largest spread of inverse depths about the plane relative to its inverse depth."""
 GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
 MAX_ITERATIONS = 15
-STILL_ITERATIONS = 8
-"""Rotation alone is there to be compared with; it does not matter to the last digit."""
+ROTATION_ITERATIONS = 8
+"""The fit with rotation alone serves only for comparison and needs no full convergence."""
 STATED_DEPTH_STD = 0.02
-"""How far a profile's depth may be off, part of it."""
+"""Relative standard deviation of a profile's depth."""
 TRACKING_BIAS_PX = 0.04
-"""Tracking's own bias under blur and codec: a steady error of a step, which is an error of the velocity."""
+"""Systematic tracking error from blur and codec: a constant error of each step, hence of the velocity."""
 IMU_MARGIN_S = 2.5
-"""A stretch takes the inertial samples up to this far beyond its tracked points."""
+"""A stretch uses inertial samples up to this far beyond its tracked points."""
 
 
 # ── which frames ─────────────────────────────────────────────────────────────────────────────────────────────────
@@ -81,7 +81,7 @@ def choose_runs(frames: Sequence[Frame]) -> list[int]:
 
 
 def _run(usable: Sequence[Frame], part: NDArray[np.intp]) -> list[int]:
-    """The unbroken run nearest to the middle of a part, or the whole of a short one."""
+    """The unbroken run closest to the middle of a part, or all of a short part."""
     if len(part) <= RUN_FRAMES:
         return [usable[int(k)].index for k in part]
     starts = part[: len(part) - RUN_FRAMES + 1]
@@ -99,19 +99,19 @@ def _run(usable: Sequence[Frame], part: NDArray[np.intp]) -> list[int]:
 def align(
     observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, depth_m: float | None = None
 ) -> VisualInertialAlignment:
-    """Fit velocity, gravity, accelerometer bias and planes to tracked points, and judge what the motion determines.
+    """Fit velocity, gravity, accelerometer bias and planes to tracked points, and check what the motion determines.
 
-    Clock, IMU rotation and gyroscope bias are fitted along, within what a careful profile may be off; unknown ones
-    (time_offset_s None) freely.  depth_m: of the scene where the profile states it; the scale then needs no
-    acceleration.  Never raises for poor data: windows carry their reasons.
+    Clock, IMU rotation and gyroscope bias are fitted too, with the priors of a careful profile, or freely if unknown
+    (time_offset_s None).  depth_m: the scene's, if the profile states it; the scale then needs no acceleration.  Never
+    raises for poor data: windows have reasons instead.
     """
     if profile.intrinsics is None:
         return VisualInertialAlignment((), "the focal length is unknown")
     observed = observed.covered(imu, profile)
     if len(observed.pairs) < MIN_PAIRS:
-        return VisualInertialAlignment((), f"{len(observed.pairs)} pairs of frames with enough points to follow")
+        return VisualInertialAlignment((), f"only {len(observed.pairs)} pairs of frames have enough points")
     if not imu.has_accelerometer:
-        return VisualInertialAlignment((), "no accelerometer to tell the camera's path")
+        return VisualInertialAlignment((), "no accelerometer to determine the camera's path")
     stretches = []
     for part in _parts(observed):
         stretch = _fit_stretch(part, imu, profile, depth_m)
@@ -121,7 +121,7 @@ def align(
 
 
 def _parts(observed: ObservedTracks) -> list[ObservedTracks]:
-    """Stretches of about STRETCH_S, in whole windows."""
+    """Parts of about STRETCH_S."""
     middle = np.array([observed.stamp_s[pair.second] for pair in observed.pairs])
     count = max(int(np.ceil((middle[-1] - middle[0]) / STRETCH_S)), 1)
     edges = np.linspace(middle[0], middle[-1], count + 1)[1:-1]
@@ -130,10 +130,10 @@ def _parts(observed: ObservedTracks) -> list[ObservedTracks]:
 
 
 def nuisance_terms(profile: CameraProfile) -> tuple[Term, ...]:
-    """What is fitted beside the scene: everything that could pass for parallax.
+    """Terms fitted with the scene: everything that could be mistaken for parallax.
 
-    Before a tilted wall another travel with another turn shows nearly the same picture (a plane's second motion); that
-    turn would have to be a bias that no phone's gyroscope has.
+    In front of a tilted wall, another translation with another rotation gives nearly the same picture (a plane's second
+    motion); the prior of the gyroscope's bias excludes that rotation.
     """
     known = profile.time_offset_s is not None and "time_offset_s" not in profile.estimates
     terms = [STATED_OFFSET if known else TIME_OFFSET, SMALL_BIAS, NEAR_AXES]
@@ -157,7 +157,7 @@ def _fit_stretch(
     first, last = (float(profile.imu_time_s(t)) for t in (table.first_stamp_s.min(), table.second_stamp_s.max()))
     imu = imu.between(first - IMU_MARGIN_S - settling_time_s(profile), last + IMU_MARGIN_S)
     terms = nuisance_terms(profile)
-    still = fit_tracks(imu, table, profile, terms, max_iterations=STILL_ITERATIONS)
+    rotating = fit_tracks(imu, table, profile, terms, max_iterations=ROTATION_ITERATIONS)
     known = ground(imu, profile, translation=True)
     if known.displacement is None:
         return None
@@ -169,7 +169,7 @@ def _fit_stretch(
     assert isinstance(fit.scene, InertialMotion)
     points = triangulate(fit.ground, fit.scene, table)
     stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table), _perturbed(fit, imu))
-    stretch = replace(stretch, windows=tuple(_judged(stretch, still, k, depth_m) for k in range(table.n_windows)))
+    stretch = replace(stretch, windows=tuple(_judged(stretch, rotating, k, depth_m) for k in range(table.n_windows)))
     sights = triangulate_relief(fit.ground, fit.scene, observed.table(observed.tracks))
     reliefs = tuple(_relief(stretch, sights, k) for k in range(table.n_windows))
     windows = tuple(_with_a_surface(window, relief) for window, relief in zip(stretch.windows, reliefs, strict=True))
@@ -177,7 +177,7 @@ def _fit_stretch(
 
 
 def _relief(stretch: Stretch, sights: Sightings, window: int) -> WindowRelief | None:
-    """What stands out of a window's planes, if it tells held-out points better."""
+    """Relief on a window's planes, if it predicts held-out points better."""
     if not stretch.windows[window].usable:
         return None
     grid = picture_grid(stretch.fit.ground.lens, stretch.origin_s(window))
@@ -189,13 +189,13 @@ def _relief(stretch: Stretch, sights: Sightings, window: int) -> WindowRelief | 
 
 
 def _perturbed(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
-    """The fit's ground with each value of its terms one quotient's step further."""
+    """The fit's integrated motion with each value of its terms changed by its difference step."""
     steps = [(term, np.diag(term.quotient)[k]) for term in fit.terms for k in range(len(term))]
     return tuple(with_profile(fit.ground, imu, term.change(fit.profile, step)) for term, step in steps)
 
 
 def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
-    """A steady error of TRACKING_BIAS_PX a step, at each window's depth."""
+    """Velocity error from a constant error of TRACKING_BIAS_PX per step, at each window's depth."""
     assert isinstance(fit.scene, InertialMotion)
     assert fit.profile.intrinsics is not None
     step_s = float(np.median(table.second_stamp_s - table.first_stamp_s))
@@ -206,7 +206,7 @@ def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
 def _at_depth(
     fit: TrackFit, imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: tuple[Term, ...], depth_m: float
 ) -> TrackFit:
-    """Fit again with each window's plane at the stated depth along the optical axis, tilted as the pictures say."""
+    """Fit again with each window's plane at the stated depth along the optical axis, with the fitted tilt."""
     scene = fit.scene
     assert isinstance(scene, InertialMotion)
     origin = np.asarray(profile.imu_time_s(table.origin_s))
@@ -223,7 +223,7 @@ def _at_depth(
 # ── judgement ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | None) -> Window:
+def _judged(stretch: Stretch, rotating: TrackFit, window: int, depth_m: float | None) -> Window:
     fit, table = stretch.fit, stretch.table
     mine = table.window == window
     start_s, end_s = float(table.first_stamp_s[mine].min()), float(table.second_stamp_s[mine].max())
@@ -236,7 +236,7 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
     scale_std = stretch.plane_std_per_m(window) / inverse
     flow, flow_covariance = stretch.flow(window, times)
     flow_std = np.sqrt(np.trace(flow_covariance, axis1=-2, axis2=-1).mean() / max((flow**2).sum(axis=-1).mean(), 1e-12))
-    left, before = _left(fit, mine), _left(still, mine)
+    left, before = _left(fit, mine), _left(rotating, mine)
     found = Window(
         start_s,
         end_s,
@@ -256,21 +256,21 @@ def _judged(stretch: Stretch, still: TrackFit, window: int, depth_m: float | Non
 
 
 def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
-    """Robust standard deviation per coordinate of a window's whitened differences."""
+    """Robust standard deviation per coordinate of a window's whitened residuals."""
     return float(np.median(fit.distance[mine])) / RAYLEIGH_MEDIAN
 
 
 def _no_parallax(found: Window) -> str:
     if found.parallax < MIN_PARALLAX:
-        return f"no parallax to speak of: rotation alone leaves {found.parallax:.2f} times what translation does"
+        return f"too little parallax: rotation alone leaves {found.parallax:.2f} times the residual of translation"
     return ""
 
 
 def _no_fit(found: Window, gravity_m_s2: float, before: float) -> str:
     unexplained = max(found.residual**2 - 1, 0.0) / max(before**2 - 1, 1e-6)
-    if unexplained > MAX_LEFT or abs(gravity_m_s2 - GRAVITY_M_S2) > GRAVITY_TOLERANCE_M_S2:
+    if unexplained > MAX_UNEXPLAINED or abs(gravity_m_s2 - GRAVITY_M_S2) > GRAVITY_TOLERANCE_M_S2:
         return (
-            f"the accelerometer does not fit the pictures: {unexplained:.0%} of the parallax unexplained, "
+            f"the accelerometer does not fit the frames: {unexplained:.0%} of the parallax unexplained, "
             f"gravity {gravity_m_s2:.2f} m/s²"
         )
     return ""
@@ -281,7 +281,7 @@ def _far_from_profile(fit: TrackFit) -> str:
         ratio = float(np.max(np.abs(fit.value(term.name)) / np.array(term.prior_std)))
         if ratio > MAX_PRIOR_STD:
             name = term.name.replace("_", " ")
-            return f"pictures and accelerometer fit only with a {name} {ratio:.0f} deviations from the profile's"
+            return f"frames and accelerometer fit only with a {name} {ratio:.0f} σ from the profile's"
     return ""
 
 
@@ -293,7 +293,7 @@ def _no_metres(found: Window) -> str:
 
 
 def _with_a_surface(window: Window, relief: WindowRelief | None) -> Window:
-    """Depths that spread too far for a plane need a surface."""
+    """The window, unusable if its depths spread too far for a plane and it has no surface."""
     if not window.usable or relief is not None or window.spread <= MAX_SPREAD:
         return window
     return replace(window, reason=f"no common plane: inverse depths spread by {window.spread:.0%}", over_depth=False)

@@ -1,1 +1,1 @@
-"""How the camera moved: orientation and displacement from the inertial samples, and the lens that moves with them."""
+"""Camera motion: orientation and displacement from the inertial samples, and the moving lens."""

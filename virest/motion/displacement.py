@@ -1,7 +1,7 @@
-"""From specific force to displacement (eqs 4-6): what the accelerometer knows of the camera's path.
+"""Displacement of the camera from specific force (eqs 4-6).
 
-Position is linear in what the accelerometer leaves open: p(t) = P(t) + v (t − t₀) + ½ g (t − t₀)² − B(t) b, with the
-velocity v and gravity g at t₀ in world axes and the accelerometer's bias b in IMU axes.  P and B are integrated once.
+Position is linear in the unknowns: p(t) = P(t) + v (t − t₀) + ½ g (t − t₀)² − B(t) b, with the velocity v at t₀ and
+gravity g in world axes and the accelerometer's bias b in IMU axes.  P and B are integrated once.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from virest.motion.trajectory import Trajectory
 Array = NDArray[np.float64]
 FIFTH_DIFFERENCES = 252**0.5
 MIN_FINITE = 0.98
-"""Least part of the rows with an acceleration; the holes are bridged by straight lines."""
+"""Smallest fraction of the rows with an acceleration; gaps are interpolated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """Path of the camera's centre by the accelerometer alone, the trajectory's axes; from rest at the first row."""
+    """Path of the camera's centre from the accelerometer alone, trajectory's axes; from rest at the first row."""
 
     trajectory: Trajectory
     spline: CubicHermiteSpline
-    """(m, 15), row by row (3, 5): P of the IMU, metres, as if gravity, velocity and bias were nought; its change per
-    m/s² of bias along each IMU axis; its change per second by which the accelerations are older than their stamps."""
+    """(m, 15), by rows of (3, 5): P of the IMU, metres, for zero gravity, velocity and bias; its change per m/s² of
+    bias along each IMU axis; its change per second of delay of the accelerations."""
     arm_cam_m: Array
     """(3,) the IMU's origin in camera axes."""
 
     def at(self, time_s: Array, origin_s: Array, window: NDArray[np.intp] | None = None) -> tuple[Array, Array, Array]:
-        """Compute P (n, 3), B (n, 3, 3) and the change per delay (n, 3), all from rest at origin_s (w,) of each window.
+        """P (n, 3), B (n, 3, 3) and the change per delay (n, 3), all from rest at origin_s (w,) of each window.
 
-        window: (n,) number of each time's; None: each time has its own.
+        window: (n,) window of each time; None: each time has its own.
         """
         window = np.arange(len(time_s)) if window is None else window
         arm = self._arm(time_s) - self._arm(origin_s)[window] if self.arm_cam_m.any() else 0.0
@@ -45,7 +45,7 @@ class Displacement:
         return path + arm, per_bias, per_delay
 
     def velocity(self, time_s: Array, origin_s: Array) -> tuple[Array, Array, Array]:
-        """Of the IMU since an origin (1,): its own (n, 3), per bias (n, 3, 3) and per delay (n, 3), world axes."""
+        """Velocity of the IMU since an origin (1,): (n, 3), per bias (n, 3, 3) and per delay (n, 3), world axes."""
         return _parts(self.spline(time_s, 1) - self.spline(origin_s, 1))
 
     def acceleration(self, time_s: Array) -> Array:
@@ -53,27 +53,27 @@ class Displacement:
         return _parts(self.spline(time_s, 2))[0]
 
     def turned(self, turn: Array, trajectory: Trajectory) -> Displacement:
-        """The same in world axes that are turned by (3, 3), along a trajectory in these axes."""
+        """The same in world axes rotated by (3, 3), along a trajectory in these axes."""
         rows = np.kron(turn, np.eye(5))
         pieces = self.spline.c @ rows.T
         spline = CubicHermiteSpline.construct_fast(pieces, self.spline.x, self.spline.extrapolate, self.spline.axis)
         return Displacement(trajectory, spline, self.arm_cam_m)
 
     def _arm(self, time_s: Array) -> Array:
-        """Camera's centre seen from the IMU, world axes: −R_world_cam p_cam_imu."""
+        """Camera's centre relative to the IMU, world axes: −R_world_cam p_cam_imu."""
         return -np.squeeze(self.trajectory.orientation(time_s) @ self.arm_cam_m[:, None], -1)
 
 
 def _parts(values: Array) -> tuple[Array, Array, Array]:
-    """What the spline holds (..., 15), part by part: (..., 3), (..., 3, 3), (..., 3)."""
+    """The spline's values (..., 15) as position (..., 3), bias (..., 3, 3) and delay (..., 3) parts."""
     rows = values.reshape(*values.shape[:-1], 3, 5)
     return rows[..., 0], rows[..., 1:4], rows[..., 4]
 
 
 def drift_std_m(imu: ImuSamples, span_s: float) -> float:
-    """Standard deviation of the displacement after span_s that the accelerometer's white noise alone makes.
+    """Standard deviation of the displacement after span_s from the accelerometer's white noise alone.
 
-    σ √Δt T^1.5 / √3; σ from fifth differences, which a hand's motion hardly reaches.  Inf without an accelerometer.
+    σ √Δt T^1.5 / √3; σ from fifth differences, which suppress hand motion.  Inf without an accelerometer.
     """
     force = imu.accel_m_s2[np.isfinite(imu.accel_m_s2).all(axis=1)]
     if len(force) < 12:
@@ -83,9 +83,9 @@ def drift_std_m(imu: ImuSamples, span_s: float) -> float:
 
 
 def force_at_samples(imu: ImuSamples) -> tuple[Array, Array] | None:
-    """Specific force and its slope at the samples, IMU axes (n, 3) each, holes bridged; None without an accelerometer.
+    """Specific force and its slope at the samples, IMU axes (n, 3) each, gaps bridged; None without an accelerometer.
 
-    No profile changes them.
+    Independent of the profile.
     """
     finite = np.isfinite(imu.accel_m_s2).all(axis=1)
     if finite.mean() < MIN_FINITE or finite.sum() < 4:
@@ -101,7 +101,7 @@ def integrate_accelerometer(
     """Integrate specific force twice along the gyroscope's orientation; None without an accelerometer.
 
     Between samples the world-axis force is linear: v ← v + ½ (a₀ + a₁) Δt, p ← p + v Δt + (2 a₀ + a₁) Δt² / 6.
-    measured: what :func:`force_at_samples` says, where that is known already.
+    measured: the result of :func:`force_at_samples`, if already known.
     """
     measured = measured or force_at_samples(imu)
     if measured is None:

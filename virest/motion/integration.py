@@ -1,4 +1,4 @@
-"""From inertial samples to motion (eqs 4-10), with exact exponentials and partial first and last intervals."""
+"""Integration of inertial samples (eqs 4-10), with exact exponentials and partial first and last intervals."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Array = NDArray[np.float64]
 
 
 def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRate | None = None) -> Trajectory:
-    """Turn angular rate into orientation: R[k+1] = R[k] exp(∫ ω dt) (eqs 7, 8 with the exact exponential).
+    """Integrate angular rate to orientation: R[k+1] = R[k] exp(∫ ω dt) (eqs 7, 8 with the exact exponential).
 
-    The rate between samples is a cubic spline through them, so a partial interval (eq 9's Δt_last) is integrated
-    exactly as far as it goes.  measured: what :func:`measured_rate` says, where that is known already.  A low
-    pass of the profile is undone.  Raises ImuError if fewer than two samples are given.
+    The rate between samples is a cubic spline, so a partial interval (eq 9's Δt_last) is integrated exactly.  measured:
+    the result of :func:`measured_rate`, if already known.  The profile's low-pass filter is undone.  Raises ImuError
+    for fewer than two samples.
     """
     polynomials = _camera_rate(measured or measured_rate(imu), profile)
     if (missing := missing_rate_rad_s(imu, profile)) is not None:
@@ -30,9 +30,9 @@ def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRa
 
 
 def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
-    """What the profile's fields of kind ``rate`` add to the true rate at the samples (n, 3), IMU axes; None: nothing.
+    """Sum of the profile's fields of kind ``rate`` at the samples (n, 3), IMU axes; None without such fields.
 
-    Along rates the covariate is the gyroscope's own reading, less bias and over scale.
+    Rate covariates are the gyroscope's readings after correction for bias and scale.
     """
     fields = [field for field in profile.extensions.field if field.kind == "rate"]
     if not fields:
@@ -45,7 +45,7 @@ def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
 
 
 def _camera_rate(measured: MeasuredRate, profile: CameraProfile) -> Array:
-    """True rate in camera axes, pieces (4, 3, n − 1): R_cam_imu (measured, before its low pass, − bias) / scale."""
+    """True rate in camera axes, pieces (4, 3, n − 1): R_cam_imu (measured, low-pass filter undone, − bias) / scale."""
     unbiased = measured.behind_low_pass(profile.extensions.gyro_lowpass_hz).copy()
     unbiased[3] -= np.array(profile.gyro_bias_rad_s)[:, None]
     return np.asarray((profile.rotation_cam_imu / np.array(profile.gyro_scale)) @ unbiased)
@@ -57,9 +57,9 @@ def _running_product(steps: Array) -> Array:
 
 
 def _products(steps: Array) -> Array:
-    """Products of the first one, two, ... of the steps: neighbours are paired and the pairs' products worked out first.
+    """Cumulative products of the steps: products of neighbouring pairs first, then recursively.
 
-    Two products a step in all, in log2(n) vectorised passes.
+    Two products per step in total, in log2(n) vectorised passes.
     """
     if len(steps) < 2:
         return steps

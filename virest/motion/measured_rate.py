@@ -1,13 +1,13 @@
-"""What the gyroscope's samples say between themselves, and the true rate behind a low pass.
+"""The gyroscope's rate between samples, and the true rate before its low-pass filter.
 
-The rate runs as a cubic spline m(t) through the samples.  Behind a second-order Butterworth low pass
-(:mod:`virest.camera.gyro_filter`) the true rate is m + τ m′ + ½ τ² m″, exactly: on a cubic piece another cubic piece.
+The rate is a cubic spline m(t) through the samples.  Before a second-order Butterworth low-pass filter
+(:mod:`virest.camera.gyro_filter`) the true rate is exactly m + τ m′ + ½ τ² m″: again a cubic on each piece.
 
-Derivatives enlarge the noise of the samples.  The best linear estimate of the true rate takes the derivatives of the
-best estimate of m instead, whatever the filter (a linear function of a conditional mean is the conditional mean of that
-function): of samples behind a Wiener filter, 1 − N/P at each frequency where P is more than chance, with P the power of
-the samples there and N that of their noise, measured where the band ends.  The samples themselves stay as they are, so
-that a filter of no delay changes nothing.
+Derivatives amplify the noise of the samples.  The best linear estimate of the true rate therefore uses the derivatives
+of the best estimate of m, for any filter (a linear function of a conditional mean is the conditional mean of that
+function): samples after a Wiener filter, 1 − N/P at each frequency with significant power, with P the power of the
+samples and N that of their noise, measured at the end of the band.  The samples themselves are kept, so that a filter
+without delay changes nothing.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from virest.errors import ImuError
 
 Array = NDArray[np.float64]
 GAP_PERIODS = 5.0
-"""A pause longer than this many median sample periods ends one spline and begins the next."""
+"""A gap longer than this many median sample periods separates two splines."""
 LEAST_RUN = 32
-"""Shorter runs of samples are not told from their noise, and taken as they are."""
+"""Shorter runs of samples are not denoised."""
 NOISE_BAND = 0.75
-"""From this part of the band up there is noise alone: 75 Hz at 200 samples/s, where a hand shakes at up to 15 Hz."""
+"""Above this fraction of the band there is only noise: 75 Hz at 200 samples/s, while hand shake ends at 15 Hz."""
 BAND_PART = 40
-"""The power at a frequency is the mean over this part of the band: some 30 values in 3 s at 400 samples/s."""
+"""The power at a frequency is the mean over 1 / this of the band: about 30 values in 3 s at 400 samples/s."""
 FALSE_ALARM = 1e-3
-"""Probability that in samples of noise alone any part of the band is taken for a turn."""
+"""Probability that samples of pure noise have significant power anywhere in the band."""
 
 
 @dataclass(frozen=True)
 class MeasuredRate:
-    """The rate as measured, whatever the profile: the work that is done once for a capture."""
+    """The measured rate, independent of the profile and computed once per capture."""
 
     time_s: Array
     """(n,) the samples' times."""
@@ -51,7 +51,7 @@ class MeasuredRate:
     """(4, 3, n − 1) cubic pieces between the samples, highest power first, IMU axes."""
 
     def behind_low_pass(self, cutoff_hz: float) -> Array:
-        """Pieces (4, 3, n − 1) of the rate that a low pass of this cutoff turned into the measured one; 0: none."""
+        """Pieces (4, 3, n − 1) of the rate before a low-pass filter of this cutoff; 0: no filter."""
         delay = delay_s(cutoff_hz)
         if not delay:
             return self.pieces
@@ -64,7 +64,7 @@ class MeasuredRate:
 
     @cached_property
     def _without_noise(self) -> Array:
-        """Pieces as ``pieces``, of samples less the noise that their spectrum shows."""
+        """Like ``pieces``, from denoised samples."""
         rate = self.rate_rad_s.copy()
         for run in _runs(self.time_s):
             if len(run) >= LEAST_RUN:
@@ -73,9 +73,9 @@ class MeasuredRate:
 
 
 def measured_rate(imu: ImuSamples) -> MeasuredRate:
-    """Spline through the samples; straight lines across gaps and in runs too short for a spline.
+    """Spline through the samples; linear across gaps and in runs too short for a spline.
 
-    No profile changes it.  Raises ImuError if fewer than two samples are given.
+    Independent of the profile.  Raises ImuError for fewer than two samples.
     """
     if len(imu) < 2:
         raise ImuError(f"{len(imu)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
@@ -83,9 +83,9 @@ def measured_rate(imu: ImuSamples) -> MeasuredRate:
 
 
 def without_noise(samples: Array) -> Array:
-    """Wiener estimate (n, k) of what evenly taken samples (n, k) have beside white noise, each column on its own.
+    """Wiener estimate (n, k) of the signal in evenly spaced samples (n, k) with white noise, column by column.
 
-    Cosine transforms mirror the samples at both ends, which therefore are no steps.
+    The cosine transform mirrors the samples at both ends, which avoids steps there.
     """
     amplitude = dct(samples, axis=0, norm="ortho")
     band = max(len(samples) // BAND_PART, 5)
@@ -97,7 +97,7 @@ def without_noise(samples: Array) -> Array:
 
 
 def _runs(time_s: Array) -> list[NDArray[np.intp]]:
-    """Samples without a gap between them."""
+    """Runs of samples without gaps."""
     step = np.diff(time_s)
     return np.split(np.arange(len(time_s)), np.flatnonzero(step > GAP_PERIODS * np.median(step)) + 1)
 

@@ -1,4 +1,4 @@
-"""The lens as it moves: focal length and stabiliser at every instant.
+"""The moving lens: focal length and stabiliser at every instant.
 
 ``focal_drift``: f(t) = f (1 + drift t) at every instant, t on the IMU's clock from stamp_0; fields of kind ``scale``
 add to the factor.  ``stabilisation``: the picture is shifted by f(t) · fraction · θ, with θ the camera's integrated
@@ -21,17 +21,17 @@ from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 SHIFT_STEP_S = 5e-4
-"""Grid of the stabiliser's path: at 50 rad/s² a straight line over it is off by 1.6e-6 rad."""
+"""Step of the stabiliser's path: at 50 rad/s² linear interpolation errs by 1.6e-6 rad."""
 SETTLED = 16.0
-"""After this many time constants 1 / (2π cutoff) the high-pass has forgotten its start but for 1e-7 of it."""
+"""After this many time constants 1 / (2π cutoff) the high-pass filter's initial state has decayed to 1e-7."""
 RADIUS_STEPS = 5
-"""A scale over the radius changes by a few per cent over it: each step of its inversion shrinks the error so."""
+"""A scale over the radius changes by a few percent: each step of its inversion reduces the error by that factor."""
 _SMALL = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class MovingLens:
-    """A lens whose focal length drifts and which a stabiliser shifts."""
+    """A lens with a drifting focal length, shifted by a stabiliser."""
 
     lens: Intrinsics
     """At stamp_0, with the stabiliser at rest."""
@@ -39,13 +39,13 @@ class MovingLens:
     shift_time_s: Array | None = None
     """(m,) rising, IMU clock from stamp_0; None: no stabiliser."""
     shift: Array | None = None
-    """(m, 2) at those times, units of the focal length, added before distortion; straight lines between, ends held."""
+    """(m, 2) at those times, units of the focal length, added before distortion; linear between, constant beyond."""
     path: tuple[Array, Array] | None = None
-    """All times (k,) of the motion and the camera's rates (k, 3) then, from which the shift was worked out."""
+    """All times (k,) of the motion and the camera's rates (k, 3), from which the shift was computed."""
     swing: tuple[float, Array] | None = None
-    """Cutoff (Hz) of the stabiliser and the shift (k, 2) at those times if it cancelled all above it, from rest."""
+    """Cutoff (Hz) of the stabiliser and the shift (k, 2), from rest, if it cancelled everything above the cutoff."""
     zoom: tuple[Field, ...] = ()
-    """Parts by which the focal length is longer, over time or over what is logged."""
+    """Relative changes of the focal length, over time or a logged covariate."""
 
     def rays(self, points_px: Array, time_s: Any, exposure_s: Any = 0.0) -> Array:
         """Rays (..., 3) with z = 1 through pixels (..., 2) seen at times (...): the inverse of :meth:`project`."""
@@ -58,9 +58,9 @@ class MovingLens:
         return self.lens.rays(points_px)
 
     def from_rest(self, rays: Array, time_s: Any, exposure_s: Any = 0.0) -> Array:
-        """Rays (..., 3) through where :meth:`rays_at_rest` go, with the stabiliser where it is at times (...).
+        """The rays (..., 3) of :meth:`rays_at_rest`, corrected for the stabiliser's shift at times (...).
 
-        exposure_s: (...) about those times, over which the rays are the mean ones.
+        exposure_s: (...) around those times, over which the shift is averaged.
         """
         if self.shift is None:
             return rays
@@ -68,9 +68,9 @@ class MovingLens:
         return np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
 
     def project(self, rays: Array, time_s: Any, exposure_s: Any = 0.0) -> Array:
-        """Pixels (..., 2) at which rays (..., 3) in camera axes are seen at times (...), or over exposures about them.
+        """Pixels (..., 2) of rays (..., 3) in camera axes at times (...), or over exposures around them.
 
-        exposure_s: (...); the rays are then the mean ones.
+        exposure_s: (...), over which the stabiliser's shift is averaged.
         """
         if self.shift is not None:
             plane = rays[..., :2] / rays[..., 2:] + self.shift_at(time_s, exposure_s)
@@ -84,9 +84,9 @@ class MovingLens:
         return points_px
 
     def shift_at(self, time_s: Any, exposure_s: Any = 0.0) -> Array:
-        """The stabiliser's mean shift (..., 2) over exposures (...) about times (...), units of the focal length.
+        """The stabiliser's mean shift (..., 2) over exposures (...) around times (...), units of the focal length.
 
-        By Gauss' two nodes: exact for paths that bend like a polynomial of third order.
+        Two-point Gauss quadrature: exact for paths that are cubic polynomials.
         """
         if self.shift is None or self.shift_time_s is None:
             return np.zeros((*np.shape(time_s), 2))
@@ -96,7 +96,7 @@ class MovingLens:
         return np.stack([np.interp(time_s, self.shift_time_s, self.shift[:, i]) for i in (0, 1)], axis=-1)
 
     def between(self, start_s: float, end_s: float) -> MovingLens:
-        """The same lens with the stabiliser's path cut to what covers [start_s, end_s]."""
+        """The same lens with the stabiliser's path restricted to [start_s, end_s]."""
         if self.shift_time_s is None or self.shift is None:
             return self
         first = max(int(np.searchsorted(self.shift_time_s, start_s, side="right")) - 1, 0)
@@ -126,10 +126,9 @@ def moving_lens(
 ) -> MovingLens:
     """The profile's lens along a motion; the stabiliser is at rest at the trajectory's first knot.
 
-    step_s: grid of the stabiliser's path; a fit of tracked points bears a wider one than a restored picture.  like: a
-    lens along the same motion on the same grid.
-    Let the trajectory begin :func:`settling_time_s` before the first time of interest, or where the log begins.
-    Raises ValueError without a focal length.
+    step_s: step of the stabiliser's path; a fit of tracked points tolerates a wider one than a restored picture.  like:
+    a lens along the same motion on the same grid.  The trajectory should start :func:`settling_time_s` before the first
+    time of interest, or with the log.  Raises ValueError without a focal length.
     """
     if profile.intrinsics is None:
         raise ValueError("the geometry needs intrinsics; frames without a focal length are copied")
@@ -154,18 +153,18 @@ def moving_lens(
 
 
 def _on_imu_clock(field: Field, profile: CameraProfile) -> Field:
-    """A field over what the camera logs, its times brought to the IMU's clock; others have none or that one already."""
+    """A field over a logged covariate with its times converted to the IMU clock; other fields are unchanged."""
     return field if field.log is None else field.later(-(profile.time_offset_s or 0.0))
 
 
 def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:
-    """Whole multiples of the step, and both ends: parts of a log share their grid, and so every digit."""
+    """Multiples of the step, and both ends: parts of a log share the grid, so results are identical to the last bit."""
     first, last = int(np.floor(start_s / step_s)) + 1, int(np.ceil(end_s / step_s))
     return np.concatenate([[start_s], step_s * np.arange(first, last), [end_s]])
 
 
 def settling_time_s(profile: CameraProfile) -> float:
-    """How long before a picture the inertial data must begin, for the stabiliser's place not to depend on it."""
+    """Time before a picture at which the inertial data must start for the stabiliser's state not to depend on it."""
     extensions = profile.extensions
     if not extensions.stabilisation_fraction:
         return 0.0
@@ -187,7 +186,7 @@ def stabiliser_shift(time_s: Array, rate_cam_rad_s: Array, fraction: float, cuto
 
 
 def _exponential_means(x: Array) -> tuple[Array, Array]:
-    """∫₀¹ e^(−x (1 − u)) du and ∫₀¹ u e^(−x (1 − u)) du: what a constant and a rising rate leave after a step."""
+    """∫₀¹ e^(−x (1 − u)) du and ∫₀¹ u e^(−x (1 − u)) du: response to a constant and a rising rate after a step."""
     safe = np.where(x > _SMALL, x, 1.0)
     mean = np.where(x > _SMALL, -np.expm1(-safe) / safe, 1 - x / 2 + x * x / 6)
     ramp = np.where(x > _SMALL, (1 + np.expm1(-safe) / safe) / safe, 0.5 - x / 6 + x * x / 24)
@@ -200,7 +199,7 @@ def _running_response(decay: Array, drive: Array) -> Array:
 
 
 def _responses(decay: Array, drive: Array) -> Array:
-    """θ[1:], from every other step: two steps are one with both decays. log2(n) vectorised passes, 2 n steps in all."""
+    """θ[1:], recursively: two steps combine into one with both decays. log2(n) vectorised passes, 2 n steps in all."""
     if len(drive) < 2:
         return drive
     found = np.empty_like(drive)

@@ -1,4 +1,4 @@
-"""Inverse depth that stands out of a plane, over one frame's picture: a coarse grid with straight lines between."""
+"""Relief: inverse depth relative to a plane over one frame's picture, on a coarse grid with bilinear interpolation."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Relief:
-    """Inverse depth above a plane over one frame's picture; camera axes at the frame's reference time."""
+    """Inverse depth relative to a plane over one frame's picture; camera axes at the frame's reference time."""
 
     low: Array
     """(2,) angles of the first node."""
     size: Array
     """(2,) angle from the first node to the last along x and y."""
     above_per_m: NDArray[np.float32]
-    """(rows, columns) at the nodes; bilinear between them, held beyond the outermost."""
+    """(rows, columns) at the nodes; bilinear between them, constant beyond the outermost."""
     std_per_m: NDArray[np.float32]
-    """(fewer rows, fewer columns) of the surface over the same angles, without the metric scale's."""
+    """(fewer rows, fewer columns) standard deviation over the same angles, without that of the metric scale."""
 
     def at(self, rays: Array) -> Array:
         """Inverse depth above the plane (...) along rays (..., 3)."""
@@ -34,9 +34,9 @@ class Relief:
     def _between(self, values: NDArray[np.float32], rays: Array) -> Array:
         rows, columns = values.shape
         nodes = np.array([columns - 1, rows - 1])
-        place = np.clip((angles(rays) - self.low) / self.size * nodes, 0.0, nodes - 1e-6)
-        first = place.astype(np.intp)
-        x, y = np.moveaxis(place - first, -1, 0)
+        position = np.clip((angles(rays) - self.low) / self.size * nodes, 0.0, nodes - 1e-6)
+        first = position.astype(np.intp)
+        x, y = np.moveaxis(position - first, -1, 0)
         flat, start = values.ravel(), first[..., 1] * columns + first[..., 0]
         upper = flat[start] * (1 - x) + flat[start + 1] * x
         lower = flat[start + columns] * (1 - x) + flat[start + columns + 1] * x
@@ -44,6 +44,6 @@ class Relief:
 
 
 def angles(rays: Array) -> Array:
-    """Rays (..., 3) as angles from the optical axis along x and y, (..., 2): even over wide lenses too."""
+    """Rays (..., 3) as angles from the optical axis along x and y, (..., 2): evenly spaced for wide lenses too."""
     side = np.linalg.norm(rays[..., :2], axis=-1)
     return np.asarray(rays[..., :2] * (np.arctan2(side, rays[..., 2]) / np.maximum(side, 1e-12))[..., None])

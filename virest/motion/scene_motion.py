@@ -1,8 +1,8 @@
-"""What a gyroscope leaves open of the camera's path and of the scene: unknowns that ride along in every fit.
+"""Unknowns of the camera's translation and of the scene that a gyroscope cannot measure: fitted with every profile.
 
-Two descriptions.  `InertialMotion`: the accelerometer tells the path but for velocity, gravity, its own bias and delay,
-and the scene is a plane in metres: a vector with priors for a Gauss-Newton fit.  `DirectedMotion`: no accelerometer;
-only the direction of travel is used, and points are judged across the parallax that it gives.
+Two models.  `InertialMotion`: the accelerometer gives the path up to velocity, gravity, its own bias and delay, and the
+scene is a plane in metres: a vector with priors for a Gauss-Newton fit.  `DirectedMotion`: without an accelerometer,
+only the direction of travel is estimated, and only residuals across its parallax are used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PLANE_STD_PER_M = 1.5
 
 @dataclass(frozen=True, slots=True)
 class InertialMotion:
-    """Path by the accelerometer; world axes of the trajectory, windows of a few seconds."""
+    """Path from the accelerometer; world axes of the trajectory, windows of a few seconds."""
 
     velocity_m_s: Array
     """(windows, 3) of the IMU at each window's middle."""
@@ -31,11 +31,11 @@ class InertialMotion:
     accel_bias_m_s2: Array
     """(3,) IMU axes."""
     accel_delay_s: float
-    """By which accelerations are older than their stamps say."""
+    """Delay of the accelerations: they are older than their timestamps by this."""
     plane_per_m: Array
     """(windows, 3) m of the scene's plane m · X = 1, origin at the camera's centre at the window's middle."""
     plane_std_per_m: tuple[float, float, float] = (PLANE_STD_PER_M,) * 3
-    """Prior of the plane about where the fit began, in ``plane_axes``."""
+    """Prior standard deviations of the plane about its starting value, in ``plane_axes``."""
     plane_axes: Array | None = None
     """(windows, 3, 3) R_world_plane: axes in which planes are varied; None: the world's."""
 
@@ -68,7 +68,7 @@ class InertialMotion:
         )
 
     def prior_std(self) -> Array:
-        """How far each entry may lie from where the fit began."""
+        """Prior standard deviation of each entry about its starting value."""
         own = [VELOCITY_STD_M_S] * 3 + list(self.plane_std_per_m)
         shared = [GRAVITY_STD_M_S2] * 3 + [ACCEL_BIAS_STD_M_S2] * 3 + [ACCEL_DELAY_STD_S]
         return np.array(shared + own * self.windows)
@@ -80,16 +80,16 @@ class InertialMotion:
 
 @dataclass(frozen=True, slots=True)
 class DirectedMotion:
-    """Path without an accelerometer: only which way the camera goes, in the trajectory's world axes.
+    """Motion without an accelerometer: only the direction of travel, in the trajectory's world axes.
 
-    Depths being unknown, parallax may move a point by any amount along its direction; what lies across is judged.
+    Since depths are unknown, parallax may move a point by any amount along its direction; only residuals across count.
     """
 
     direction: Array
     """(groups, 3) unit vectors; one for the whole capture (a vehicle), or one for each pair."""
 
     def vector(self) -> Array:
-        """Nothing that a step could change: directions are found anew between descents."""
+        """Empty: directions are eliminated from the fit, not changed by its steps."""
         return np.zeros(0)
 
     def with_vector(self, vector: Array) -> DirectedMotion:
@@ -105,7 +105,7 @@ class DirectedMotion:
         return np.zeros(0)
 
     def group(self, pair: NDArray[np.intp]) -> NDArray[np.intp]:
-        """(n,) which direction each point's pair has."""
+        """(n,) index of each pair's direction."""
         return np.zeros_like(pair) if len(self.direction) == 1 else pair
 
 

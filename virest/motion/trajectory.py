@@ -15,7 +15,7 @@ _SMALL_SQUARE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Orientation of the camera at any time, from knots joined by exact exponentials of the integrated rate.
+    """Orientation of the camera at any time, from knots and exact exponentials of the integrated rate between them.
 
     Between knot k and k+1 the rate is a cubic polynomial, and R_world_cam(t) = R_k exp(integral of the rate).
     World axes are the camera axes at the first knot.
@@ -52,9 +52,9 @@ class Trajectory:
         return np.asarray(self.rotation_world_cam.take(interval, axis=0) @ _exponential(*angle))
 
     def mean_orientation(self, middle_s: Array, exposure_s: Array) -> Orientations:
-        """R_world_cam averaged over exposures about the times (n,): R exp(ω' E² / 24), to second order.
+        """R_world_cam averaged over exposures around the times (n,): R exp(ω' E² / 24), to second order.
 
-        The two turns since the knot are put together as exp(u) exp(v) ≈ exp(u + v + ½ u × v): v is some 1e-4 rad.
+        The two rotations since the knot are combined as exp(u) exp(v) ≈ exp(u + v + ½ u × v): v is about 1e-4 rad.
         """
         interval, since = self._locate(middle_s)
         pieces = self.rate_polynomials.take(interval, axis=2)
@@ -65,7 +65,7 @@ class Trajectory:
         return Orientations(self.rotation_world_cam.take(interval, axis=0), _exponential(*both))
 
     def _locate(self, time_s: Array) -> tuple[NDArray[np.intp], Array]:
-        """Interval of each time (...), and the seconds since its knot (...). Outside the knots the ends are held."""
+        """Interval of each time (...), and the seconds since its knot (...). Times beyond the knots are clipped."""
         held = np.clip(time_s, self.time_s[0], self.time_s[-1])
         interval = np.clip(np.searchsorted(self.time_s, held, side="right") - 1, 0, len(self.time_s) - 2)
         return interval, held - self.time_s[interval]
@@ -81,16 +81,16 @@ class Orientations:
     """(n, 3, 3)."""
 
     def to_world(self, rays: Array) -> Array:
-        """Rays (n, 3) in camera axes, in world axes."""
+        """Rays (n, 3) from camera to world axes."""
         return turned(self.knot, turned(self.since, rays))
 
     def to_camera(self, rays: Array) -> Array:
-        """Rays (n, 3) in world axes, in camera axes."""
+        """Rays (n, 3) from world to camera axes."""
         in_knot = np.einsum("nji,nj->ni", self.knot, rays)
         return np.asarray(np.einsum("nji,nj->ni", self.since, in_knot))
 
     def per_world(self, slopes: Array) -> Array:
-        """Slopes (n, k, 3) by camera axes, as slopes by world axes."""
+        """Slopes (n, k, 3) with respect to camera axes, converted to world axes."""
         return np.asarray(slopes @ np.swapaxes(self.since, -1, -2) @ np.swapaxes(self.knot, -1, -2))
 
 
