@@ -1,4 +1,4 @@
-"""``virest export CAPTURE``: frames and inertial samples in the folders that SLAM tools read, without ROS.
+"""``virest export CAPTURE``: frames and inertial samples in the folder layouts that SLAM tools read, without ROS.
 
     euroc   mav0/cam0/{data/<ns>.png, data.csv, sensor.yaml}, mav0/imu0/{data.csv, sensor.yaml}, dso/cam0/times.txt
     tum     rgb/<s>.png, rgb.txt, accelerometer.txt, imu.txt
@@ -219,7 +219,7 @@ def _said(plan: ExportPlan) -> list[str]:
     kind = "restored by virest process" if plan.options.restored else "as recorded"
     return [
         f"{plan.capture.name}, pictures {kind}; profile from {Path(plan.source).name}",
-        f"a picture stands for the instant {1e3 * plan.instant_s:.4f} ms after its stamp",
+        f"a picture shows the instant {1e3 * plan.instant_s:.4f} ms after its timestamp",
         *(note.text for note in plan.notes if not note.on_stamps),
     ]
 
@@ -282,12 +282,12 @@ def _facts(plan: ExportPlan, frames: list[ExportFrame]) -> Json:
 
 
 def describe(facts: Json) -> str:
-    """Lines for people."""
+    """The printed lines."""
     span_s = (facts["span_ns"][1] - facts["span_ns"][0]) / 1e9
     lines = [
         f"{facts['capture']}: {facts['frames']} {facts['pictures']} frames over {span_s:.2f} s and "
-        f"{facts['imu_rows']} inertial rows as {facts['format']}"
+        f"{facts['imu_rows']} IMU samples in {facts['format']} format"
     ]
     lines += [f"left out: {number} frames ({reason})" for reason, number in facts["left_out"].items()]
-    lines.append(f"a frame shows the instant {1e3 * facts['instant_after_stamp_s']:.2f} ms after its stamp")
+    lines.append(f"a frame shows the instant {1e3 * facts['instant_after_stamp_s']:.2f} ms after its timestamp")
     return "\n".join([*lines, f"wrote {facts['folder']}"])

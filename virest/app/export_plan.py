@@ -172,11 +172,11 @@ def _require_free(target: Path, capture: Path, options: ExportOptions) -> None:
     for kept in (capture, options.restored):
         place = target.resolve()
         if kept is not None and (place == kept.resolve() or place in kept.resolve().parents):
-            raise OutputError(f"{target}: is where {kept} lies", hint="choose another folder with --out")
+            raise OutputError(f"{target}: contains {kept}", hint="choose another folder with --out")
     if not target.exists() and not target.is_symlink():
         return
     if not (target / RECORD).is_file():
-        raise OutputError(f"{target}: exists and is not an export of virest", hint="choose another folder with --out")
+        raise OutputError(f"{target}: exists and is not a virest export", hint="choose another folder with --out")
     if not options.overwrite:
         raise OutputError(f"{target}: holds an export", hint="--overwrite replaces it, --out chooses another folder")
 
@@ -361,13 +361,13 @@ def _notes(
     notes = []
     if profile.time_offset_s is None:
         notes.append(
-            "the time offset between camera and IMU is unknown: samples keep their times; find it by `virest calibrate`"
+            "the time offset between camera and IMU is unknown: samples keep their times; run `virest calibrate`"
         )
     if profile.intrinsics is None:
         notes.append("the focal length is unknown: no camera calibration is written; give --config, or calibrate")
     if rates := {field.covariates[0]: 1 for field in profile.fields if field.kind == "rate"}:
         over = ", ".join(rates)
-        notes.append(f"the readings of the gyroscope are written with the fields of its rate over {over} added")
+        notes.append(f"gyroscope readings are written with the profile's rate fields over {over} added")
     if unbridged := profile.unbridged_s:
         spans = ", ".join(f"{begin:.2f} to {end:.2f} s" for begin, end in unbridged[:3])
         more = f" and {len(unbridged) - 3} more" if len(unbridged) > 3 else ""
@@ -378,8 +378,8 @@ def _notes(
     shift_ms = 1e3 * float(np.median(instants_s))
     if options.stamps == "logged" and abs(shift_ms) > 1.0:
         text = (
-            f"a picture stands for an instant {shift_ms:.1f} ms after its stamp (timeshift_cam_imu); for tools that "
-            "cannot shift times, as ORB-SLAM3, export with --stamps instant"
+            f"a picture shows the instant {shift_ms:.1f} ms after its timestamp (timeshift_cam_imu); for tools without "
+            "a time shift, such as ORB-SLAM3, export with --stamps instant"
         )
         found.append(ExportNote(text, on_stamps=True))
     return found

@@ -1,4 +1,4 @@
-"""A film of a run: restored frames, or recorded beside restored ones, as MP4 with the movie's stamps and rotation."""
+"""A video of a run: restored frames, or recorded beside restored ones, as MP4 with the movie's stamps and rotation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from virest.errors import OutputError
 Picture = NDArray[np.uint8]
 TICKS_PER_S = 90_000
 QUALITY = "17"
-"""x264's constant rate factor: hardly a difference to the PNGs is to be seen."""
+"""x264's constant rate factor: hardly distinguishable from the PNGs."""
 BT601 = 6
 UPRIGHT = (1, 0, 0, 1)
 _BOXES_WITH_BOXES = (b"moov", b"trak", b"mdia")
@@ -31,7 +31,7 @@ _MOST_HEADER_BYTES = 64 * 2**20
 def write_film(
     path: Path, frames: Iterable[tuple[int, Picture]], fps: float, turn: tuple[int, int, int, int] = UPRIGHT
 ) -> int:
-    """Write (stamp in ns from the first, RGB picture) as H.264; the film appears whole or not at all.
+    """Write (timestamp in ns from the first, RGB picture) as H.264, atomically.
 
     turn: a, b, c, d of the display matrix, as :func:`display_turn` reads it.  Returns the number of frames.  Raises
     OutputError.
@@ -53,7 +53,7 @@ def write_film(
                 container.mux(stream.encode(frame))
                 count += 1
             if stream is None:
-                raise OutputError(f"{path}: no frame to show", hint="choose other frames")
+                raise OutputError(f"{path}: no frame to show", hint="select other frames")
             container.mux(stream.encode(None))
         if turn != UPRIGHT:
             _set_turn(part, turn, *size)
@@ -67,7 +67,7 @@ def write_film(
 
 
 def side_by_side(left: Picture, right: Picture, turn: tuple[int, int, int, int]) -> Picture:
-    """Two pictures of one size, so that they stand beside each other as displayed: stacked in a film that is turned."""
+    """Join two pictures of one size so that players show them side by side: stacked if the video is rotated by 90°."""
     a, b, _, _ = turn
     if a:
         return np.hstack([left, right] if a > 0 else [right, left])
@@ -86,7 +86,7 @@ def _stream(container: Any, width: int, height: int, fps: float) -> Any:
 
 
 def _even(picture: Picture) -> Picture:
-    """The picture with a repeated last row or column where its size is odd, as the format wants it."""
+    """The picture with its last row or column repeated if its size is odd; the format needs even sizes."""
     height, width = picture.shape[:2]
     if height % 2 or width % 2:
         picture = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
@@ -108,7 +108,7 @@ def display_turn(path: Path) -> tuple[int, int, int, int]:
 
 
 def _set_turn(path: Path, turn: tuple[int, int, int, int], width: int, height: int) -> None:
-    """Write the display matrix; the offset brings the turned picture back to the corner."""
+    """Write the display matrix; its offset moves the rotated picture back to the origin."""
     place, _ = next(_picture_tracks(path))
     a, b, c, d = turn
     x = width * (a < 0) + height * (c < 0)

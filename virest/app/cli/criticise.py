@@ -28,9 +28,9 @@ def criticise(
     \b
     $ virest criticise residuals.csv
     residuals.csv: 2400 residuals (2400 used), 0.202 px rms per coordinate
-    asked along x, y, row, frame
+    tested covariates: x, y, row, frame
     field: shifts of up to 0.677 px depend on the position in the picture, ...
-    left: 0.152 px without structure
+    remaining: 0.152 px without structure
     $ virest criticise residuals.csv --json | jq '.fields[].sentence'
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)

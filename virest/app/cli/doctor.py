@@ -12,7 +12,7 @@ def doctor(json: Json = False, quiet: Quiet = False, verbose: Verbose = False, v
     \b
     $ virest doctor
     ...
-    everything that virest needs is here
+    all requirements are installed
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     from virest.app.doctor import examine

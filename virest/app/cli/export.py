@@ -51,8 +51,8 @@ def export(
 
     \b
     $ virest export sample_data/text --format euroc --restored virest-out/text
-    text: 4 restored frames over 0.10 s and 320 inertial rows as euroc
-    a frame shows the instant 0.00 ms after its stamp
+    text: 4 restored frames over 0.10 s and 320 IMU samples in euroc format
+    a frame shows the instant 0.00 ms after its timestamp
     wrote virest-export/text
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
