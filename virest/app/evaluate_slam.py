@@ -246,7 +246,7 @@ def _tools(command: str | None) -> dict[str, Any]:
     try:
         used = {"virest": __version__, "evo": version("evo")}
     except PackageNotFoundError:
-        raise SettingsError("evo, which scores the trajectories, is not installed", hint="pip install 'virest[slam]'") from None
+        raise SettingsError("evo is needed to score trajectories", hint="pip install 'virest[slam]'") from None
     if command is not None:
         return {"versions": used, "tracker": command}
     require_pycolmap()

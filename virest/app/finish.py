@@ -97,7 +97,7 @@ def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
 def require_finishable(wishes: FinishWishes, name: str, run: Path, *, overwrite: bool) -> None:
     """Raise OutputError, before any work, if the request cannot be fulfilled."""
     if wishes.any and is_remote(run):
-        raise OutputError("--video and --crop need --out in a file system", hint="process into a folder, then upload it")
+        raise OutputError("--video and --crop need a local --out", hint="process to a folder, then upload")
     film = wishes.film_of(name)
     if film is None:
         return
@@ -150,7 +150,7 @@ def common_rectangle(lines: Iterable[Json]) -> Crop:
     x0, y0 = np.max([px[:2] for px in inside], axis=0).tolist()
     x1, y1 = np.min([px[2:] for px in inside], axis=0).tolist()
     if min(x1 - x0, y1 - y0) < LEAST_CROP_PX:
-        raise OutputError("--crop: no area holds recorded data in every frame", hint="use --mask, or select fewer --frames")
+        raise OutputError("--crop: no area holds recorded data in every frame", hint="use --mask, or fewer --frames")
     return (x0, y0, x1, y1)
 
 

@@ -1,4 +1,4 @@
-"""``virest profile``: a camera profile to start from, and the readout times of known phones."""
+"""``virest profile``: create a camera profile, and list the readout times of known phones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ COMMENTS = {
 
 @dataclass(frozen=True, slots=True)
 class NewProfile:
-    """What ``virest profile new`` was asked for."""
+    """The options of one ``virest profile new``."""
 
     capture: Path | None = None
     device: str | None = None
@@ -46,7 +46,7 @@ class NewProfile:
 
 
 def run_new_profile(wishes: NewProfile) -> tuple[Json, str]:
-    """Write the profile; the mapping for ``--json`` and the text for people."""
+    """Write the profile; returns the mapping for ``--json`` and the printed text."""
     if wishes.out.exists() and not wishes.overwrite:
         raise OutputError(f"{wishes.out}: exists already", hint="name another by --out, or pass --overwrite")
     profile, source = _base(wishes)
@@ -77,7 +77,7 @@ def run_new_profile(wishes: NewProfile) -> tuple[Json, str]:
 
 
 def commented(profile: CameraProfile, notes: list[str]) -> str:
-    """The profile's YAML with a word on each key that readers ask about."""
+    """The profile's YAML with comments on its main keys."""
     lines = [f"# {note}" for note in notes]
     for line in format_profile(profile).splitlines():
         key = line.strip().partition(":")[0]
@@ -126,7 +126,7 @@ def _base(wishes: NewProfile) -> tuple[CameraProfile, str]:
         return profile, f"{capture.name}, {source}"
     if wishes.size is None:
         raise SettingsError("neither a capture nor a frame size is given", hint="pass CAPTURE, or --size WxH")
-    return phone_profile(*wishes.size), "a phone's usual axes"
+    return phone_profile(*wishes.size), "typical phone axes"
 
 
 def _focal_px(wishes: NewProfile, profile: CameraProfile) -> float | None:
@@ -135,7 +135,7 @@ def _focal_px(wishes: NewProfile, profile: CameraProfile) -> float | None:
     if wishes.fov_deg is None:
         return None
     if not 1 < wishes.fov_deg < 170:
-        raise SettingsError(f"field of view {wishes.fov_deg:g} is not in 1 to 170 degrees", hint="along the long side")
+        raise SettingsError(f"field of view {wishes.fov_deg:g} is not in 1 to 170 degrees", hint="give the angle along the long side")
     return max(profile.width, profile.height) / 2 / math.tan(math.radians(wishes.fov_deg) / 2)
 
 
@@ -150,6 +150,6 @@ def _entry(device: str, profile: CameraProfile) -> Readout:
         modes = ", ".join(f"{entry.device} {entry.width}x{entry.height}" for entry in found)
         raise SettingsError(
             f"no readout time of {device!r} at {profile.width}x{profile.height} is known ({modes})",
-            hint="a readout holds for one mode; virest calibrate measures it",
+            hint="a readout time applies to one mode; virest calibrate measures it",
         )
     return same[0]
