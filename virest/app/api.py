@@ -89,7 +89,9 @@ class Capture:
         number = self._number(index)
         for _, picture in self.read_frames(number, number + 1):
             return picture
-        raise CaptureError(f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it")
+        raise CaptureError(
+            f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it"
+        )
 
     def restore(self, index: int, preset: str = "balanced", **settings: Any) -> RestoredFrame:
         """Restore one frame as ``virest process`` does; unknown profile values and translation are estimated once."""
@@ -103,7 +105,9 @@ class Capture:
         read = read_frames(self.record.movie, self._movie(), around[0], around[-1], steps)
         decoded = {n: picture for n, picture in read if picture is not None}
         if number not in decoded:
-            raise CaptureError(f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it")
+            raise CaptureError(
+                f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it"
+            )
         near = [(self.frames[k], decoded[k]) for k in sorted(decoded) if k == number or not self.frames[k].skip_reason]
         return next(restore_frames(near, self.imu, plan, {number}, steps))
 

@@ -210,7 +210,7 @@ def _profile_text(facts: Json, profile: CameraProfile) -> str:
     return "".join(f"# {_one_line(line)}\n" for line in head) + format_profile(profile)
 
 
-# ── JSON results ─────────────────────────────────────────────────────────────────────────────────────────
+# ── JSON results ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise | None) -> Json:
@@ -310,7 +310,7 @@ def _imu_disagreements(file: ImuNoise, measured: ImuNoise) -> list[str]:
     return notes
 
 
-# ── printed results ───────────────────────────────────────────────────────────────────────────────────────────
+# ── printed results ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def describe(facts: Json) -> str:

@@ -151,7 +151,9 @@ def _notes(facts: Json) -> list[str]:
         )
     if facts.get("fft_s", 0.0) > 2 * USUAL_FFT_S:
         times = facts["fft_s"] / USUAL_FFT_S
-        notes.append(f"a Fourier transform takes {times:.1f} times the usual time: slow core, or one that other processes use too")
+        notes.append(
+            f"a Fourier transform takes {times:.1f} times the usual time: slow core, or one shared with other processes"
+        )
     if facts["free_bytes_here"] < 2e9:
         notes.append(
             f"{facts['free_bytes_here'] / 1e9:.1f} GB free here; a minute of 720x1280 as PNGs takes about 2 GB"

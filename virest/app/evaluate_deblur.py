@@ -262,7 +262,9 @@ def _common_names(restored: Path, reference: Path) -> list[str]:
     there = {p.name for p in reference.iterdir()}
     names = sorted(p.name for p in restored.iterdir() if p.suffix.lower() in PICTURE_ENDINGS and p.name in there)
     if not names:
-        raise CaptureError(f"{restored} and {reference} have no file name in common", hint="name pairs alike: 000017.png")
+        raise CaptureError(
+            f"{restored} and {reference} have no file name in common", hint="name pairs alike: 000017.png"
+        )
     return names
 
 
@@ -321,7 +323,7 @@ def _moved(picture: Picture, shift: NDArray[np.float64]) -> Picture:
     return np.asarray(cv2.warpAffine(picture, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-# ── results ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _facts(results: list[FrameResult], about: dict[str, Any], case: str = CASE) -> dict[str, Any]:

@@ -265,7 +265,7 @@ def _titled(name: str, picture: Picture) -> Picture:
     return np.concatenate([head, framed])
 
 
-# ── results ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _facts(results: list[FrameResult], missed: dict[str, int], options: ShutterOptions) -> dict[str, Any]:

@@ -135,7 +135,9 @@ def _focal_px(wishes: NewProfile, profile: CameraProfile) -> float | None:
     if wishes.fov_deg is None:
         return None
     if not 1 < wishes.fov_deg < 170:
-        raise SettingsError(f"field of view {wishes.fov_deg:g} is not in 1 to 170 degrees", hint="give the angle along the long side")
+        raise SettingsError(
+            f"field of view {wishes.fov_deg:g} is not in 1 to 170 degrees", hint="give the angle along the long side"
+        )
     return max(profile.width, profile.height) / 2 / math.tan(math.radians(wishes.fov_deg) / 2)
 
 

@@ -128,7 +128,5 @@ def capture_name(path: str) -> str:
     place = locate(path)
     name = place.name if is_remote(place) else os.path.basename(os.path.abspath(place))
     if not name or name in (".", "..") or any(unicodedata.category(c) in UNPRINTABLE for c in name) or "/" in name:
-        raise OutputError(
-            f"{path!r}: {name!r} cannot name an output folder", hint="rename the capture's folder"
-        )
+        raise OutputError(f"{path!r}: {name!r} cannot name an output folder", hint="rename the capture's folder")
     return name

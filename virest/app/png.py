@@ -47,9 +47,7 @@ def _channels(picture: NDArray[np.uint8]) -> int:
     channels = 1 if picture.ndim == 2 else picture.shape[-1]
     right = picture.dtype == np.uint8 and picture.ndim in (2, 3) and channels in _COLOUR_TYPES
     if not right or not picture.size or max(picture.shape) > MOST_PX:
-        raise ValueError(
-            f"{picture.dtype} {picture.shape}: not an 8-bit picture (height, width) or (height, width, 3)"
-        )
+        raise ValueError(f"{picture.dtype} {picture.shape}: not an 8-bit picture (height, width) or (height, width, 3)")
     return channels
 
 

@@ -322,7 +322,7 @@ def _inside(folder: Path) -> Iterable[Path]:
         return ()
 
 
-# ── results ────────────────────────────────────────────────────────────────────────────────────────
+# ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _facts(target: Path, size: int, records: Sequence[CaptureRecord], failures: list[Json]) -> Json:

@@ -14,18 +14,24 @@ CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
 
 
 def calibrate_curve(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture of a static scene.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture of a static scene.")
+    ],
     exposures: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Exposure times, columns file,exposure_s. [from EXIF]")
     ] = None,
     kind: Annotated[
         str | None,
-        typer.Option(metavar="KIND", callback=one_of(CURVE_KINDS), help=f"Curve model: {', '.join(CURVE_KINDS)}. [auto]"),
+        typer.Option(
+            metavar="KIND", callback=one_of(CURVE_KINDS), help=f"Curve model: {', '.join(CURVE_KINDS)}. [auto]"
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Write the response block here.")] = Path(
         "curve.yaml"
     ),
-    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Plot curve, data and residuals to this png, svg or pdf.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Plot curve, data and residuals to this png, svg or pdf.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     json: Json = False,
     quiet: Quiet = False,

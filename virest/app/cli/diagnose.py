@@ -14,9 +14,9 @@ from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, cores,
 def diagnose(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
     config: Config = None,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Write the results to DIR/<capture>.")
-    ] = Path("virest-out"),
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Write the results to DIR/<capture>.")] = Path(
+        "virest-out"
+    ),
     check: Annotated[bool, typer.Option("--check", help="Exit with 10 unless the verdict is consistent.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing diagnosis.")] = False,
     json: Json = False,

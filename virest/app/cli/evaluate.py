@@ -92,10 +92,15 @@ def deblur(
     restored: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Evaluate these pictures against --reference.")
     ] = None,
-    reference: Annotated[Path | None, typer.Option(metavar="DIR", help="Reference pictures with the same names.")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Reference pictures with the same names.")
+    ] = None,
     out: Maps = None,
     over_time: Annotated[
-        bool, typer.Option("--over-time", help="Compare joint restoration with neighbouring frames to merging aligned frames.")
+        bool,
+        typer.Option(
+            "--over-time", help="Compare joint restoration with neighbouring frames to merging aligned frames."
+        ),
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Two simulated captures, two or three frames each.")] = False,
     json: Json = False,

@@ -15,7 +15,9 @@ from virest.restoration.settings import PRESETS
 def slam(
     captures: Annotated[
         list[str] | None,
-        typer.Argument(metavar="CAPTURE", help="Capture folders with truth/; - reads their paths from stdin. [simulated]"),
+        typer.Argument(
+            metavar="CAPTURE", help="Capture folders with truth/; - reads their paths from stdin. [simulated]"
+        ),
     ] = None,
     command: Annotated[
         str | None,
@@ -29,7 +31,9 @@ def slam(
     preset: Annotated[
         str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Preset of the restoration.")
     ] = "balanced",
-    timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", min=0.1, help="Time limit of one run of CMD, in seconds.")] = 600.0,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", metavar="S", min=0.1, help="Time limit of one run of CMD, in seconds.")
+    ] = 600.0,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Keep sequences, trajectories and results here.")
     ] = None,

@@ -27,7 +27,8 @@ def export(
     ] = None,
     config: Config = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices.")
+        str | None,
+        typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
     ] = None,
     stamps: Annotated[
         str,

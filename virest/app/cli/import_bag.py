@@ -17,7 +17,9 @@ def import_bag(
     image: Annotated[
         str | None, typer.Option(metavar="TOPIC", help="Image topic. [the one with the most messages]")
     ] = None,
-    imu: Annotated[str | None, typer.Option(metavar="TOPIC", help="IMU topic. [the one with the most messages]")] = None,
+    imu: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="IMU topic. [the one with the most messages]")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier import.")] = False,
     json: Json = False,
     quiet: Quiet = False,

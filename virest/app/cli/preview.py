@@ -15,7 +15,8 @@ from virest.restoration.settings import PRESETS
 def preview(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder, or the movie in it.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write the picture (PNG) here. [CAPTURE-preview.png]")
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Write the picture (PNG) here. [CAPTURE-preview.png]"),
     ] = None,
     config: Config = None,
     frame: Annotated[int | None, typer.Option(metavar="N", help="Frame to show. [the most blurred]")] = None,

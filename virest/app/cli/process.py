@@ -35,9 +35,12 @@ def process(
         str, typer.Option("--out", "-o", metavar="DIR", help="Write one folder per capture here; s3:// works too.")
     ] = "virest-out",
     config: Config = None,
-    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings file, such as configs/balanced.yaml.")] = None,
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Settings file, such as configs/balanced.yaml.")
+    ] = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices.")
+        str | None,
+        typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
     ] = None,
     preset: Annotated[
         str | None, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="[balanced]")
@@ -53,7 +56,9 @@ def process(
     reference: Annotated[
         str | None,
         typer.Option(
-            metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Instant that a restored frame shows. [exposure-start]"
+            metavar="|".join(REFERENCES),
+            callback=one_of(REFERENCES),
+            help="Instant that a restored frame shows. [exposure-start]",
         ),
     ] = None,
     neighbours: Annotated[
@@ -68,7 +73,8 @@ def process(
         bool, typer.Option("--keep-start-up", help="Also process the frames of the recorder's start-up.")
     ] = False,
     video: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Write a video (MP4); {capture} is replaced by the capture's name.")
+        str | None,
+        typer.Option(metavar="FILE", help="Write a video (MP4); {capture} is replaced by the capture's name."),
     ] = None,
     side_by_side: Annotated[
         bool, typer.Option("--side-by-side", help="Show recorded beside restored frames in the video.")
@@ -84,7 +90,9 @@ def process(
     skip_copied: Annotated[
         bool, typer.Option("--skip-copied", help="Write no PNG for frames that are only copied.")
     ] = False,
-    shard: Annotated[str | None, typer.Option(metavar="i/N", help="Process only the i-th of N parts of the captures.")] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="i/N", help="Process only the i-th of N parts of the captures.")
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print frames, predicted gain, time and size; write nothing.")
     ] = False,

@@ -54,14 +54,18 @@ def simulate(
         Path | None,
         typer.Option(metavar="CAPTURE", help="Re-create this capture: its camera, timestamps, exposures and motion."),
     ] = None,
-    scene: Annotated[str, typer.Option(metavar="KIND", help="Scene: leaves, bright, board, text or photographs.")] = "leaves",
+    scene: Annotated[
+        str, typer.Option(metavar="KIND", help="Scene: leaves, bright, board, text or photographs.")
+    ] = "leaves",
     width: Annotated[int, typer.Option(metavar="PX")] = 720,
     height: Annotated[int, typer.Option(metavar="PX")] = 1280,
     frames: Annotated[
         str | None, typer.Option(metavar="N", help="Number of frames; with --like also A:B of its frames. [12; all]")
     ] = None,
     fps: Annotated[float, typer.Option(metavar="HZ", help="Frames per second.")] = 30.0,
-    exposure_ms: Annotated[str, typer.Option(metavar="MS[,MS...]", help="Exposure time; frames cycle through several.")] = "10",
+    exposure_ms: Annotated[
+        str, typer.Option(metavar="MS[,MS...]", help="Exposure time; frames cycle through several.")
+    ] = "10",
     auto_exposure: Annotated[
         str | None,
         typer.Option(
@@ -69,10 +73,14 @@ def simulate(
             help="Vary exposure x ISO and brightness over EV, smoothly or in STEPS steps. [constant]",
         ),
     ] = None,
-    readout_ms: Annotated[float, typer.Option(metavar="MS", help="Readout time, from the first row to one past the last.")] = 20.0,
+    readout_ms: Annotated[
+        float, typer.Option(metavar="MS", help="Readout time, from the first row to one past the last.")
+    ] = 20.0,
     direction: Annotated[
         str | None,
-        typer.Option(metavar="DIRECTION", callback=one_of(DIRECTIONS), help=f"Readout direction: {', '.join(DIRECTIONS)}."),
+        typer.Option(
+            metavar="DIRECTION", callback=one_of(DIRECTIONS), help=f"Readout direction: {', '.join(DIRECTIONS)}."
+        ),
     ] = None,
     focal_px: Annotated[float | None, typer.Option(metavar="PX", help="Focal length.")] = None,
     rate: Annotated[float, typer.Option(metavar="RAD_S", help="Rotation rate of the hand; 0: none.")] = 1.0,
@@ -91,12 +99,19 @@ def simulate(
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Take the camera from this profile.")] = None,
     effect: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME[=VALUE]", help="Apply this effect without stating it in camera.yaml; may be repeated."),
+        typer.Option(
+            metavar="NAME[=VALUE]", help="Apply this effect without stating it in camera.yaml; may be repeated."
+        ),
     ] = None,
     reference: Annotated[
-        str, typer.Option(metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Instant that the truth frames show.")
+        str,
+        typer.Option(
+            metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Instant that the truth frames show."
+        ),
     ] = REFERENCES[0],
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed; the same seed gives the same capture.")] = 0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Random seed; the same seed gives the same capture.")
+    ] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a simulated capture.")] = False,
     isp: Isp = None,
     tone: Tone = None,
