@@ -171,7 +171,8 @@ def diagnosis_verdict(verdict: str, causes: Sequence[Mapped], nominal: Mapped) -
     if nominal.get("geometry_rms_px") is not None:
         words.append(
             "Residual of tracked points: "
-            f"{residual_words(nominal['geometry_rms_px'], nominal.get('geometry_noise_px'))} ({number(nominal.get('tracks'), 9)} tracks in {number(nominal.get('frames'), 9)} frames)."
+            f"{residual_words(nominal['geometry_rms_px'], nominal.get('geometry_noise_px'))}"
+            f" ({number(nominal.get('tracks'), 9)} tracks in {number(nominal.get('frames'), 9)} frames)."
         )
     return Verdict(level, headline, " ".join(filter(None, words)))
 

@@ -85,7 +85,7 @@ def process(
         bool, typer.Option("--crop", help="Crop all frames to the area with recorded data in every frame.")
     ] = False,
     undistort: Annotated[
-        bool, typer.Option("--undistort", help="Also remove lens distortion: frames of a pinhole camera.")
+        bool, typer.Option("--undistort", help="Undo the lens's distortion too: frames of a pinhole camera.")
     ] = False,
     skip_copied: Annotated[
         bool, typer.Option("--skip-copied", help="Write no PNG for frames that are only copied.")
