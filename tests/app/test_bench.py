@@ -177,7 +177,7 @@ def test_runs_that_get_shorter_have_no_exponent() -> None:
     assert growth.doubling_exponents(rows)["wall_exponent"] is None
     spoilt = [{"pixels": 100, "cpu_s_per_frame": -0.1}, {"pixels": 300, "cpu_s_per_frame": 0.2}]
     assert growth._fitted(spoilt, "pixels", "cpu_s_per_frame") == {"exponent": None, "std": None}
-    assert growth.exponent_text({"exponent": None}) == "not to be told from these runs"
+    assert growth.exponent_text({"exponent": None}) == "not determined by these runs"
 
 
 def growth_facts() -> Facts:

@@ -24,7 +24,7 @@ from virest.evaluation.fidelity import psnr_db
 
 METHODS = (*PRESETS, *PEERS)
 SHORT = {"unsupervised_wiener": "unsup. wiener", "richardson_lucy": "rich.-lucy"}
-"""Heads of columns."""
+"""Column heads."""
 KIND_TITLES = {
     "ordinary": "ordinary: 5-20 px",
     "photographs": "photographs: 5-20 px",
@@ -49,7 +49,7 @@ def quality_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def measure_workload(work: Path, workload: Workload) -> list[dict[str, Any]]:
-    """One record for each frame: blur, PSNR of straightening alone, gain of each preset and peer."""
+    """One record per frame: blur, PSNR of straightening alone, gain of each preset and peer."""
     capture = simulated(work, workload.name, **workload.options)
     base = run_process(capture, work / "none", "--deblur", "none")
     runs = {preset: run_process(capture, work / preset, "--preset", preset) for preset in PRESETS}
