@@ -119,7 +119,7 @@ class ClusterExecutor(Executor):
             cluster_lost=True,
         )
 
-    def require_places(self, places: list[Path]) -> None:
+    def require_paths(self, places: list[Path]) -> None:
         """Raise SettingsError unless every worker sees these files and folders of a shared disk."""
         shared = [str(place.absolute()) for place in places if not is_remote(place)]
         if not shared:

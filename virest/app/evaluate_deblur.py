@@ -131,8 +131,8 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
         if options.over_time:
             count, judged = {}, JUDGED_OVER_TIME
         names = [(name, wishes | count) for name, wishes in standard if not options.quick or name in quick]
-        told = [{**simulate_command(work / name, **wishes), "capture": name} for name, wishes in names]
-        yield [open_true_capture(work / name, None, judged) for name, _ in names], told
+        simulated = [{**simulate_command(work / name, **wishes), "capture": name} for name, wishes in names]
+        yield [open_true_capture(work / name, None, judged) for name, _ in names], simulated
     finally:
         shutil.rmtree(work, ignore_errors=True)
 

@@ -133,9 +133,9 @@ def _scored(sequences: SlamSequences, seeds: int, words: list[str] | None, optio
             runs = list(track_with_colmap(sequences, kind, numbers, SfmSettings()))
         else:
             runs = list(track_with_command(sequences, kind, numbers, words, options.timeout_s))
-        moment, scores = _best_moment(sequences, kind, runs)
+        reference, scores = _best_reference(sequences, kind, runs)
         summaries[kind] = summarise(scores)
-        kinds[kind] = _kind_facts(moment, scores, summaries[kind])
+        kinds[kind] = _kind_facts(reference, scores, summaries[kind])
         log.info("%s, %s: %s", sequences.name, kind, _error_cell(kinds[kind]))
     true, lens = sequences.truth.at(sequences.start_s), sequences.lens
     return {
@@ -150,7 +150,7 @@ def _scored(sequences: SlamSequences, seeds: int, words: list[str] | None, optio
     }
 
 
-def _best_moment(
+def _best_reference(
     sequences: SlamSequences, kind: str, runs: Sequence[dict[int, Any]]
 ) -> tuple[str, list[TrajectoryScore]]:
     """Score trajectories at the instant that the frames show.
@@ -158,10 +158,12 @@ def _best_moment(
     The rows of a recorded frame differ in time: the first row's start and the middle row's mid-exposure are both
     scored, and the better result counts.
     """
-    moments = {"exposure-start": sequences.start_s}
+    references = {"exposure-start": sequences.start_s}
     if kind == "rolling":
-        moments["frame-middle"] = sequences.middle_s
-    scored = {name: [score_path(sequences.truth, found, time_s) for found in runs] for name, time_s in moments.items()}
+        references["frame-middle"] = sequences.middle_s
+    scored = {
+        name: [score_path(sequences.truth, found, time_s) for found in runs] for name, time_s in references.items()
+    }
     best = min(scored, key=lambda name: summarise(scored[name]).median_m)
     return best, scored[best]
 
@@ -176,9 +178,9 @@ def _comparison(summaries: dict[str, ScoreSummary]) -> dict[str, Any]:
     }
 
 
-def _kind_facts(moment: str, scores: Sequence[TrajectoryScore], summary: ScoreSummary) -> dict[str, Any]:
+def _kind_facts(reference: str, scores: Sequence[TrajectoryScore], summary: ScoreSummary) -> dict[str, Any]:
     return {
-        "reference": moment,
+        "reference": reference,
         "rmse_m": [_finite(score.rmse_m) for score in scores],
         "median_m": _finite(summary.median_m),
         "low_m": _finite(summary.low_m),
@@ -325,9 +327,11 @@ def _closing(facts: dict[str, Any]) -> list[str]:
     removed, worse = summary["added_error_removed"], summary["worse_than_recorded"]
     tools = ", ".join(f"{name} {number}" for name, number in versions.items())
     lines = [f"evo_ape RMSE after Sim(3) alignment, median (range) over seeds from 0; {tools}; {facts['tracker']}"]
-    moments = {row["kinds"]["rolling"]["reference"] for row in facts["results"] if "error" not in row}
-    if moments:
-        lines.append(f"recorded frames at the better of exposure-start and frame-middle: {', '.join(sorted(moments))}")
+    references = {row["kinds"]["rolling"]["reference"] for row in facts["results"] if "error" not in row}
+    if references:
+        lines.append(
+            f"recorded frames at the better of exposure-start and frame-middle: {', '.join(sorted(references))}"
+        )
     if removed:
         lines.append(
             f"restored frames remove {100 * removed['median']:.1f} % (median; least {100 * removed['least']:.1f} %) "

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.film import display_turn, side_by_side, write_film
+from virest.app.film import display_matrix, side_by_side, write_film
 from virest.app.outputs import write_picture
 from virest.app.run_folder import RunFolder, parse_lines
 from virest.camera.intrinsics import Intrinsics
@@ -34,7 +34,7 @@ LENS_ESTIMATES = ("k1", "k2", "p1", "p2", "k3", "k4")
 
 
 @dataclass(frozen=True, slots=True)
-class FinishWishes:
+class FinishOptions:
     """What to do with a run's frames at its end."""
 
     film: str | None = None
@@ -94,11 +94,11 @@ def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
     return dataclasses.replace(profile, width=x1 - x0, height=y1 - y0, intrinsics=lens).with_fields(moved)
 
 
-def require_finishable(wishes: FinishWishes, name: str, run: Path, *, overwrite: bool) -> None:
+def require_finishable(options: FinishOptions, name: str, run: Path, *, overwrite: bool) -> None:
     """Raise OutputError, before any work, if the request cannot be fulfilled."""
-    if wishes.any and is_remote(run):
+    if options.any and is_remote(run):
         raise OutputError("--video and --crop need a local --out", hint="process to a folder, then upload")
-    film = wishes.film_of(name)
+    film = options.film_of(name)
     if film is None:
         return
     if film.is_dir() or not film.absolute().parent.is_dir():
@@ -114,7 +114,7 @@ def finish_pictures(
     logs: Iterable[Path],
     movie: Path,
     index: MovieIndex,
-    wishes: FinishWishes,
+    options: FinishOptions,
     name: str,
     lens: Intrinsics | None = None,
 ) -> Finished:
@@ -124,22 +124,22 @@ def finish_pictures(
     undistorted too.
     """
     lines = [line for log in read_each(logs) for line in parse_lines(log)]
-    crop_px = common_rectangle(lines) if wishes.crop else None
+    crop_px = common_rectangle(lines) if options.crop else None
     if crop_px is not None:
         for line in lines:
             if line["output"] is not None:
                 for place in (run.picture(line["frame"]), run.mask(line["frame"])):
                     _crop_file(place, crop_px)
-    film = wishes.film_of(name)
+    film = options.film_of(name)
     if film is not None and lines:
-        turn = display_turn(movie)
+        rotation = display_matrix(movie)
         first_ns = lines[0]["timestamp_ns"]
-        frames = _film_frames(run, lines, movie, index, crop_px, turn if wishes.side_by_side else None, lens)
-        write_film(film, ((ns - first_ns, picture) for ns, picture in frames), _rate(lines), turn)
-    if not wishes.keep_frames:
+        frames = _film_frames(run, lines, movie, index, crop_px, rotation if options.side_by_side else None, lens)
+        write_film(film, ((ns - first_ns, picture) for ns, picture in frames), _rate(lines), rotation)
+    if not options.keep_frames:
         for line in lines:
             run.picture(line["frame"]).unlink(missing_ok=True)
-    return Finished(crop_px, film, wishes.keep_frames)
+    return Finished(crop_px, film, options.keep_frames)
 
 
 def common_rectangle(lines: Iterable[Json]) -> Crop:

@@ -50,12 +50,12 @@ class Workers:
             return self._executor.slots
         return 1 if self.here else self.jobs + 1
 
-    def start(self, *places: Path) -> None:
+    def start(self, *paths: Path) -> None:
         """Start workers that can read these paths. Raises SettingsError if a cluster's workers cannot."""
         if self._executor is None:
             self._executor = self._start()
         if isinstance(self._executor, ClusterExecutor):
-            self._executor.require_places(list(places))
+            self._executor.require_paths(list(paths))
 
     def submit(self, segment: Segment) -> Future[dict[str, int]]:
         """Submit a segment to the executor."""

@@ -42,17 +42,17 @@ def batch_names(paths: list[str]) -> list[str]:
 
 def _relative_names(paths: list[str], name: str) -> list[str]:
     """Paths of equally named folders below their common folder, joined by dashes."""
-    places = [resolved(path) for path in paths]
-    if len(set(places)) < len(places):
+    absolute = [resolved(path) for path in paths]
+    if len(set(absolute)) < len(absolute):
         raise OutputError(
             f"{len(paths)} captures are named {name!r} ({', '.join(paths)}): the same folder is given twice and would "
             "share one output folder",
             hint="give each capture once",
         )
-    common = os.path.commonpath(places) if not any("://" in place for place in places) else ""
+    common = os.path.commonpath(absolute) if not any("://" in place for place in absolute) else ""
     if not common:
         raise OutputError(
             f"{len(paths)} captures are named {name!r} ({', '.join(paths)}) and would share one output folder",
             hint="process them with different --out, or rename one",
         )
-    return [JOINT.join(PurePath(os.path.relpath(place, common)).parts) for place in places]
+    return [JOINT.join(PurePath(os.path.relpath(place, common)).parts) for place in absolute]

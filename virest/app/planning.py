@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest import __version__
-from virest.app.finish import FinishWishes
+from virest.app.finish import FinishOptions
 from virest.app.outputs import file_facts, plain
 from virest.app.run_folder import Mode, RunFolder, check_run
-from virest.app.segments import PictureWishes
+from virest.app.segments import PictureOptions
 from virest.app.worker_processes import prepare_worker
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
@@ -59,8 +59,8 @@ class ProcessOptions:
     scheduler: str | None = None
     mode: Mode = "new"
     command: str = ""
-    pictures: PictureWishes = PictureWishes()  # noqa: RUF009  (frozen)
-    finish: FinishWishes = FinishWishes()  # noqa: RUF009  (frozen)
+    pictures: PictureOptions = PictureOptions()  # noqa: RUF009  (frozen)
+    finish: FinishOptions = FinishOptions()  # noqa: RUF009  (frozen)
     json_lines: bool = False
     """Print each frame's line on standard output, in frame order, as soon as it is finished."""
     quiet: bool = False
@@ -246,9 +246,9 @@ def _request(
         "profile_sha256": hashlib.sha256(mapping.encode()).hexdigest(),
         "inputs": [file_facts(file) for file in inputs],
     }
-    wishes = {**dataclasses.asdict(options.pictures), **dataclasses.asdict(options.finish)}
-    if options.pictures != PictureWishes() or options.finish != FinishWishes():
-        request["outputs"] = wishes
+    outputs = {**dataclasses.asdict(options.pictures), **dataclasses.asdict(options.finish)}
+    if options.pictures != PictureOptions() or options.finish != FinishOptions():
+        request["outputs"] = outputs
     return plain(request)
 
 
@@ -275,8 +275,8 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
     for name, estimate in plan.profile.estimates.items():
         logged = name == "time_offset_s" and any(note.code is NoteCode.TIME_OFFSET for note in plan.said)
         if name not in job.profile.estimates and not logged:
-            said = with_deviation(name, estimate.value, estimate.std)
-            log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
+            text = with_deviation(name, estimate.value, estimate.std)
+            log.info("%s: %s %s (%s)", job.name, name, text, estimate.source)
     for note in plan.notes:
         log.info("%s: %s", job.name, note)
     for warning in plan.warnings:

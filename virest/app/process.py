@@ -92,8 +92,8 @@ def process_captures(paths: list[str], options: ProcessOptions, shard: tuple[int
         ahead = _planned_ahead(paths, names, options, workers)
         for number, (path, name) in enumerate(zip(paths, names, strict=True)):
             try:
-                turn = CaptureSlot(path, name, number, len(paths), ahead)
-                outcomes.append(_process(turn, options, workers))
+                slot = CaptureSlot(path, name, number, len(paths), ahead)
+                outcomes.append(_process(slot, options, workers))
                 codes.append(outcomes[-1].exit_code)
             except (BrokenPipeError, SettingsError, MemoryError) as error:
                 if isinstance(error, BrokenPipeError) or len(paths) == 1:
@@ -131,47 +131,47 @@ def process_capture(path: str, name: str, options: ProcessOptions, workers: Work
     return _process(CaptureSlot(path, name), options, workers)
 
 
-def _process(turn: CaptureSlot, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
+def _process(slot: CaptureSlot, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
     """Process the current capture; record the failure if it cannot be processed."""
     began = time.perf_counter()
     planned = Planned()
     try:
-        require_startable(turn.path, turn.name, options)
-        with console.progress_bar(None, f"{shown(turn.name)}: reading and planning", quiet=options.quiet):
-            planned = turn.plan(options)
-        seconds = planned.seconds if turn.ahead else time.perf_counter() - began
+        require_startable(slot.path, slot.name, options)
+        with console.progress_bar(None, f"{shown(slot.name)}: reading and planning", quiet=options.quiet):
+            planned = slot.plan(options)
+        seconds = planned.seconds if slot.ahead else time.perf_counter() - began
         say(planned.messages)
         if planned.error is not None:
-            if turn.ahead and isinstance(planned.error, CaptureError):
-                workers.start(locate(turn.path))  # a worker that cannot read the capture is a different error
+            if slot.ahead and isinstance(planned.error, CaptureError):
+                workers.start(locate(slot.path))  # a worker that cannot read the capture is a different error
             raise planned.error
-        return _process_planned(turn, planned, options, workers, seconds)
+        return _process_planned(slot, planned, options, workers, seconds)
     except Exception as error:
         if not (isinstance(error, OutputError | BrokenPipeError) or is_lost(error)):
-            lost_s = time.perf_counter() - began + (planned.seconds if turn.ahead else 0.0)
-            _leave_account(turn, options, planned, error, lost_s)
+            lost_s = time.perf_counter() - began + (planned.seconds if slot.ahead else 0.0)
+            _record_failure(slot, options, planned, error, lost_s)
         raise
 
 
 def _process_planned(
-    turn: CaptureSlot, planned: Planned, options: ProcessOptions, workers: Workers, seconds: float
+    slot: CaptureSlot, planned: Planned, options: ProcessOptions, workers: Workers, seconds: float
 ) -> CaptureOutcome:
     """Run a planned capture's segments; planning took ``seconds``."""
     began = time.perf_counter() - seconds
     assert planned.job is not None
-    run = RunFolder(options.out / turn.name)
-    job = dataclasses.replace(planned.job, run=run, path=turn.path)
+    run = RunFolder(options.out / slot.name)
+    job = dataclasses.replace(planned.job, run=run, path=slot.path)
     found = check_run(run, job.request, options.mode)
     if planned.index is None or planned.plan is None or (found == "finished" and options.mode == "resume"):
         with opened_run(run, job.request, "resume"):
             return _repeat_finished(job, options)
-    require_finishable(options.finish, turn.name, run.path, overwrite=options.mode != "new")
+    require_finishable(options.finish, slot.name, run.path, overwrite=options.mode != "new")
     with opened_run(run, job.request, options.mode):
         try:
             if options.pictures.masks:
                 run.masks.mkdir(exist_ok=True)
             workers.start(job.capture.movie, run.path)
-            return _run(job, planned.index, planned.plan, options, workers, began, turn.begin_next)
+            return _run(job, planned.index, planned.plan, options, workers, began, slot.begin_next)
         except BaseException:
             workers.kill()
             raise
@@ -299,20 +299,20 @@ def _in_order(
     return give
 
 
-def _leave_account(
-    turn: CaptureSlot, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float
+def _record_failure(
+    slot: CaptureSlot, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float
 ) -> None:
     """Record in run.json why a capture could not be processed, unless its folder holds a run.
 
     A single mistyped path writes no run.json.
     """
     try:
-        if turn.among == 1 and not locate(turn.path).is_dir():
+        if slot.among == 1 and not locate(slot.path).is_dir():
             return
-        account = failure_account(turn.path, turn.name, options, planned.job, error, wall_s)
-        write_failure(RunFolder(options.out / turn.name), account)
+        account = failure_account(slot.path, slot.name, options, planned.job, error, wall_s)
+        write_failure(RunFolder(options.out / slot.name), account)
     except (VirestError, OSError, ValueError) as fault:
-        log.warning("%s: this failure could not be recorded in run.json: %s", shown(turn.name), shown(str(fault)))
+        log.warning("%s: this failure could not be recorded in run.json: %s", shown(slot.name), shown(str(fault)))
 
 
 def _warn_about(name: str, counts: dict[str, int], selected: int, copy_reason: str | None) -> None:

@@ -50,7 +50,7 @@ class _SharedOut:
             return one_by_one(function, calls, done)
         try:
             futures = [self._submit(function, parts) for parts in calls]
-            return [_told(future, place, done) for place, future in enumerate(futures)]
+            return [_result_of(future, place, done) for place, future in enumerate(futures)]
         except BrokenExecutor:
             self._give_up()
             return one_by_one(function, calls, done)
@@ -99,7 +99,7 @@ class _SharedOut:
                 process.kill()
 
 
-def _told(future: Future[Any], place: int, done: Callable[[int], None] | None) -> Any:
+def _result_of(future: Future[Any], place: int, done: Callable[[int], None] | None) -> Any:
     result = future.result()
     if done is not None:
         done(place)

@@ -254,7 +254,7 @@ def find_movie(account: Account, folder: Path, hint: Path | None) -> tuple[_Movi
     if not names:
         return None, f"run.json names no movie; {ONLY_AFTER}."
     other = None
-    for path in dict.fromkeys(place / name for place in _places(account, folder, hint) for name in names):
+    for path in dict.fromkeys(root / name for root in _possible_folders(account, folder, hint) for name in names):
         with suppress(OSError, ValueError, VirestError):
             if path.is_dir() or any(_is_same(path, item) for item in account.inputs):
                 return _Movie(path, probe_movie(path)), ""
@@ -277,7 +277,7 @@ def _movie_names(account: Account) -> list[str]:
     return [item.file for item in account.inputs if Path(item.file).suffix.lower() in MOVIE_SUFFIXES]
 
 
-def _places(account: Account, folder: Path, hint: Path | None) -> Iterator[Path]:
+def _possible_folders(account: Account, folder: Path, hint: Path | None) -> Iterator[Path]:
     """Possible folders of the capture, most likely first."""
     if hint is not None:
         yield from (hint, hint / folder.resolve().name)

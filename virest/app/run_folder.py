@@ -136,7 +136,7 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
     for file, found in ((run.state, "unfinished"), (run.run_json, "finished")):
         old = _read_request(file)
         if old is not None:
-            return ("nothing", {}) if _tells_of_failure(old) else (found, old)  # type: ignore[return-value]
+            return ("nothing", {}) if _records_failure(old) else (found, old)  # type: ignore[return-value]
     try:
         inside = run.path.iterdir() if run.path.is_dir() else ()
         foreign = [p.name for p in inside if p != run.lock and p.name not in BESIDE and not _is_own_part(p.name)]
@@ -167,7 +167,7 @@ def _read_request(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) and "profile_sha256" in content else None
 
 
-def _tells_of_failure(account: dict[str, Any]) -> bool:
+def _records_failure(account: dict[str, Any]) -> bool:
     """Whether a run.json only records a failure, so that it may be replaced."""
     return isinstance(account.get("failure"), dict)
 
@@ -380,8 +380,8 @@ def finished_segments(run: RunFolder, segments: Iterable[tuple[int, ...]]) -> se
 def _is_finished(frames: tuple[int, ...], data: bytes, pictures: set[str]) -> bool:
     try:
         lines = parse_lines(data)
-        said = [line["output"] for line in lines if line["output"]]
-        return tuple(line["frame"] for line in lines) == frames and pictures.issuperset(said)
+        outputs = [line["output"] for line in lines if line["output"]]
+        return tuple(line["frame"] for line in lines) == frames and pictures.issuperset(outputs)
     except (ValueError, KeyError, TypeError):
         return False
 

@@ -42,7 +42,7 @@ EDGE_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class PictureWishes:
+class PictureOptions:
     """Which pictures a run writes in addition to the restored frames, and which it omits."""
 
     masks: bool = False
@@ -65,7 +65,7 @@ class Segment:
     run: RunFolder
     around: tuple[Frame, ...] = ()
     """Neighbouring frames that are decoded for joint restoration but not restored in this segment."""
-    pictures: PictureWishes = PictureWishes()
+    pictures: PictureOptions = PictureOptions()
 
     @property
     def log_path(self) -> Path:
@@ -110,7 +110,7 @@ def make_segment(
     index: MovieIndex,
     plan: RestorationPlan,
     run: RunFolder,
-    pictures: PictureWishes = PictureWishes(),
+    pictures: PictureOptions = PictureOptions(),
 ) -> Segment:
     """One segment, ready for a worker."""
     place, movie = RunFolder(run.path.absolute()), capture.movie.absolute()  # a worker's current folder may differ

@@ -144,8 +144,8 @@ def deblur(
 evaluate.command("slam", short_help="Case C: trajectories from restored frames.")(slam)
 
 
-def _require_captures(paths: list[str], wishes: dict[str, Any]) -> None:
+def _require_captures(paths: list[str], given: dict[str, Any]) -> None:
     """Refuse options that would have no effect."""
-    for name, wish in wishes.items():
-        if wish is not None and not paths:
+    for name, value in given.items():
+        if value is not None and not paths:
             raise typer.BadParameter(f"{name} needs a CAPTURE")

@@ -131,9 +131,9 @@ def process(
     if video is not None and len(paths) > 1 and "{capture}" not in video:
         raise typer.BadParameter("--video: several captures need {capture} in the file name")
     one_thread_each()
-    from virest.app.finish import FinishWishes
+    from virest.app.finish import FinishOptions
     from virest.app.process import ProcessOptions, process_captures
-    from virest.app.segments import PictureWishes
+    from virest.app.segments import PictureOptions
     from virest.app.settings import compose_settings
     from virest.capture.location import locate
 
@@ -156,8 +156,8 @@ def process(
         scheduler,
         "resume" if resume else "overwrite" if overwrite else "new",
         shlex.join(["virest", *sys.argv[1:]]),
-        PictureWishes(mask, skip_copied),
-        FinishWishes(video, side_by_side, not no_frames, crop),
+        PictureOptions(mask, skip_copied),
+        FinishOptions(video, side_by_side, not no_frames, crop),
         json,
         quiet,
         verbose,

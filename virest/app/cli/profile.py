@@ -51,8 +51,8 @@ def new(
     from virest.app.new_profile import NewProfile, parse_size, run_new_profile
 
     folder = None if capture is None else Path(console.folder_of(capture))
-    wishes = NewProfile(folder, device, None if size is None else parse_size(size), focal_px, fov_deg, out, overwrite)
-    facts, text = run_new_profile(wishes)
+    request = NewProfile(folder, device, None if size is None else parse_size(size), focal_px, fov_deg, out, overwrite)
+    facts, text = run_new_profile(request)
     emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 

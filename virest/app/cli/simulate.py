@@ -151,8 +151,8 @@ def simulate(
     console.configure(quiet=quiet, verbose=verbose)
     if like is not None:
         _require_only(context, LIKE_OPTIONS, "has no effect with --like, which takes it from the capture")
-        wishes = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
-        facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **wishes)
+        options = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
+        facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **options)
         emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
         return 0
     count = _parse_count(frames, 12)
@@ -186,7 +186,7 @@ def simulate(
 
 
 def _simulate_like(
-    out: Path, like: Path, config: Path | None, frames: str | None, quiet: bool, **wishes: Any
+    out: Path, like: Path, config: Path | None, frames: str | None, quiet: bool, **options: Any
 ) -> dict[str, Any]:
     """Re-create a capture; a single number N in ``--frames`` means its first N frames."""
     chosen = parse_frames(frames if frames is None or ":" in frames else f":{frames}")
@@ -195,7 +195,7 @@ def _simulate_like(
 
     with console.progress_bar(count_frames(like, chosen), "simulate", quiet=quiet) as bar:
         step = (lambda _done, _total: bar.update(1)) if bar else None
-        return simulate_like(out, like, config=config, frames=chosen, progress=step, **wishes)
+        return simulate_like(out, like, config=config, frames=chosen, progress=step, **options)
 
 
 def _describe_simulation(facts: dict[str, Any]) -> str:
