@@ -30,7 +30,7 @@ from virest.inference.parallel import ParallelMap, one_by_one
 from virest.report.words import residual_words
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
-"""What ``--with`` takes."""
+"""Names that ``--with`` accepts."""
 MAX_FRAMES = 400
 """Captures up to this length (13 s at 30 frames/s) use every frame; longer ones use runs with this total."""
 FIT_STEPS = 3
@@ -60,7 +60,7 @@ class CalibrationPlan:
 
     @property
     def steps(self) -> int:
-        """How often ``progress`` is called."""
+        """Number of calls of ``progress``."""
         return len(self.frames) + FIT_STEPS
 
 

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 CONNECT_S = 10.0
 CONNECT_VARIABLE = "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"
-"""How long to wait for an answer, and Dask's own variable that says otherwise."""
+"""How long to wait for an answer, and Dask's own variable that overrides it."""
 FIRST_WORKER_S = 30.0
 """How long to wait for a cluster's first worker, and for one to return after all are lost."""
 LOOK_S = 2.0

@@ -130,8 +130,8 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
         count, judged = {"frames": FRAMES_QUICK if options.quick else FRAMES}, slice(None)
         if options.over_time:
             count, judged = {}, JUDGED_OVER_TIME
-        names = [(name, wishes | count) for name, wishes in standard if not options.quick or name in quick]
-        simulated = [{**simulate_command(work / name, **wishes), "capture": name} for name, wishes in names]
+        names = [(name, settings | count) for name, settings in standard if not options.quick or name in quick]
+        simulated = [{**simulate_command(work / name, **settings), "capture": name} for name, settings in names]
         yield [open_true_capture(work / name, None, judged) for name, _ in names], simulated
     finally:
         shutil.rmtree(work, ignore_errors=True)

@@ -33,7 +33,7 @@ EVIDENCE = {
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is hidden in one capture, and what the reader should look for."""
+    """The effect hidden in one capture, and its visible signs."""
 
     value: str
     """VALUE of ``simulate --effect NAME=VALUE``."""
@@ -76,7 +76,7 @@ CASES: dict[str, Case] = {
 
 
 def write_gallery(docs: Path, names: Sequence[str]) -> None:
-    """Simulate, diagnose and draw the chosen effects; the page lists every effect that was drawn, now or before."""
+    """Simulate, diagnose and draw the chosen effects; the page lists every effect drawn now or before."""
     images = docs / "images" / "gallery"
     images.mkdir(parents=True, exist_ok=True)
     kept = images / "results.json"

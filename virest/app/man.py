@@ -22,7 +22,7 @@ EXIT_CODES = (
 )
 """The same texts as in docs/exit-codes.md."""
 VERBATIM = "\b"
-"""Marks a paragraph of a help text whose line breaks are kept."""
+"""Marks a help paragraph whose line breaks are kept."""
 
 
 def man_page(program: Any) -> str:

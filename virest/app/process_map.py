@@ -44,7 +44,7 @@ class _SharedOut:
         arguments: Iterable[tuple[Any, ...]],
         done: Callable[[int], None] | None = None,
     ) -> list[Any]:
-        """As `ParallelMap` defines; calls lost with a dying worker are repeated here."""
+        """See `ParallelMap`; calls lost with a dying worker are repeated here."""
         calls = list(arguments)
         if len(calls) < 2 or self.jobs == 1:
             return one_by_one(function, calls, done)
@@ -56,7 +56,7 @@ class _SharedOut:
             return one_by_one(function, calls, done)
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        """As `Background` defines."""
+        """See `Background`."""
         here = partial(function, *arguments)
         if self.jobs == 1:
             return here

@@ -164,7 +164,7 @@ def _true_value(value: CalibratedValue, found: CameraProfile, truth: CameraProfi
 
 
 def summed(rows: Sequence[Row]) -> dict[str, Any]:
-    """What one value's errors in deviations amount to, and the share of noise that its errors ask for."""
+    """Statistics of one value's errors in standard deviations, and the shared noise that its errors imply."""
     known = np.array([row["error_in_std"] for row in rows])
     name = _TERMS[rows[0]["value"]][0]
     in_use = STILL_SHARED.get(name, STILL_SHARED_OTHER)

@@ -31,7 +31,7 @@ BASE: dict[str, Any] = {"width": 640, "height": 480, "exposure_ms": 16.0, "rate_
 SEEDS = (11, 12, 13)
 GAMMA, LINEAR, SRGB = ResponseCurve("gamma", gamma=2.2), ResponseCurve("linear"), ResponseCurve("srgb")
 BENT = ResponseCurve("five_segment", b=(0.065, 0.048), c=(0.4, 0.6), y_max=1.0)
-"""Of dead leaves, toe and shoulder together hold about a fifth of the pixels."""
+"""With dead leaves, toe and shoulder together hold about 1/5 of the pixels."""
 OTHER_KNOTS = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
 CURVES: dict[str, tuple[ResponseCurve, dict[str, ResponseCurve]]] = {
     "gamma 2.2": (GAMMA, {"none (linear)": LINEAR, "gamma 1.2": ResponseCurve("gamma", gamma=1.2),
@@ -191,7 +191,7 @@ def _exposed_up(results: list[RestoredFrame], gain: float) -> list[RestoredFrame
 
 
 def _near_and_far(results: list[RestoredFrame], clipped: Path) -> list[list[float]]:
-    """Of each frame: PSNR within a blur path of clipped light, farther away, of all; and the clipped share."""
+    """For each frame: PSNR within a blur path of clipped highlights, farther away, and overall; the clipped share."""
     found: list[list[float]] = []
     for result in results:
         truth = truth_frame(clipped, result.frame.index)

@@ -247,7 +247,7 @@ class Run:
     folder: Path
     """OUT/<capture>."""
     lines: list[dict[str, Any]]
-    """Of parameters.jsonl."""
+    """The lines of parameters.jsonl."""
     timing: Timing
 
     @property
