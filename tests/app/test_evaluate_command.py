@@ -157,7 +157,7 @@ def test_captures_without_truth_or_board_are_refused(shaken: Path, tmp_path: Pat
         run_shutter(ShutterOptions((str(shaken),)))
     bare = tmp_path / "bare"
     shutil.copytree(shaken, bare, ignore=shutil.ignore_patterns("truth"))
-    with pytest.raises(CaptureError, match="none of 2 chosen frames has a truth"):
+    with pytest.raises(CaptureError, match="none of 2 selected frames has ground truth"):
         run_deblur(DeblurOptions((str(bare),)))
 
 

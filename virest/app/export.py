@@ -87,7 +87,9 @@ def run_export(plan: ExportPlan, progress: Callable[[int], Any] | None = None) -
 def _write_lens_profile(plan: ExportPlan, part: Path) -> tuple[Json, str]:
     """Write only Gyroflow's lens profile; Gyroflow reads the gyroscope data from the capture."""
     if plan.profile.intrinsics is None:
-        raise CaptureError(f"{plan.capture.name}: the focal length is unknown", hint="fit it with virest calibrate --with focal")
+        raise CaptureError(
+            f"{plan.capture.name}: the focal length is unknown", hint="fit it with virest calibrate --with focal"
+        )
     rate_hz = _rate_hz([frame.time_ns for frame in plan.frames])
     text, error_px = gyroflow_profile(replace(plan.profile, intrinsics=plan.standard.intrinsics), rate_hz)
     _write(part / "lens.json", text)

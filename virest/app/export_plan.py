@@ -172,7 +172,7 @@ def _require_free(target: Path, capture: Path, options: ExportOptions) -> None:
     for kept in (capture, options.restored):
         place = target.resolve()
         if kept is not None and (place == kept.resolve() or place in kept.resolve().parents):
-            raise OutputError(f"{target}: contains {kept}", hint="choose another folder with --out")
+            raise OutputError(f"{target}: would overwrite {kept}", hint="choose another folder with --out")
     if not target.exists() and not target.is_symlink():
         return
     if not (target / RECORD).is_file():
