@@ -1,8 +1,8 @@
-"""The same segments on a Dask cluster: an executor over ``Client.get_executor()``, and plain words where it fails.
+"""Run segments on a Dask cluster: an executor over ``Client.get_executor()`` with readable errors.
 
-Dask gives a segment whose worker died to another one by itself, and gives up after some deaths.  What is left to do
-here: look at the workers before any work, know how many segments keep them busy, notice that the scheduler or all
-workers are gone, and let no worker write on after the program has left.
+Dask itself moves a segment to another worker if its worker dies, and gives up after several deaths.  This module checks
+the workers before any work, knows how many segments keep them busy, detects that the scheduler or all workers are gone,
+and waits at exit until no worker writes any more.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def _even(picture: Picture) -> Picture:
 
 
 def display_matrix(path: Path) -> tuple[int, int, int, int]:
-    """a, b, c, d of the movie's display matrix, each −1, 0 or 1 (ISO/IEC 14496-12); UPRIGHT where it has none."""
+    """a, b, c, d of the movie's display matrix, each −1, 0 or 1 (ISO/IEC 14496-12); UPRIGHT if it has none."""
     found = next(_picture_tracks(path), None)
     if found is None:
         return UPRIGHT

@@ -32,7 +32,7 @@ class CaptureOutcome:
 
     @property
     def exit_code(self) -> int:
-        """9 where a frame failed."""
+        """9 if a frame failed, else 0."""
         return PARTLY_FAILED if self.counts.get("failed") else 0
 
 

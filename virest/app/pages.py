@@ -274,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _brought_up_to_date(block: Block, only_check: bool) -> bool:
-    """Run one block and write it; with ``only_check`` say whether it is as it was. False too where a command fails."""
+    """Run one block and write it, or with ``only_check`` compare it. False if it differs or a command fails."""
     about = f"{block.page.name}: {block.commands[-1]}"
     try:
         session, took_s = rerun(block)

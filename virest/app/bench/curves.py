@@ -209,7 +209,7 @@ def _near_and_far(results: list[RestoredFrame], clipped: Path) -> list[list[floa
 
 
 def _curves_text(rows: list[dict[str, Any]]) -> str:
-    head = ["camera's curve", "told", "PSNR", "gain", "right is better by", "least"]
+    head = ["camera's curve", "used", "PSNR", "gain", "right is better by", "least"]
     cells = [
         [row["camera"], row["told"], f"{row['psnr_db']:.2f}", f"{row['gain_db']:+.2f}",
          f"{row['right_minus_this_db']:+.2f}", f"{row['least_right_minus_this_db']:+.2f}"]

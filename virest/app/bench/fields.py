@@ -402,7 +402,7 @@ def is_right(strange: Strangeness, named: list[str], found: Diagnosis) -> bool:
 
 
 def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Each effect with some seeds, as many captures with named effects only, and nulls."""
+    """Each effect with several seeds, as many captures with only named effects, and captures without effects."""
     cases = [(name, FIRST_SEED + 10 * k + i) for k in range(SEEDS[scale.name]) for i, name in enumerate(EFFECTS)]
     cases += [(NAMED_ONLY, FIRST_SEED + 500 + k) for k in range(SEEDS[scale.name])]
     cases += [(NULL, FIRST_NULL + k) for k in range(NULLS[scale.name])]

@@ -232,7 +232,7 @@ def _text(promise: Row, best: dict[str, Row], swept: dict[str, tuple[Sequence[fl
         for name, (values, gains) in swept.items()
     ]
     return (
-        f"FITS: {promise['frames']} frames of {promise['captures']} captures with seeds of their own; |promise-gain|\n"
+        f"FITS: {promise['frames']} frames of {promise['captures']} captures with separate seeds; |promise-gain|\n"
         f"{promise['off_db']:.2f} dB in the median with what fits best\n"
         + table(header, lines)
         + "\n"

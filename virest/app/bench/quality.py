@@ -108,7 +108,7 @@ def _summary(kind: str, name: str | None, rows: list[dict[str, Any]]) -> dict[st
 
 
 def _text(summary: list[dict[str, Any]]) -> str:
-    """Means and minima; a kind's own rows only where it has several captures."""
+    """Means and minima; a kind gets rows of its own only if it has several captures."""
     several = {kind for kind in KIND_TITLES if sum(entry["kind"] == kind for entry in summary) > 2}
     shown = [entry for entry in summary if entry["capture"] or entry["kind"] in several]
     means, minima = [], []

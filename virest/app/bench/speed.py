@@ -141,8 +141,8 @@ def judged(measured: list[Facts], planning_s: float) -> Facts:
 def _shares(entry: Facts, floor: Facts, planning_s: float) -> Facts:
     """Ratios of what was measured.
 
-    Figures by CPU time are what a quiet machine allows where no process ever waits; on one that others use too, the
-    wall clock cannot show it.  While one process plans the others have nothing to do, so planning counts in full.
+    Figures by CPU time show what a quiet machine allows if no process ever waits; under other load the wall clock
+    cannot show it.  While one process plans, the others are idle, so planning counts in full.
     """
     one, stages = entry["one_process"], entry["stage_s"]
     estimate, frames = stages["estimate"] / sum(stages.values()), CAPTURE_S * FPS

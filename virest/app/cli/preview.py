@@ -21,7 +21,7 @@ def preview(
     config: Config = None,
     frame: Annotated[int | None, typer.Option(metavar="N", help="Frame to show. [the most blurred]")] = None,
     preset: Annotated[
-        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Trade quality for speed.")
+        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Quality or speed.")
     ] = "balanced",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: Json = False,

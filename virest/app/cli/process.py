@@ -43,15 +43,22 @@ def process(
         typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="[balanced]")
+        str | None,
+        typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Quality or speed. [balanced]"),
     ] = None,
     deblur: Annotated[
         str | None,
-        typer.Option(metavar="METHOD", callback=one_of(DEBLUR_METHODS), help=f"One of {', '.join(DEBLUR_METHODS)}."),
+        typer.Option(
+            metavar="METHOD", callback=one_of(DEBLUR_METHODS), help=f"Deblurring: {', '.join(DEBLUR_METHODS)}."
+        ),
     ] = None,
     shutter: Annotated[
         str | None,
-        typer.Option(metavar="|".join(SHUTTER_METHODS), callback=one_of(SHUTTER_METHODS), help="[rowwise]"),
+        typer.Option(
+            metavar="|".join(SHUTTER_METHODS),
+            callback=one_of(SHUTTER_METHODS),
+            help="Rolling-shutter correction. [rowwise]",
+        ),
     ] = None,
     reference: Annotated[
         str | None,

@@ -57,8 +57,8 @@ def simulate(
     scene: Annotated[
         str, typer.Option(metavar="KIND", help="Scene: leaves, bright, board, text or photographs.")
     ] = "leaves",
-    width: Annotated[int, typer.Option(metavar="PX")] = 720,
-    height: Annotated[int, typer.Option(metavar="PX")] = 1280,
+    width: Annotated[int, typer.Option(metavar="PX", help="Frame width.")] = 720,
+    height: Annotated[int, typer.Option(metavar="PX", help="Frame height.")] = 1280,
     frames: Annotated[
         str | None, typer.Option(metavar="N", help="Number of frames; with --like also A:B of its frames. [12; all]")
     ] = None,
@@ -84,7 +84,7 @@ def simulate(
     ] = None,
     focal_px: Annotated[float | None, typer.Option(metavar="PX", help="Focal length.")] = None,
     rate: Annotated[float, typer.Option(metavar="RAD_S", help="Rotation rate of the hand; 0: none.")] = 1.0,
-    pan: Annotated[float, typer.Option(metavar="RAD_S", help="Constant yaw rate added to it.")] = 0.0,
+    pan: Annotated[float, typer.Option(metavar="RAD_S", help="Constant yaw rate in addition to --rate.")] = 0.0,
     noise: Annotated[float, typer.Option(metavar="LEVELS", help="Image noise in grey levels.")] = 1.5,
     response: Annotated[
         str, typer.Option(metavar="CURVE", help="Response: srgb, linear, gamma:2.2, five_segment[:xb,yb,xc,yc,y_max].")
