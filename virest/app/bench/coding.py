@@ -3,8 +3,8 @@
 $ python -m virest.app.bench --only coding --quick
 
 Captures without any model error, with four motions and contents, are read in all four directions and coded at three bit
-rates.  Measured, each fitted alone: the errors of the time offset and of the principal point that their points give, and
-the coding errors of a step, divided by the square of its noise, that these imply: by rows, and at one instant.
+rates.  Measured, each fitted alone: the errors of the time offset and of the principal point from their points, and the
+coding errors of a step, divided by the square of its noise, that these imply: by rows, and at one instant.
 """
 
 from __future__ import annotations
