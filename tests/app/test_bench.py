@@ -177,7 +177,7 @@ def test_runs_that_get_shorter_have_no_exponent() -> None:
     assert growth.doubling_exponents(rows)["wall_exponent"] is None
     spoilt = [{"pixels": 100, "cpu_s_per_frame": -0.1}, {"pixels": 300, "cpu_s_per_frame": 0.2}]
     assert growth._fitted(spoilt, "pixels", "cpu_s_per_frame") == {"exponent": None, "std": None}
-    assert growth.exponent_text({"exponent": None}) == "not to be told from these runs"
+    assert growth.exponent_text({"exponent": None}) == "not determined by these runs"
 
 
 def growth_facts() -> Facts:
@@ -412,7 +412,7 @@ def test_other_machines_versions_and_scales_are_said() -> None:
     assert "no figure in common" in text
     assert "cores busy" not in text
     new["commands"]["commands"][0]["others_cores"] = 1.25
-    assert "new commands: others kept 1.2 cores busy" in compare.compare_text(old, new)
+    assert "new commands: other processes kept 1.2 cores busy" in compare.compare_text(old, new)
 
 
 def test_a_report_is_the_same_as_itself() -> None:
@@ -446,7 +446,7 @@ def test_two_reports_are_compared_from_the_command_line(tmp_path: Path, capsys: 
 def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
     """Any other JSON."""
     (tmp_path / "run.json").write_text('{"virest_run": 1}')
-    with pytest.raises(ValueError, match="no report"):
+    with pytest.raises(ValueError, match="not a report"):
         compare.read_report(tmp_path / "run.json")
 
 

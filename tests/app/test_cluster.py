@@ -98,7 +98,7 @@ def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
     assert process.returncode == 7, errors
     assert "Traceback" not in errors
     assert len(lines) == 1, errors
-    assert "gone" in lines[0]
+    assert "lost the scheduler" in lines[0]
     assert "--resume" in lines[0]
     assert output == ""
     kept = finished_segments(run)

@@ -160,7 +160,7 @@ def test_the_table_reads_from_cause_to_verdict(tiny: Path, tmp_path: Path, ladde
         assert part in row
     assert max(len(line) for line in lines[1:4]) <= 95
     assert "time_offset: the clocks are 4 ms apart (held-out geometry_rms_px)" in lines
-    assert "  as good an explanation: timestamp_reference (0.23)" in lines
+    assert "  equally good explanations: timestamp_reference (0.23)" in lines
     assert any("gyro_bias_rad_s[1]" in line and "-0.02" in line for line in lines)
     assert "unexplained: something goes on along radius" in lines
     assert "note: blur was not judged: too little of it" in lines

@@ -109,7 +109,7 @@ def test_a_capture_without_truth_is_one_line(capture: Path, tmp_path: Path):
     ("text", "said"),
     [
         ("slam {sequence}", "has no {trajectory}"),
-        ("slam {sequence} {trajectory} {vocabulary}", "does not know {vocabulary}"),
+        ("slam {sequence} {trajectory} {vocabulary}", "has an unknown {vocabulary}"),
         ("slam '{sequence} {trajectory}", "No closing quotation"),
     ],
 )

@@ -182,9 +182,9 @@ def test_what_exists_is_not_lost(walk, tmp_path):
     assert len(list((folder / "mav0/cam0/data").iterdir())) == 7
     assert [path.name for path in tmp_path.iterdir()] == ["walk"]
     (folder / "export.json").unlink()
-    with pytest.raises(OutputError, match="not an export of virest"):
+    with pytest.raises(OutputError, match="not a virest export"):
         export(walk, tmp_path, overwrite=True)
-    with pytest.raises(OutputError, match="is where"):
+    with pytest.raises(OutputError, match="would overwrite"):
         export(walk, walk.parent, overwrite=True)
     plan = plan_export(str(walk), ExportOptions(tmp_path / "new"))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from laws import RADTAN, phone
 
-from virest.app.film import UPRIGHT, display_turn, side_by_side, write_film
+from virest.app.film import UPRIGHT, display_matrix, side_by_side, write_film
 from virest.app.finish import cropped_profile
 from virest.app.names import batch_names, shard_of
 from virest.camera.field import Field
@@ -74,7 +74,7 @@ def test_a_film_is_turned_as_the_movie_is(tmp_path: Path, turn: tuple[int, int, 
     picture = np.zeros((48, 64, 3), np.uint8)
     picture[:, :20] = 200
     write_film(tmp_path / "film.mp4", [(0, picture), (40_000_000, picture)], 25.0, turn)
-    assert display_turn(tmp_path / "film.mp4") == turn
+    assert display_matrix(tmp_path / "film.mp4") == turn
     _, _, rotation = film_frames(tmp_path / "film.mp4")
     expected = {(0, 1, -1, 0): (-90, 270), (-1, 0, 0, -1): (180, -180), (0, -1, 1, 0): (90, -270), UPRIGHT: (0,)}[turn]
     assert rotation in expected

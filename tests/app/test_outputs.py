@@ -142,7 +142,7 @@ def test_a_run_killed_in_its_first_moment_is_no_obstacle(tmp_path: Path, mode: s
         assert names(run.path) - {".lock"} == {".run", ".segments", "frames"}
     (run.path / "mine.0123abcd.part").write_bytes(b"mine")
     run.state.unlink()
-    with pytest.raises(OutputError, match="no run of virest"):
+    with pytest.raises(OutputError, match="do not belong to a virest run"):
         check_run(run, REQUEST, "overwrite")
 
 
@@ -241,7 +241,7 @@ def test_a_foreign_folder_is_never_touched(tmp_path: Path, mode: str) -> None:
     (folder / "frames").mkdir(parents=True)
     (folder / "frames" / "000000.png").write_bytes(b"holiday")
     (folder / "run.json").write_text('{"other": "tool"}')
-    with pytest.raises(OutputError, match="no run of virest"), opened_run(RunFolder(folder), REQUEST, mode):  # type: ignore[arg-type]
+    with pytest.raises(OutputError, match="do not belong to a virest"), opened_run(RunFolder(folder), REQUEST, mode):  # type: ignore[arg-type]
         pass
     assert names(folder) == {"frames", "frames/000000.png", "run.json"}
 

@@ -75,7 +75,7 @@ def test_rows_are_filtered_modulo_256() -> None:
 @pytest.mark.parametrize("shape", [(0, 5, 3), (5, 0, 3), (4, 4, 2), (4,), (2, 2, 2, 3)])
 def test_what_is_no_picture_is_refused(shape: tuple[int, ...]) -> None:
     """Pictures without pixels and with other channels than PNG's."""
-    with pytest.raises(ValueError, match="no picture"):
+    with pytest.raises(ValueError, match="not an 8-bit picture"):
         png_bytes(np.zeros(shape, np.uint8))
 
 

@@ -128,7 +128,7 @@ def test_frames_left_out_stand_with_their_reason_and_range(report, made):
     lines = [json.loads(line) for line in (made / "parameters.jsonl").read_text().splitlines()]
     skipped = [line["frame"] for line in lines if line["status"] == "skipped"]
     markup = (made / "report.html").read_text()
-    (row,) = re.findall(r'<td data-label="Why">(falls into the IMU gap.*?)</tr>', markup, re.DOTALL)
+    (row,) = re.findall(r'<td data-label="Reason">(falls into the IMU gap.*?)</tr>', markup, re.DOTALL)
     assert f"{skipped[0]}–{skipped[-1]}" in row
     assert f'class="number">{len(skipped)}<' in row
 
@@ -305,7 +305,7 @@ def test_a_picture_that_is_gone_or_broken_leaves_its_place_empty(report, made):
     code, out, err = report(made, "--json", "--frames", 2)
     assert code == 0
     assert json.loads(out)["captures"][0]["recorded_shown"]
-    assert "is not a picture" in err
+    assert "cannot be read as a picture" in err
     assert len(pictures_of(made / "report.html")) == 2
 
 

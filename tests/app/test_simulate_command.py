@@ -96,7 +96,7 @@ def test_a_phone_can_be_asked_for_and_changed(virest: Virest, tmp_path: Path) ->
 def test_the_help_groups_the_phones_options(virest: Virest, tmp_path: Path) -> None:
     """They stand under a title of their own, behind the others."""
     text = virest("simulate", "--help", cwd=tmp_path).stdout
-    usual, phones = text.partition("\nOptions:")[2].split("Phone's processing")
+    usual, phones = text.partition("\nOptions:")[2].split("phone's own processing")
     assert "--seed" in usual
     assert "--sharpen" not in usual
     assert all(option in phones for option in ("--isp", "--sharpen", "--gyro-noise", "--bits-per-px"))

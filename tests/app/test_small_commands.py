@@ -125,5 +125,5 @@ def test_a_bad_folder_is_told_in_few_lines(virest_here, tmp_path: Path) -> None:
     (tmp_path / "bad" / "gyro_accel.csv").write_text("t,x\n")
     done = virest_here("inspect", "bad")
     assert done.returncode == 4
-    assert "missing too: movie.mp4, frame_timestamps.txt, movie_metadata.csv" in done.stdout
+    assert "also missing: movie.mp4, frame_timestamps.txt, movie_metadata.csv" in done.stdout
     assert len(done.stdout.splitlines()) <= 6

@@ -114,7 +114,7 @@ def test_every_cause_has_words():
          "0.01792 ± 0.00019 rad/s; −0.01076 ± 0.00021 rad/s"),
         ("gyro_scale", 1.01, None, "1.01"),
         ("depth_m", "inf", None, "infinity"),
-        ("depth_m", None, None, "not known"),
+        ("depth_m", None, None, "unknown"),
         ("gain", [1.0] * 30, None, "30 values"),
         ("focal_drift_per_s", 0.002, 0.0, "0.002 1/s"),
     ],
@@ -132,8 +132,8 @@ def test_an_estimate_travels_with_its_deviation_and_source():
     values = {value.title: value for value in camera_values(profile, "camera.yaml")}
     assert (values["Time offset"].text, values["Time offset"].source) == ("462 ± 17 ms", "tracked points")
     assert values["Focal length"].source == "given by camera.yaml"
-    assert values["Readout time"].text == "not known"
-    assert camera_values({"imu": 3, "estimates": [1]}, "")[0].text == "not known"
+    assert values["Readout time"].text == "unknown"
+    assert camera_values({"imu": 3, "estimates": [1]}, "")[0].text == "unknown"
 
 
 def test_frames_left_alone_are_grouped_by_reason_whatever_its_numbers():
@@ -155,7 +155,7 @@ def test_the_verdict_counts():
     """All, some or none restored, and what became of the others."""
     mixed = run_verdict({**COUNTS, "failed": 4}, "some frames failed", [facts(3)])
     assert (mixed.level, mixed.headline) == ("poor", "1 of 7 frames deblurred, 1 only straightened")
-    assert mixed.sentence.startswith("1 left out, 4 failed.")
+    assert mixed.sentence.startswith("1 skipped, 4 failed.")
     assert run_verdict({**COUNTS, "skipped": 0}, "restored", []).level == "good"
     told = run_verdict({"restored": 103, "copied": 0, "skipped": 0, "failed": 0, "deblurred": 14}, "restored", [])
     assert told.headline == "14 of 103 frames deblurred, 89 only straightened"
@@ -267,7 +267,7 @@ def test_a_diagnosis_is_told_with_values_deviations_and_rivals():
     for words in ("0 ms → 4.20 ± 0.11 ms", "1.41 → 0.22 points, px", "99%", "timestamp reference (0.23)",
                   "camera and IMU clocks differ by an offset", "Found: time offset."):  # fmt: skip
         assert words in told
-    assert "more than chance" in text_of(
+    assert "is significant" in text_of(
         report_page([CaptureRecord("t", None, DiagnosisRecord({**found, "verdict": "unexplained"}))], "1")
     )
 
@@ -285,6 +285,6 @@ def test_only_what_a_profile_states_is_called_given():
     """A null is unknown, whatever default replaces it; a default may be nobody's."""
     profile = {"imu": {"time_offset_s": None, "gyro_bias_rad_s": [0.0, 0.0, 0.0]}, "intrinsics": {"fx_px": 500.0}}
     values = {value.title: value.source for value in camera_values(profile, "camera.yaml")}
-    assert values["Time offset"] == "not known"
+    assert values["Time offset"] == "unknown"
     assert values["Gyroscope bias"] == "camera.yaml, or the default"
     assert values["Focal length"] == "given by camera.yaml"

@@ -1,4 +1,4 @@
-"""The content of run.json: what came out of a capture, or why nothing did."""
+"""The content of run.json: the result for one capture, or why there is none."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from virest.restoration.capture import RestorationPlan
 PARTLY_FAILED = 9
 STATUSES = ("restored", "copied", "skipped", "failed")
 STEPS = ("deblurred", "straightened", "undistorted")
-"""What is counted beside the four statuses; a copied frame may be undistorted."""
+"""Steps counted in addition to the four statuses; a copied frame may be undistorted."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 MOST_FILES, MOST_BYTES = 32, 1 << 30
-"""Of a capture that cannot be read: what is looked at for run.json."""
+"""Limits on the files of an unreadable capture that run.json lists."""
 
 
 def run_totals(logs: list[Path]) -> dict[str, Any]:
-    """Counts by status and by what was done, seconds by stage, and what neighbours brought, over all lines."""
+    """Counts by status and by step, seconds by stage, and the gain from neighbours, over all lines."""
     counts: Counter[str] = Counter()
     seconds: Counter[str] = Counter()
     joined: list[tuple[int, float]] = []
@@ -51,7 +51,7 @@ def run_totals(logs: list[Path]) -> dict[str, Any]:
 
 
 def _joined(joined: list[tuple[int, float]]) -> dict[str, Any]:
-    """What neighbours brought: frames restored with some, how many each had, and the gain by the spectra, means."""
+    """Frames restored with neighbours, their mean number of neighbours, and the mean gain predicted by the spectra."""
     count = len(joined)
     taken, gain_db = (sum(column) / count for column in zip(*joined, strict=True)) if count else (None, None)
     return {"frames": count, "mean_taken": taken, "mean_gain_db": gain_db}
@@ -99,7 +99,7 @@ def run_account(
 def failure_account(
     path: str, name: str, options: ProcessOptions, job: Job | None, error: Exception, wall_s: float
 ) -> dict[str, Any]:
-    """The content of run.json for a capture that could not be processed; what was not found out is empty."""
+    """The content of run.json for a capture that could not be processed; unknown values are empty."""
     kind = type(error).__name__
     known = error if isinstance(error, VirestError) else VirestError(f"{kind}: {error}", hint=console.OUR_FAULT)
     return {
@@ -129,12 +129,12 @@ def failure_account(
 
 
 def _source(path: str) -> dict[str, str]:
-    """Where the capture is: as it was given, and where that lies, links followed."""
+    """The capture's path as given, and with links resolved."""
     return {"given": path, "resolved": resolved(path)}
 
 
 def _facts_of_folder(folder: Path) -> list[dict[str, Any]]:
-    """Facts of plain files in the folder of a capture that could not be read, in bounded time; none at an address."""
+    """Facts of regular files in an unreadable capture's folder, in bounded time; none for a remote address."""
     facts: list[dict[str, Any]] = []
     left = 0 if is_remote(folder) else MOST_BYTES
     with suppress(OSError):
@@ -147,7 +147,7 @@ def _facts_of_folder(folder: Path) -> list[dict[str, Any]]:
 
 
 def _inputs(job: Job) -> list[dict[str, Any]]:
-    """Facts of the input files with their places."""
+    """Facts of the input files with their paths."""
     known = zip(job.request["inputs"], job.inputs, strict=True)
     return [{**facts, "path": resolved(file)} for facts, file in known]
 

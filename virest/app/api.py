@@ -1,4 +1,4 @@
-"""What ``import virest`` offers: a handful of functions on numpy arrays and records.  No file is written unless asked.
+"""The public API of ``import virest``: a few functions on numpy arrays and records.  Files are written only on request.
 
 The functions raise the errors of :mod:`virest.errors`; each carries a hint.
 """
@@ -38,15 +38,15 @@ PathLike = str | os.PathLike[str]
 
 
 class Capture:
-    """An opened capture: its logs are read, its frames are decoded when asked for.  Made by :func:`open`."""
+    """An opened capture: logs are read at once, frames are decoded on demand.  Created by :func:`open`."""
 
     def __init__(self, record: CaptureRecord, profile: CameraProfile, profile_source: str) -> None:
         self.record = record
-        """Everything that was read, checked and joined."""
+        """All logs, checked and joined."""
         self.profile = profile
         """The camera profile in use."""
         self.profile_source = profile_source
-        """Where it comes from."""
+        """Where the profile comes from."""
         self._index: MovieIndex | None = None
         self._plans: dict[RestorationSettings, RestorationPlan] = {}
 
@@ -63,21 +63,21 @@ class Capture:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """What was logged for each frame: stamp, time, exposure, and why it cannot be used, if so."""
+        """The log of each frame: timestamp, time, exposure, and why it cannot be used, if so."""
         return at_true_times(self.record.frames, self.profile, self.record.repeats)
 
     @property
     def imu(self) -> ImuSamples:
-        """Gyroscope and accelerometer, on the time axis of ``frames``."""
+        """Gyroscope and accelerometer samples, on the time axis of ``frames``."""
         return self.record.imu
 
     @property
     def notes(self) -> tuple[Note, ...]:
-        """What a reader of the capture should know."""
+        """Notes about the capture: problems found, values assumed."""
         return self.record.notes
 
     def read_frames(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, Picture]]:
-        """Index and RGB pixels (height, width, 3) of the decodable frames from ``start`` to before ``stop``."""
+        """Index and RGB pixels (height, width, 3) of the decodable frames in ``range(start, stop)``."""
         chosen = range(len(self))[start:stop]
         if len(chosen):
             for index, picture in read_frames(self.record.movie, self._movie(), chosen[0], chosen[-1]):
@@ -85,14 +85,16 @@ class Capture:
                     yield index, picture
 
     def read_frame(self, index: int) -> Picture:
-        """Pixels (height, width, 3) RGB of one frame.  Raises CaptureError where it cannot be decoded."""
+        """RGB pixels (height, width, 3) of one frame.  Raises CaptureError if it cannot be decoded."""
         number = self._number(index)
         for _, picture in self.read_frames(number, number + 1):
             return picture
-        raise CaptureError(f"{self.name}: frame {number} cannot be decoded", hint="inspect the capture")
+        raise CaptureError(
+            f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it"
+        )
 
     def restore(self, index: int, preset: str = "balanced", **settings: Any) -> RestoredFrame:
-        """Restore one frame as ``virest process`` does: unknown values of the profile and travel are estimated once."""
+        """Restore one frame as ``virest process`` does; unknown profile values and translation are estimated once."""
         number = self._number(index)
         plan = self.plan(preset, **settings)
         frame = self.frames[number]
@@ -103,12 +105,14 @@ class Capture:
         read = read_frames(self.record.movie, self._movie(), around[0], around[-1], steps)
         decoded = {n: picture for n, picture in read if picture is not None}
         if number not in decoded:
-            raise CaptureError(f"{self.name}: frame {number} cannot be decoded", hint="inspect the capture")
+            raise CaptureError(
+                f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it"
+            )
         near = [(self.frames[k], decoded[k]) for k in sorted(decoded) if k == number or not self.frames[k].skip_reason]
         return next(restore_frames(near, self.imu, plan, {number}, steps))
 
     def plan(self, preset: str = "balanced", **settings: Any) -> RestorationPlan:
-        """What restoring this capture takes: the profile with unknown values filled in, translations, warnings."""
+        """The plan for restoring this capture: the completed profile, translations, warnings."""
         from virest.restoration.capture_estimation import plan_restoration
 
         composed = _settings(preset, settings)
@@ -137,7 +141,7 @@ class Capture:
 def open(path: PathLike, config: PathLike | CameraProfile | None = None) -> Capture:
     """Open a capture folder of any supported recorder.
 
-    config: a profile file (virest's or Kalibr's) or record; otherwise ``camera.yaml`` of the folder, or the recorder's
+    config: a profile file (virest's or Kalibr's) or record; by default the folder's ``camera.yaml``, or the recorder's
     own metadata.  Raises CaptureError, SettingsError.
     """
     record = read_capture(Path(path))
@@ -161,9 +165,9 @@ def restore(
     """Deblur and straighten one frame.
 
     frame: (height, width) or (height, width, 3) RGB, uint8, as stored.  motion: inertial samples, or a trajectory of
-    the camera's orientation, on the IMU's clock.  time_s: the frame's stamp on the camera's clock; the profile's
-    ``time_offset_s`` must be known.  exposure_s: as logged; None straightens only.  translation: the camera's travel,
-    where it is known; otherwise only rotation is undone.  settings: fields of RestorationSettings, such as ``shutter``.
+    the camera's orientation, on the IMU's clock.  time_s: the frame's timestamp on the camera's clock; the profile's
+    ``time_offset_s`` must be known.  exposure_s: as logged; None straightens only.  translation: of the camera, if
+    known; otherwise only rotation is corrected.  settings: fields of RestorationSettings, such as ``shutter``.
     The result's ``picture`` has the shape of ``frame``; ``parameters`` are those of ``parameters.jsonl``.
     """
     camera = profile if isinstance(profile, CameraProfile) else read_any_profile(Path(profile))
@@ -171,12 +175,12 @@ def restore(
     if picture.shape[:2] != (camera.height, camera.width):
         raise SettingsError(
             f"the frame is {picture.shape[1]}x{picture.shape[0]}, the profile {camera.width}x{camera.height}",
-            hint="a profile holds for one stored size",
+            hint="a profile applies to one stored frame size",
         )
     for name, value in (("time_offset_s", camera.time_offset_s), ("intrinsics", camera.intrinsics)):
         if value is None:
             raise SettingsError(
-                f"the profile's {name} is unknown", hint="fit it by virest.calibrate, or use Capture.restore"
+                f"the profile's {name} is unknown", hint="fit it with virest.calibrate, or use Capture.restore"
             )
     composed = _settings(preset, settings)
     trajectory = motion if isinstance(motion, Trajectory) else integrate_gyro(motion, camera)
@@ -198,17 +202,17 @@ def deblur(
     preset: str = "balanced",
     **settings: Any,
 ) -> Picture:
-    """Deblur a picture by one kernel, or along one blur path, the same all over.
+    """Deblur a picture with one kernel or one blur path for the whole picture.
 
     picture: (height, width) or (height, width, 3) RGB, uint8.  kernel: 2-D, of the convolution ``recorded light =
-    sharp light ∗ kernel``, of any sum.  path_px: (k, 2) where a point moved while the picture was taken, x right, y
-    down; the result shows displacement (0, 0).  response: the exposure curve between light and grey, ``srgb``,
+    sharp light ∗ kernel``; any positive sum.  path_px: (k, 2) displacement of a point during the exposure, x
+    right, y down; the result shows displacement (0, 0).  response: the exposure curve between light and grey, ``srgb``,
     ``linear``, ``gamma:2.2`` or a record.  Noise is measured in the picture.  Returns an array of the same shape.
     """
     from virest.app.simulate import parse_response
 
     if (kernel is None) == (path_px is None):
-        raise SettingsError("give either a kernel or path_px", hint="one of the two")
+        raise SettingsError("deblur needs a kernel or path_px", hint="pass exactly one of the two")
     curve = response if isinstance(response, ResponseCurve) else parse_response(response)
     path, light = path_of_kernel(np.asarray(kernel)) if path_px is None else (even_path(np.asarray(path_px)), None)
     sharp = deblur_along(as_colour(picture), path, light, curve, _settings(preset, settings))
@@ -218,9 +222,9 @@ def deblur(
 def calibrate(
     path: PathLike, config: PathLike | None = None, extra: Sequence[str] = (), out: PathLike | None = None
 ) -> Json:
-    """Fit clock, readout, axes and gyroscope bias to a capture: the mapping of ``virest calibrate --json``.
+    """Fit clock, readout, axes and gyroscope bias to a capture; returns the mapping of ``virest calibrate --json``.
 
-    extra: names of ``--with``.  out: write the calibrated profile here.  Raises CalibrationError where the motion does
+    extra: names of ``--with``.  out: write the calibrated profile here.  Raises CalibrationError if the motion does
     not determine the time offset.
     """
     from virest.app.calibrate import (
@@ -233,7 +237,7 @@ def calibrate(
 
     for name in extra:
         if wrong := unknown_extra(name):
-            raise SettingsError(wrong, hint="see docs/commands/calibrate.md")
+            raise SettingsError(wrong, hint="virest calibrate --help lists the names of --with")
     plan = plan_calibration(Path(path), None if config is None else Path(config), extra)
     if out is not None:
         return run_calibration(plan, CalibrationOutput(Path(out)))[0]
@@ -241,10 +245,10 @@ def calibrate(
 
 
 def diagnose(path: PathLike, config: PathLike | None = None, out: PathLike | None = None) -> Json:
-    """Test the camera model on a capture: the mapping of ``virest diagnose --json``.
+    """Test the camera model on a capture; returns the mapping of ``virest diagnose --json``.
 
-    ``extended_profile`` is the profile with the causes built in, as a mapping, and ``residuals`` the points' residuals
-    before and after.  out: also write ``OUT/<capture>/`` as the command does.
+    ``extended_profile`` is the profile with the causes included, as a mapping; ``residuals`` are the residuals of the
+    tracked points before and after.  out: also write ``OUT/<capture>/`` as the command does.
     """
     from virest.app.diagnose import DiagnosisOptions, find_diagnosis, run_diagnosis
 
@@ -255,7 +259,7 @@ def diagnose(path: PathLike, config: PathLike | None = None, out: PathLike | Non
 
 
 def simulate(out: PathLike, **options: Any) -> Json:
-    """Write a capture with known truth to the folder ``out``: the mapping of ``virest simulate --json``.
+    """Write a capture with known ground truth to the folder ``out``; returns the mapping of ``virest simulate --json``.
 
     options: those of :func:`virest.app.simulate.simulate_command`, such as ``scene``, ``frames``, ``effects``.
     """
@@ -269,7 +273,7 @@ def _settings(preset: str, given: Mapping[str, Any]) -> RestorationSettings:
 
     unknown = set(given) - {field.name for field in dataclasses.fields(RestorationSettings)}
     if unknown:
-        raise SettingsError(f"no setting '{sorted(unknown)[0]}'", hint="see docs/profile.md#settings")
+        raise SettingsError(f"unknown setting '{sorted(unknown)[0]}'", hint="see the fields of RestorationSettings")
     if preset not in PRESETS:
         raise SettingsError(f"preset '{preset}' is unknown", hint=f"choose from {', '.join(PRESETS)}")
     return compose_settings(None, preset=preset, **given)

@@ -1,4 +1,4 @@
-"""``virest calibrate CAPTURE``: clock, readout, axes, bias and more of a phone, from an ordinary capture."""
+"""``virest calibrate CAPTURE``: clock, readout, axes, bias and more, fitted to an ordinary capture."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from virest.inference.parallel import ParallelMap, one_by_one
 from virest.report.words import residual_words
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
-"""What ``--with`` takes."""
+"""Names that ``--with`` accepts."""
 MAX_FRAMES = 400
-"""Every frame of captures up to this length, 13 s at 30 frames a second; runs of that many in all of longer ones."""
+"""Captures up to this length (13 s at 30 frames/s) use every frame; longer ones use runs with this total."""
 FIT_STEPS = 3
 UNEXPLAINED = 1.5
-"""A residual of this many times the noise of tracking is worth a note."""
+"""Ratio of residual to tracking noise above which a note is given."""
 RATE_TOLERANCE, NOISE_FACTOR = 0.1, 3.0
-"""How far a capture's inertial data may be from imu.yaml before that is worth a note."""
+"""Relative difference in sample rate, and ratio of noise densities, above which a note compares data and imu.yaml."""
 CAMCHAIN_NAME, IMU_NAME = "camchain-imucam.yaml", "imu.yaml"
 DIGITS = 6
 
@@ -46,27 +46,27 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPlan:
-    """A capture that was read, and which of its frames are used."""
+    """A capture with its profile, and the frames to use."""
 
     capture: Capture
     profile: CameraProfile
     source: str
     """Where the profile comes from."""
     imu_file: ImuNoise | None
-    """Noise from the imu.yaml beside a Kalibr camera chain."""
+    """Noise from the imu.yaml next to a Kalibr camera chain."""
     extra: tuple[str, ...]
     frames: tuple[int, ...]
-    """Movie indices that are tracked."""
+    """Movie indices of the frames to track."""
 
     @property
     def steps(self) -> int:
-        """How often ``progress`` is called."""
+        """Number of calls of ``progress``."""
         return len(self.frames) + FIT_STEPS
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationOutput:
-    """Where the results go."""
+    """Where to write the results."""
 
     profile: Path
     kalibr: Path | None = None
@@ -79,7 +79,7 @@ class CalibrationOutput:
         return (self.profile, *((self.kalibr / CAMCHAIN_NAME, self.kalibr / IMU_NAME) if self.kalibr else ()))
 
     def require(self) -> None:
-        """Raise OutputError, before any work, for what could not be written at its end."""
+        """Raise OutputError, before any work, if a result could not be written later."""
         for path in (self.profile, *([self.kalibr] if self.kalibr else [])):
             if not path.absolute().parent.is_dir():
                 raise OutputError(f"{path}: its folder does not exist", hint="create it first")
@@ -93,7 +93,7 @@ class CalibrationOutput:
 
 
 def unknown_extra(name: str) -> str | None:
-    """Why ``--with`` does not take this name, with its nearest neighbour; None: it does."""
+    """Error text for a name that ``--with`` does not accept, with the closest accepted name; None: accepted."""
     if name in EXTRA_NAMES:
         return None
     near = difflib.get_close_matches(name.replace("_", "-").lower(), EXTRA_NAMES, n=1, cutoff=0.5)
@@ -118,7 +118,7 @@ def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str
 
 
 def choose_frames(capture: Capture, profile: CameraProfile, with_startup: bool = False) -> list[int]:
-    """Movie indices to track, rising: every usable frame, or lively runs of them; the start-up's where asked for."""
+    """Movie indices to track, ascending: every usable frame or high-motion runs; with start-up frames if asked."""
     chosen = high_motion_frames(capture.frames, capture.imu, MAX_FRAMES, profile.time_offset_s or 0.0)
     if with_startup:
         chosen += [frame.index for frame in capture.frames if frame.only_startup]
@@ -126,7 +126,7 @@ def choose_frames(capture: Capture, profile: CameraProfile, with_startup: bool =
 
 
 def _imu_file(source: str) -> ImuNoise | None:
-    """The imu.yaml that lies beside a Kalibr camera chain."""
+    """The imu.yaml next to a Kalibr camera chain."""
     path = Path(source)
     beside = path.with_name(IMU_NAME)
     if not path.is_file() or not beside.is_file() or not is_kalibr(load_yaml_mapping(path)):
@@ -143,10 +143,10 @@ def run_calibration(
     progress: Callable[[int], Any] | None = None,
     each: ParallelMap = one_by_one,
 ) -> tuple[Json, str]:
-    """Track, fit and write; returns the mapping for ``--json`` and the table for people.
+    """Track, fit and write; returns the mapping for ``--json`` and the printed table.
 
-    progress is called with the number of the plan's steps just done.  each: shares work out.  Raises CalibrationError,
-    OutputError; nothing is written then.
+    progress is called with the number of the plan's steps just done.  each: maps calls over processes.  Raises
+    CalibrationError, OutputError; nothing is written then.
     """
     output.require()
     facts, found, noise = find_calibration(plan, progress, each)
@@ -159,7 +159,7 @@ def run_calibration(
 def find_calibration(
     plan: CalibrationPlan, progress: Callable[[int], Any] | None = None, each: ParallelMap = one_by_one
 ) -> tuple[Json, GeometryCalibration, ImuNoise | None]:
-    """Track and fit; the mapping for ``--json``, and what it was made from.  Raises CalibrationError."""
+    """Track and fit; the mapping for ``--json``, the calibration and the IMU noise.  Raises CalibrationError."""
     step = progress or (lambda _: None)
     movie = plan.capture.movie
     gray = GrayReader(movie, probe_movie(movie))
@@ -171,13 +171,13 @@ def find_calibration(
 
 
 def _require_offset(found: GeometryCalibration) -> None:
-    """Nothing else can be believed of a capture whose clock is unknown."""
+    """Raise CalibrationError if the time offset is unknown: every other value depends on it."""
     offset = next((value for value in found.values if value.name == "time_offset_s"), None)
     if offset is not None and not offset.determined and not offset.rough:
         std = f" (± {1e3 * float(np.max(offset.std)):.1f} ms)" if offset.std is not None else ""
         raise CalibrationError(
             f"the motion does not determine the time offset{std}",
-            hint="film a few seconds more, and turn the phone about all three axes",
+            hint="record a few more seconds while rotating the phone about all three axes",
         )
 
 
@@ -187,7 +187,7 @@ def _write(
     contents = [_profile_text(facts, found.profile)]
     if output.kalibr:
         if noise is None:
-            raise CalibrationError("too few inertial samples to measure their noise", hint="leave --kalibr out")
+            raise CalibrationError("too few inertial samples to measure their noise", hint="omit --kalibr")
         contents += [format_camchain(found.profile, capture.metadata.exposure_s), format_imu(noise)]
         _make_folder(output.kalibr)
     for path, content in zip(output.files, contents, strict=True):
@@ -210,11 +210,11 @@ def _profile_text(facts: Json, profile: CameraProfile) -> str:
     return "".join(f"# {_one_line(line)}\n" for line in head) + format_profile(profile)
 
 
-# ── results for machines ─────────────────────────────────────────────────────────────────────────────────────────
+# ── JSON results ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise | None) -> Json:
-    """Everything that was found, as one mapping."""
+    """All results as one mapping."""
     values = [_value_facts(value) for value in found.values]
     undetermined = [value["name"] for value in values if not value["determined"] and not value["rough"]]
     return {
@@ -243,13 +243,13 @@ def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise |
 
 
 def _verdict(undetermined: list[str], odd: list[str]) -> str:
-    """In one line; odd: of those not determined, the ones whose values no camera has."""
+    """The verdict in one line; odd: the undetermined parameters whose fitted values no camera has."""
     if not undetermined:
         return "calibrated"
     open_yet = [name for name in undetermined if name not in odd]
-    parts = [f"{', '.join(open_yet)}, which this motion does not determine"] if open_yet else []
-    parts += [f"{', '.join(odd)}, which no camera has so"] if odd else []
-    return f"calibrated but for {'; and '.join(parts)}"
+    parts = [f"{', '.join(open_yet)} (not determined by this motion)"] if open_yet else []
+    parts += [f"{', '.join(odd)} (implausible value)"] if odd else []
+    return f"calibrated, except {' and '.join(parts)}"
 
 
 def _value_facts(value: CalibratedValue) -> Json:
@@ -278,12 +278,12 @@ def _own_notes(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNois
     notes = []
     if found.residual_px > UNEXPLAINED * found.noise_px:
         notes.append(
-            f"the residual is {found.residual_px / found.noise_px:.1f} times the tracking noise: something remains "
-            "unexplained, and the standard deviations include it as noise"
+            f"the residual is {found.residual_px / found.noise_px:.1f} times the tracking noise: part of it is "
+            "unexplained, and the standard deviations treat it as noise"
         )
     notes += [
-        f"the time offset is written although it is known to ± {1e3 * float(np.max(value.std)):.1f} ms only: film a "
-        "few seconds more, and turn the phone about all three axes"
+        f"the time offset is written but known only to ± {1e3 * float(np.max(value.std)):.1f} ms: record a few more "
+        "seconds while rotating the phone about all three axes"
         for value in found.values
         if value.rough and value.std is not None
     ]
@@ -293,7 +293,7 @@ def _own_notes(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNois
 
 
 def _imu_disagreements(file: ImuNoise, measured: ImuNoise) -> list[str]:
-    """Where a capture's inertial data are not those that imu.yaml describes."""
+    """Notes where a capture's inertial data differ from what imu.yaml states."""
     notes = []
     if abs(measured.update_rate_hz / file.update_rate_hz - 1) > RATE_TOLERANCE:
         notes.append(
@@ -304,29 +304,29 @@ def _imu_disagreements(file: ImuNoise, measured: ImuNoise) -> list[str]:
         ("gyroscope", file.gyro_density, measured.gyro_density),
         ("accelerometer", file.accel_density, measured.accel_density),
     )
-    for name, told, seen in pairs:
-        if told and seen and seen > NOISE_FACTOR * told:
-            notes.append(f"{name}: noise density {seen:.2g} here, {told:.2g} in {IMU_NAME}")
+    for name, stated, density in pairs:
+        if stated and density and density > NOISE_FACTOR * stated:
+            notes.append(f"{name}: noise density {density:.2g} here, {stated:.2g} in {IMU_NAME}")
     return notes
 
 
-# ── results for people ───────────────────────────────────────────────────────────────────────────────────────────
+# ── printed results ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def describe(facts: Json) -> str:
-    """A table of the values, then what is to be known about them."""
+    """A table of the values, then residual, translation, correlations and notes."""
     rows = [row for value in facts["values"] for row in _rows(value)]
     share = 100 * facts["moving_fraction"]
     lines = [
         f"{facts['capture']}: {facts['verdict']}",
         table(["value", "start", "calibrated", "±", "determined", "note"], rows),
         f"residual {facts['before_px']:.3f} -> {residual_words(facts['residual_px'], facts['noise_px'])}",
-        f"{facts['tracks']} tracks in {facts['pairs']} pairs of frames, {share:.1f} % of them moving on their own; "
+        f"{facts['tracks']} tracks in {facts['pairs']} pairs of frames, {share:.1f} % of them on moving objects; "
         f"the gyroscope explains {facts['explained']:.1%} of the rotation",
-        f"camera's translation: {_TRANSLATIONS.get(facts['translation'], facts['translation'])}",
+        f"camera translation: {_TRANSLATIONS.get(facts['translation'], facts['translation'])}",
     ]
     if facts["frames"] < facts["frames_recorded"]:
-        lines.append(f"used {facts['frames']} of {facts['frames_recorded']} frames: runs from all parts of the capture")
+        lines.append(f"used {facts['frames']} of {facts['frames_recorded']} frames: runs spread over the capture")
     lines += [
         f"errors of {pair['first']} and {pair['second']} are correlated: {pair['correlation']:+.2f}"
         for pair in facts["correlations"]
@@ -337,15 +337,15 @@ def describe(facts: Json) -> str:
 
 
 _TRANSLATIONS = {
-    "none": "none seen",
-    "inertial": "from the accelerometer, in front of a plane",
+    "none": "none detected",
+    "inertial": "from the accelerometer, scene modelled as a plane",
     "direction": "one direction per pair of frames, any depth",
-    "free": "a smooth path, in front of a plane; the accelerometer does not determine it",
+    "free": "a smooth path, scene modelled as a plane; not determined by the accelerometer",
 }
 
 
 def _rows(value: Json) -> list[list[str]]:
-    """One row for a number or a word, one for each component of a list."""
+    """One row for a number or a word, one per component for a list."""
     count = len(value["value"]) if isinstance(value["value"], list) else 0
     if not count:
         return [_row(value, value["name"], value["start"], value["value"], value["std"])]
@@ -362,7 +362,7 @@ def _row(value: Json, name: str, start: Any, found: Any, std: Any) -> list[str]:
 
 
 def _cell(value: Any, std: float | None) -> str:
-    """A number to the digit that its standard deviation leaves, a word, or ``unknown``."""
+    """A number rounded to two digits of its standard deviation, a word, or ``unknown``."""
     if value is None:
         return "unknown"
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""``virest calibrate-curve SOURCE``: the response curve of a bracket or of a capture of a still scene."""
+"""``virest calibrate-curve SOURCE``: the response curve from bracketed stills or a capture of a static scene."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def calibrate_curve(
     plot: Path | None = None,
     overwrite: bool = False,
 ) -> tuple[dict[str, Any], str]:
-    """Fit the curve and write its files; returns the mapping for ``--json`` and the table for people.
+    """Fit the curve and write its files; returns the mapping for ``--json`` and the printed table.
 
     out: YAML with the ``response:`` block; plot: figure, its format by its suffix.  Raises CaptureError,
     CalibrationError, OutputError; nothing is written then.
     """
     for path in (out, plot):
-        _require_place(path, overwrite=overwrite)
+        _require_writable(path, overwrite=overwrite)
     stills, notes = read_source(source, exposures)
     fit = fit_response([BracketPicture(s.file, s.levels, s.exposure) for s in stills], kind)
     facts = as_json(fit, stills, notes)
@@ -53,7 +53,7 @@ def calibrate_curve(
     return facts, describe(facts, out, plot)
 
 
-def _require_place(path: Path | None, *, overwrite: bool) -> None:
+def _require_writable(path: Path | None, *, overwrite: bool) -> None:
     if path is None:
         return
     if path.is_dir():
@@ -70,17 +70,17 @@ def plot_format_known(path: Path) -> bool:
 
 
 def read_source(source: Path, exposures: Path | None) -> tuple[list[Still], list[str]]:
-    """The pictures of a folder of stills or of a capture, and what is worth knowing about them."""
+    """The pictures of a folder of stills or of a capture, and notes about them."""
     if not is_capture(source):
         return read_bracket(source, exposures)
     if exposures is not None:
         text = f"{source}: is a capture, whose exposures are logged"
-        raise CaptureError(text, hint="leave --exposures out, or pass a folder of stills")
+        raise CaptureError(text, hint="omit --exposures, or pass a folder of stills")
     return capture_bracket(read_capture(source))
 
 
 def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, Any]:
-    """The result as contract, section 1, has it."""
+    """The result in the form of contract section 1."""
     return {
         "response": _rounded(response_block(fit.curve)),
         "rms_grey_levels": fit.rms_grey_levels,
@@ -102,7 +102,7 @@ def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, A
 
 
 def _rounded(block: dict[str, Any]) -> dict[str, Any]:
-    # two neighbours of a table may become equal: then all digits are written
+    # Rounding may make two neighbouring table entries equal; all digits are written then.
     def shorten(value: Any) -> Any:
         if isinstance(value, list):
             return [shorten(item) for item in value]
@@ -118,7 +118,7 @@ def _rounded(block: dict[str, Any]) -> dict[str, Any]:
 
 
 def format_curve(facts: dict[str, Any]) -> str:
-    """The ``response:`` block as YAML, to be put into camera.yaml; fit error and covered range as comments."""
+    """The ``response:`` block for camera.yaml as YAML, with fit error and covered range as comments."""
     low, high = facts["covered_exposure"]
     lines = [
         "# Exposure characteristic curve by virest calibrate-curve; put the block into camera.yaml.",
@@ -138,12 +138,12 @@ def _one_line(text: str) -> str:
 
 
 def _shown(value: float | list[float]) -> str:
-    """A number of a curve, or a point, to four digits; the file has all of them."""
+    """A number of a curve, or a point, to four digits; the file holds all digits."""
     return f"({', '.join(map(_shown, value))})" if isinstance(value, list) else f"{value:.4g}"
 
 
 def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
-    """The result for people: one line for the curve, a table of the pictures, the notes."""
+    """The printed result: one line for the curve, a table of the pictures, the notes."""
     rows = []
     for p in facts["pictures"]:
         error = "–" if p["exposure_error_ev"] is None else f"{round(p['exposure_error_ev'], 3) + 0.0:+.3f}"

@@ -1,8 +1,8 @@
-"""The same segments on a Dask cluster: an executor over ``Client.get_executor()``, and plain words where it fails.
+"""Run segments on a Dask cluster: an executor over ``Client.get_executor()`` with readable errors.
 
-Dask gives a segment whose worker died to another one by itself, and gives up after some deaths.  What is left to do
-here: look at the workers before any work, know how many segments keep them busy, notice that the scheduler or all
-workers are gone, and let no worker write on after the program has left.
+Dask itself moves a segment to another worker if its worker dies, and gives up after several deaths.  This module checks
+the workers before any work, knows how many segments keep them busy, detects that the scheduler or all workers are gone,
+and waits at exit until no worker writes any more.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ log = logging.getLogger(__name__)
 
 CONNECT_S = 10.0
 CONNECT_VARIABLE = "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"
-"""How long to wait for an answer, and Dask's own variable that says otherwise."""
+"""How long to wait for an answer, and Dask's own variable that overrides it."""
 FIRST_WORKER_S = 30.0
-"""How long to wait for a cluster's first worker, and, once all are gone, for one to come back."""
+"""How long to wait for a cluster's first worker, and for one to return after all are lost."""
 LOOK_S = 2.0
-"""How old the count of workers may be."""
+"""Maximum age of the cached worker count."""
 LAST_SEGMENT_S = 120.0
-"""How long to wait for segments that are being worked on when the program leaves."""
-TALKERS = ("distributed", "tornado", "asyncio")
-"""Loggers that tell at length of a connection that was lost."""
+"""How long to wait at exit for segments in progress."""
+VERBOSE_LOGGERS = ("distributed", "tornado", "asyncio")
+"""Loggers that report a lost connection in many lines."""
 LIBRARIES = ("numpy", "opencv-python-headless", "av", "isal")
-"""Those that decide the bytes of a picture."""
+"""Libraries that determine the bytes of a picture."""
 TRANSFORMS = "transforms by"
 """The library of tiles' Fourier transforms, which follows from OpenCV's build and the environment."""
 
 
 def is_lost(error: BaseException) -> bool:
-    """Whether an error says that the scheduler, or every worker, is gone: no fault of a capture, and none is left."""
+    """Whether an error means that the scheduler or every worker is lost, so that no capture can be processed."""
     return isinstance(error, RestorationError) and bool(error.facts.get("cluster_lost"))
 
 
 def worker_facts() -> dict[str, str]:
-    """What is installed where this is called."""
+    """Versions installed on the machine that calls this."""
     return {"virest": __version__, **{name: version(name) for name in LIBRARIES}, TRANSFORMS: transforms.in_use()}
 
 
-def missing_places(places: list[str]) -> list[str]:
-    """Which of the places are not there where this is called."""
-    return [place for place in places if not Path(place).exists()]
+def missing_paths(paths: list[str]) -> list[str]:
+    """Those of the paths that do not exist on the machine that calls this."""
+    return [path for path in paths if not Path(path).exists()]
 
 
 def _being_worked_on(run: str, dask_worker: Any) -> int:
@@ -62,7 +62,7 @@ def _being_worked_on(run: str, dask_worker: Any) -> int:
 
 
 class ClusterExecutor(Executor):
-    """Hands work to the workers of a Dask scheduler. Raises SettingsError where they cannot do it."""
+    """Submits work to the workers of a Dask scheduler. Raises SettingsError if they cannot do it."""
 
     def __init__(self, address: str, *, verbose: bool = False) -> None:
         self.address = address
@@ -84,12 +84,12 @@ class ClusterExecutor(Executor):
         key = f"{self._run}-{self._sent}"
         try:
             return self._executor.submit(fn, *args, key=key, **kwargs)  # type: ignore[no-any-return]
-        except Exception as error:  # Dask has a type of its own for a client that closed itself
+        except Exception as error:  # Dask raises its own type for a closed client
             raise self.lost() from error
 
     @property
     def slots(self) -> int:
-        """Segments that keep every thread of every worker busy, and one more a worker while its answer travels."""
+        """Segments in flight: one per worker thread, plus one per worker to cover the transfer of results."""
         if time.monotonic() - self._looked_s > LOOK_S:
             threads = self._threads()
             self._slots = max(sum(threads.values()) + len(threads), 2)
@@ -97,7 +97,7 @@ class ClusterExecutor(Executor):
         return self._slots
 
     def check(self) -> None:
-        """Raise RestorationError if no worker has been there for a while."""
+        """Raise RestorationError if no worker has been connected for FIRST_WORKER_S."""
         if self._threads():
             self._alone_since_s = None
             return
@@ -112,27 +112,27 @@ class ClusterExecutor(Executor):
             )
 
     def lost(self) -> RestorationError:
-        """The error of a scheduler that does not answer any more."""
+        """The error for a scheduler that no longer answers."""
         return RestorationError(
-            f"the scheduler {self.address} is gone; the segments that are done stay",
-            hint="start it again, then continue with --resume",
+            f"lost the scheduler {self.address}; finished segments are kept",
+            hint="restart it, then continue with --resume",
             cluster_lost=True,
         )
 
-    def require_places(self, places: list[Path]) -> None:
+    def require_paths(self, places: list[Path]) -> None:
         """Raise SettingsError unless every worker sees these files and folders of a shared disk."""
         shared = [str(place.absolute()) for place in places if not is_remote(place)]
         if not shared:
             return
-        for worker, missing in self._ask(missing_places, shared).items():
+        for worker, missing in self._ask(missing_paths, shared).items():
             if missing:
                 raise SettingsError(
                     f"the worker {worker} does not see {missing[0]}",
-                    hint="captures and --out have to lie on a disk that all share, or behind an address such as s3://",
+                    hint="put captures and --out on a disk that all workers share, or at an address such as s3://",
                 )
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let go of the cluster; nothing of ours is being written any more afterwards."""
+        """Disconnect from the cluster after its workers have stopped writing for this run."""
         if self._client.status == "running":
             self._executor.shutdown(wait=wait and not cancel_futures)
             self._await_last()
@@ -152,20 +152,20 @@ class ClusterExecutor(Executor):
     def _ask(self, fn: Callable[..., Any], *args: Any) -> dict[str, Any]:
         try:
             return dict(self._client.run(fn, *args))
-        except Exception as error:  # whatever the worker raised, or Dask's own complaint
+        except Exception as error:  # an error of the worker, or of Dask itself
             raise SettingsError(
                 f"--scheduler {self.address}: a worker cannot do the work: {type(error).__name__}: {_line(error)}",
                 hint=f"install virest {__version__} with its extra [cluster] on every worker",
             ) from error
 
     def _require_alike(self) -> None:
-        """Refuse workers with another version of this program; say where a library differs."""
+        """Refuse workers with another virest version; warn if a library version differs."""
         ours = worker_facts()
         for worker, theirs in self._ask(worker_facts).items():
             if theirs["virest"] != ours["virest"]:
                 raise SettingsError(
-                    f"--scheduler {self.address}: the worker {worker} has virest {theirs['virest']}, here is "
-                    f"{ours['virest']}",
+                    f"--scheduler {self.address}: the worker {worker} has virest {theirs['virest']}, this "
+                    f"machine {ours['virest']}",
                     hint="install the same version everywhere",
                 )
             other = [
@@ -174,19 +174,19 @@ class ClusterExecutor(Executor):
                 if theirs[name] != ours[name]
             ]
             if other:
-                log.warning("the worker %s has %s: bytes may differ from a local run", worker, "; ".join(other))
+                log.warning("the worker %s has %s: output bytes may differ from a local run", worker, "; ".join(other))
 
     def _await_last(self) -> None:
-        """Wait for what workers are in the middle of: a segment that was called off is still written to its end."""
+        """Wait for segments in progress: a worker still completes a cancelled segment."""
         end_s = time.monotonic() + LAST_SEGMENT_S
         while time.monotonic() < end_s:
             try:
                 if not any(self._client.run(_being_worked_on, self._run, on_error="ignore").values()):
                     return
-            except Exception:  # the scheduler went away meanwhile; nobody is left to ask
+            except Exception:  # the scheduler has exited: nothing left to query
                 return
             time.sleep(0.1)
-        log.warning("a worker is still writing a segment that was called off; wait before --overwrite")
+        log.warning("a worker is still writing a cancelled segment; wait before using --overwrite")
 
 
 def _connect_s() -> float:
@@ -199,17 +199,17 @@ def _connect(address: str, verbose: bool) -> Any:
     import dask
     from dask.distributed import Client
 
-    if not verbose:  # what it has to say about lost connections is said here in one line
-        for name in [*logging.root.manager.loggerDict, *TALKERS]:  # Dask gives some of their children levels
-            if name.partition(".")[0] in TALKERS:
+    if not verbose:  # virest reports a lost connection in one line of its own
+        for name in [*logging.root.manager.loggerDict, *VERBOSE_LOGGERS]:  # Dask sets levels on some child loggers
+            if name.partition(".")[0] in VERBOSE_LOGGERS:
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
         dask.config.set({"distributed.comm.timeouts.connect": f"{_connect_s()}s"})
-        asyncio.run(_knock(address))  # a client that cannot connect would complain at length when it is taken away
+        asyncio.run(_try_connection(address))  # a client that fails to connect logs many lines when it is closed
         client = Client(address, timeout=_connect_s(), set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise SettingsError(
-            f"--scheduler {address}: {_line(error)}", hint="start `dask scheduler`, or leave it out"
+            f"--scheduler {address}: {_line(error)}", hint="start `dask scheduler`, or omit --scheduler"
         ) from error
     try:
         client.wait_for_workers(1, timeout=FIRST_WORKER_S)
@@ -221,7 +221,7 @@ def _connect(address: str, verbose: bool) -> Any:
     return client
 
 
-async def _knock(address: str) -> None:
+async def _try_connection(address: str) -> None:
     from distributed.comm import connect
 
     comm = await connect(address, timeout=_connect_s())

@@ -1,4 +1,4 @@
-"""Talking to the user: results on standard output, everything else on standard error, one line an error."""
+"""Output to the user: results on standard output, everything else on standard error, one line per error."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from typing import Any, Protocol
 
 from virest.errors import OutputError, VirestError
 
-OUR_FAULT = "this is a fault of virest, not of your input; please report it with the lines above"
+OUR_FAULT = "this is a bug in virest, not in your input; please report it with the lines above"
 MOVIE_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".insv", ".360")
 
 
 class Bar(Protocol):
-    """What the program needs of a progress bar."""
+    """The part of a progress bar's interface that the program uses."""
 
     def update(self, count: int) -> Any:
         """Move the bar on."""
 
     def clear(self) -> Any:
-        """Take the bar off the screen."""
+        """Remove the bar from the screen."""
 
     def refresh(self) -> Any:
-        """Put the bar back."""
+        """Draw the bar again."""
 
 
 class _Console(logging.Handler):
@@ -48,11 +48,11 @@ class _Console(logging.Handler):
             self.block("".join(traceback.format_exception(*record.exc_info)))
 
     def line(self, text: str) -> None:
-        """Write one line, whatever the text holds."""
+        """Write the text as one line; line breaks in it become blanks."""
         self.block("virest: " + " ".join(text.split()) + "\n")
 
     def block(self, text: str) -> None:
-        """Write text as it is; a closed standard error is no reason to fail."""
+        """Write text unchanged; a closed standard error is ignored."""
         if sys.stderr is None:
             return
         if self.bar is not None:
@@ -70,7 +70,7 @@ CONSOLE = _Console()
 
 
 def configure(*, quiet: bool, verbose: bool) -> None:
-    """Show warnings and what was found; with ``quiet`` errors only, with ``verbose`` everything and tracebacks."""
+    """Show information and warnings; with ``quiet`` errors only, with ``verbose`` all messages and tracebacks."""
     root = logging.getLogger("virest")
     root.handlers = [CONSOLE]
     root.propagate = False
@@ -79,7 +79,7 @@ def configure(*, quiet: bool, verbose: bool) -> None:
 
 
 def report_error(error: BaseException, about: str = "") -> int:
-    """One line for a known error, a traceback for a fault of ours (or with -v). Returns the exit code."""
+    """Print one line for a known error, a traceback for a bug of virest (or with -v). Returns the exit code."""
     known = isinstance(error, VirestError)
     if CONSOLE.verbose or not known:
         CONSOLE.block("".join(traceback.format_exception(error)))
@@ -89,7 +89,7 @@ def report_error(error: BaseException, about: str = "") -> int:
 
 
 def emit(text: str) -> None:
-    """Write a result to standard output at once. A closed pipe raises BrokenPipeError, a full disk OutputError."""
+    """Write a result to standard output and flush. A closed pipe raises BrokenPipeError, a full disk OutputError."""
     if sys.stdout is None:
         return
     try:
@@ -99,11 +99,11 @@ def emit(text: str) -> None:
         raise
     except OSError as error:
         silence_stdout()
-        raise OutputError(f"standard output: {error.strerror}", hint="make room there, or write elsewhere") from error
+        raise OutputError(f"standard output: {error.strerror}", hint="free space there, or write elsewhere") from error
 
 
 def silence_stdout() -> None:
-    """Point standard output at nothing, so that the interpreter's last flush cannot fail."""
+    """Redirect standard output to the null device, so that the interpreter's last flush cannot fail."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, sys.__stdout__.fileno() if sys.__stdout__ else 1)
     os.close(null)
@@ -111,9 +111,9 @@ def silence_stdout() -> None:
 
 @contextmanager
 def progress_bar(total: int | None, label: str, *, quiet: bool, done: int = 0) -> Iterator[Bar | None]:
-    """A bar on standard error, only where that is a terminal.
+    """A bar on standard error; None unless standard error is a terminal.
 
-    total: None where the work has no steps to count.  done: of the total by an earlier run; speeds leave it out.
+    total: None if the work has no steps to count.  done: steps finished by an earlier run, which speeds exclude.
     """
     if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield None
@@ -132,7 +132,7 @@ def progress_bar(total: int | None, label: str, *, quiet: bool, done: int = 0) -
 
 
 def expand_dash(captures: Iterable[str]) -> list[str]:
-    """Replace ``-`` by the folder names on standard input, one a line, and a movie by the folder that holds it."""
+    """Replace ``-`` by the paths on standard input, one per line, and a movie by its folder."""
     names: list[str] = []
     for capture in captures:
         if capture != "-":
@@ -144,14 +144,14 @@ def expand_dash(captures: Iterable[str]) -> list[str]:
 
 
 def folder_of(capture: str) -> str:
-    """The capture's folder, where the movie inside it was given."""
+    """The capture's folder, also if the movie inside it was given."""
     if capture.lower().endswith(MOVIE_ENDINGS) and os.path.isfile(capture):
         return os.path.dirname(capture) or "."
     return capture
 
 
 def table(header: list[str], rows: list[list[str]], words: int = 2) -> str:
-    """Columns under their heads, the first and the last few (``words``) to the left, numbers to the right."""
+    """Columns under their heads: the first and the last ``words`` columns left-aligned, the others right-aligned."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     left = {0, *range(len(header) - words, len(header))}
 

@@ -1,4 +1,4 @@
-"""``virest criticise residuals.csv``: what a calibration's residuals say that its model does not."""
+"""``virest criticise residuals.csv``: structure in a calibration's residuals that its model does not explain."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SEPARATORS = (";", "\t", ",")
 
 
 def criticise_file(path: Path) -> tuple[Json, str]:
-    """Facts for ``--json`` and text for people. Raises CaptureError where the table cannot be used."""
+    """Facts for ``--json`` and the printed text. Raises CaptureError if the table cannot be used."""
     columns = read_columns(path)
     try:
         found = criticise(columns)
@@ -32,15 +32,15 @@ def criticise_file(path: Path) -> tuple[Json, str]:
 
 
 def read_columns(path: Path) -> dict[str, Any]:
-    """The numeric columns of a table by their names, in lower case.
+    """The numeric columns of a table by name, in lower case.
 
-    Columns are separated by commas, semicolons, tabs or blanks, with a decimal comma where that separates nothing.  `#`
-    begins a comment; the names may stand behind one, as vnlog (mrcal) has them.
+    Columns are separated by commas, semicolons, tabs or blanks; a decimal comma is accepted if commas do not separate
+    columns.  `#` begins a comment; the line of names may begin with one, as in vnlog files (mrcal).
     """
     if not path.is_file():
         raise CaptureError(f"{path}: no such file", hint="pass a CSV file with the columns x, y, dx, dy")
     if path.stat().st_size > MAX_BYTES:
-        raise CaptureError(f"{path.name}: larger than {MAX_BYTES >> 20} MB", hint="thin the rows")
+        raise CaptureError(f"{path.name}: larger than {MAX_BYTES >> 20} MB", hint="keep fewer rows")
     try:
         legend, skipped, first = _beginning(path)
         separator = next((mark for mark in SEPARATORS if mark in legend), r"\s+")
@@ -48,7 +48,7 @@ def read_columns(path: Path) -> dict[str, Any]:
         if all(map(_is_number, names)):
             raise CaptureError(f"{path.name}: its first line holds numbers", hint=f"name the columns: {NAMES}, ...")
         if len(set(names)) < len(names):
-            raise CaptureError(f"{path.name}: a column stands twice", hint="name each column once")
+            raise CaptureError(f"{path.name}: a column name occurs twice", hint="give each column its own name")
         decimal = "," if separator in ";\t" and re.search(r"\d,\d", first) else "."
         table = pd.read_csv(
             path, sep=separator, names=names, skiprows=skipped, decimal=decimal, skipinitialspace=separator == ",",
@@ -56,20 +56,20 @@ def read_columns(path: Path) -> dict[str, Any]:
         )  # fmt: skip
     except (ValueError, UnicodeDecodeError, OSError) as error:
         reason = (str(error).splitlines() or ["empty"])[0][:120]
-        raise CaptureError(f"{path.name}: is no CSV table: {reason}", hint=f"first line: {NAMES}") from None
+        raise CaptureError(f"{path.name}: not a CSV table: {reason}", hint=f"first line: {NAMES}") from None
     numeric = {name: pd.to_numeric(table[name], errors="coerce").to_numpy(float) for name in table.columns}
     columns = {name: values for name, values in numeric.items() if np.isfinite(values).any()}
     if missing := [name for name in NEEDED if name not in columns]:
         found = ", ".join(name for name in columns if name.isprintable())[:80] or "no column with numbers"
         raise CaptureError(
             f"{path.name}: no column {', '.join(missing)}; it has {found}",
-            hint=_nearest(columns) or f"needed are {', '.join(NEEDED)}, in pixels",
+            hint=_nearest(columns) or f"the columns {', '.join(NEEDED)} are needed, in pixels",
         )
     return columns
 
 
 def _beginning(path: Path) -> tuple[str, int, str]:
-    """The line of names, how many lines end with it, and the line after it. Raises ValueError for an empty file."""
+    """The line of names, its number from 1, and the line after it. Raises ValueError for an empty file."""
     with path.open(encoding="utf-8-sig") as lines:
         for number, line in enumerate(lines, start=1):
             words = line.lstrip("# \t").rstrip()
@@ -88,7 +88,7 @@ def _is_number(text: str) -> bool:
 
 
 def _nearest(columns: dict[str, Any]) -> str:
-    """The column that may be meant by a missing one."""
+    """A hint: existing columns that may be meant by the missing ones."""
     missing = [name for name in NEEDED if name not in columns]
     spare = [name for name in columns if name not in NEEDED]
     near = [
@@ -144,20 +144,20 @@ def _field(field: TableFinding) -> Json:
 
 
 def describe(path: Path, found: Criticism) -> str:
-    """The findings for people."""
+    """The findings as printed text."""
     over = [form.split(" over ")[1].split(", ") for form in found.forms]
     asked = ", ".join(dict.fromkeys(name for names in over for name in names if name != "radius"))
     pairs = " and pairs of these" if any(len(names) > 1 and names != ["x", "y"] for names in over) else ""
     lines = [
         f"{path.name}: {found.rows} residuals ({found.used} used), {found.rms_px:.3g} px rms per coordinate",
-        f"asked along {asked}{pairs}",
+        f"tested covariates: {asked}{pairs}",
     ]
     for field in found.findings:
         lines.append(f"field: {field.sentence}; largest value ± {field.std:.2g} {field.unit}")
-        lines.append(f"  likely: {field.reasons}; to tell: {field.next}")
+        lines.append(f"  likely: {field.reasons}; to confirm: {field.next}")
     left = f"{found.left_px:.3g} px"
     if found.findings:
-        lines.append(f"left: {left} without structure")
+        lines.append(f"remaining: {left} without structure")
     else:
-        lines.append(f"nothing: no structure beyond chance ({found.false_alarm_rate:g} for all covariates together)")
+        lines.append(f"no structure found (false-alarm rate {found.false_alarm_rate:g} for all covariates together)")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""``virest diagnose CAPTURE``: what the model gets wrong, why, what to add, and what that gains."""
+"""``virest diagnose CAPTURE``: what the camera model gets wrong, why, what to add, and what that gains."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ DIAGNOSIS, EXTENDED, FIGURES = "diagnosis.json", "extended.yaml", "figures"
 OWN_FIGURES = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.png")
 NOT_CONSISTENT = 10
 LADDER_PART, GAIN_PART = 0.85, 0.95
-"""Where the ladder and the restorations end on the way from 0 to 1."""
+"""Progress, from 0 to 1, at which the ladder and the restorations end."""
 MAX_RUNGS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisOptions:
-    """What one ``virest diagnose`` was asked for, beside the capture."""
+    """The options of one ``virest diagnose``."""
 
     out: Path
     config: Path | None = None
@@ -67,12 +67,12 @@ class DiagnosisOptions:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisOutcome:
-    """What came of it."""
+    """The result of one diagnosis."""
 
     facts: Json
     """The content of diagnosis.json."""
     text: str
-    """The same for people."""
+    """The printed text."""
     verdict: str
 
     @property
@@ -83,20 +83,20 @@ class DiagnosisOutcome:
 
 @dataclass(frozen=True, slots=True)
 class RgbReader:
-    """Pictures of the frames asked for: what a process needs to read a movie by itself."""
+    """Reads requested frames of a movie; picklable, so that each process decodes for itself."""
 
     movie: Path
     index: MovieIndex
 
     def __call__(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
-        """Stream (movie index, RGB (h, w, 3) or None), rising."""
+        """Stream (movie index, RGB (h, w, 3) or None), ascending."""
         for first, last in _runs(numbers):
             yield from read_frames(self.movie, self.index, first, last)
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A capture that was read, and how to have its pictures."""
+    """A capture with its profile, and readers of its frames."""
 
     capture: Capture
     profile: CameraProfile
@@ -109,14 +109,14 @@ def run_diagnosis(
 ) -> DiagnosisOutcome:
     """Diagnose one capture and write DIR/<capture>/diagnosis.json, extended.yaml and figures.
 
-    progress: told of each stage and of the part that is done.  each: shares work out.  Raises CaptureError,
+    progress: called with each stage and the finished fraction.  each: maps calls over processes.  Raises CaptureError,
     SettingsError, CalibrationError, OutputError; nothing is written then.
     """
     say = progress or (lambda _stage, _part: None)
     folder = Path(options.out) / capture_name(path)
     require_free(folder, options.overwrite)
     source = open_source(Path(path), options.config)
-    found, gain = _found_and_judged(source, say, each)
+    found, gain = _diagnosed_with_gain(source, say, each)
     say("figures", GAIN_PART)
     files, drawn = draw_figures(source.capture, found, each)
     facts = as_json(found, gain, drawn)
@@ -129,14 +129,14 @@ def run_diagnosis(
 
 
 def find_diagnosis(path: Path, config: Path | None = None) -> Json:
-    """The mapping of diagnosis.json without a file written: the extended profile and the residuals stand in it."""
-    found, gain = _found_and_judged(open_source(path, config), lambda _stage, _part: None, one_by_one)
+    """The mapping of diagnosis.json with the extended profile and the residuals added; no file is written."""
+    found, gain = _diagnosed_with_gain(open_source(path, config), lambda _stage, _part: None, one_by_one)
     facts = as_json(found, gain, [[] for _ in found.causes])
     return {**facts, "extended_profile": profile_mapping(found.extended_profile), "residuals": found.residuals}
 
 
-def _found_and_judged(source: Source, say: Progress, each: ParallelMap) -> tuple[Diagnosis, RestorationGain]:
-    """What is wrong, and what mending it does to pictures that no fit has seen."""
+def _diagnosed_with_gain(source: Source, say: Progress, each: ParallelMap) -> tuple[Diagnosis, RestorationGain]:
+    """The diagnosis, and what its causes gain on frames that no fit has used."""
     firsts = pairs_to_keep_back(source.capture, source.profile)
     as_given = begun(each, restore_pairs, source.capture, source.profile, firsts, source.pictures, source.gray)
     found = climb(source, lambda stage, part: say(stage, LADDER_PART * part), each, _of_pairs(firsts))
@@ -154,7 +154,7 @@ def _of_pairs(firsts: Collection[int]) -> list[int]:
 
 
 def climb_as_command(source: Source) -> Diagnosis:
-    """What `virest diagnose` finds: the frames that its restoration gain is measured on are kept back."""
+    """The diagnosis as `virest diagnose` makes it: frames for the restoration gain are held out."""
     kept_back = _of_pairs(pairs_to_keep_back(source.capture, source.profile))
     return climb(source, lambda _stage, _part: None, kept_back=kept_back)
 
@@ -162,17 +162,17 @@ def climb_as_command(source: Source) -> Diagnosis:
 def climb(
     source: Source, progress: Progress, each: ParallelMap = one_by_one, kept_back: Collection[int] = ()
 ) -> Diagnosis:
-    """The ladder itself; kept_back: movie indices of frames that no fit is to see."""
+    """Run the ladder; kept_back: movie indices of frames held out of all fits."""
     from virest.diagnosis.ladder import diagnose_capture
 
     return diagnose_capture(source.capture, source.profile, source.pictures, source.gray, progress, each, kept_back)
 
 
 def require_free(folder: Path, overwrite: bool) -> None:
-    """Raise OutputError, before any work, for what stands in the way; a run of `process` does not."""
-    for place in (folder.parent, folder, folder / FIGURES):
-        if place.exists() and not place.is_dir():
-            raise OutputError(f"{place}: is a file", hint="choose another folder with --out")
+    """Raise OutputError, before any work, if the results cannot be written there; a run of `process` may exist."""
+    for path in (folder.parent, folder, folder / FIGURES):
+        if path.exists() and not path.is_dir():
+            raise OutputError(f"{path}: is a file", hint="choose another folder with --out")
     if (folder / FIGURES).is_symlink():
         raise OutputError(f"{folder / FIGURES}: is a link", hint="choose another folder with --out")
     for name in (DIAGNOSIS, EXTENDED):
@@ -180,12 +180,12 @@ def require_free(folder: Path, overwrite: bool) -> None:
             raise OutputError(f"{folder / name}: is a folder", hint="choose another folder with --out")
     if (folder / DIAGNOSIS).exists() and not overwrite:
         raise OutputError(
-            f"{folder}: holds a diagnosis", hint="--overwrite replaces it, --out chooses another folder"
+            f"{folder}: already holds a diagnosis", hint="--overwrite replaces it, --out chooses another folder"
         )  # fmt: skip
 
 
 def open_source(path: Path, config: Path | None = None) -> Source:
-    """Read a capture with its profile; its pictures are decoded when they are asked for."""
+    """Read a capture with its profile; frames are decoded on demand."""
     capture = read_capture(path)
     for note in capture.notes:
         log.log(logging.INFO if note.severity == "info" else logging.WARNING, "%s: %s", capture.name, note.text)
@@ -196,11 +196,11 @@ def open_source(path: Path, config: Path | None = None) -> Source:
 
 
 def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """First and last of each run of consecutive numbers, rising."""
+    """First and last of each run of consecutive numbers, ascending."""
     if not len(numbers):
         return []
-    rising = np.unique(np.asarray(numbers))
-    parts = np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1)
+    ascending = np.unique(np.asarray(numbers))
+    parts = np.split(ascending, np.flatnonzero(np.diff(ascending) > 1) + 1)
     return [(int(part[0]), int(part[-1])) for part in parts]
 
 
@@ -289,7 +289,7 @@ def _field_path(number: int) -> str:
 
 
 def extended_text(name: str, found: Diagnosis) -> str:
-    """The profile with every cause built in, each with its standard deviation among the estimates."""
+    """The profile with every cause included, each with its standard deviation among the estimates."""
     profile = found.extended_profile
     for cause in found.causes:
         for parameter, change in cause.parameters.items():
@@ -303,7 +303,7 @@ def extended_text(name: str, found: Diagnosis) -> str:
 
 
 def _plain_std(std: Any) -> Any:
-    """A standard deviation as the profile takes it; None where there is none."""
+    """A standard deviation as the profile stores it; None if unknown."""
     if std is None or not np.all(np.isfinite(np.asarray(std, float))):
         return None
     return plain(np.asarray(std, float))
@@ -315,7 +315,7 @@ def _plain_std(std: Any) -> Any:
 def draw_figures(
     capture: Capture, found: Diagnosis, each: ParallelMap = one_by_one
 ) -> tuple[dict[str, bytes], list[list[str]]]:
-    """PNG files by their path below the capture's folder, and the paths that belong to each cause."""
+    """PNG files by path below the capture's output folder, and the paths that belong to each cause."""
     drawings: dict[str, tuple[Any, ...]] = {}
     before, after = found.residuals.get("before"), found.residuals.get("after")
     if before and after:
@@ -323,7 +323,7 @@ def draw_figures(
         drawings[f"{FIGURES}/residuals.png"] = (residual_figure, before, after, title)
     if found.ladder:
         rungs = [_bars(rung) for rung in found.ladder[:MAX_RUNGS]]
-        drawings[f"{FIGURES}/ladder.png"] = (ladder_figure, rungs, f"{capture.name}: what was tried")
+        drawings[f"{FIGURES}/ladder.png"] = (ladder_figure, rungs, f"{capture.name}: candidates tried")
     common = list(drawings)
     drawn = []
     for number, cause in enumerate(found.causes, start=1):
@@ -347,7 +347,7 @@ def draw_figures(
 
 
 def _called(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Different functions as calls of one, for `Each`."""
+    """Call the function; lets a ParallelMap run calls of different functions."""
     return function(*arguments)
 
 
@@ -356,7 +356,7 @@ def _bars(rung: Rung) -> tuple[str, float, dict[str, float], str | None]:
 
 
 def _shots(capture: Capture, found: Diagnosis) -> dict[str, tuple[Capture, CameraProfile, int]]:
-    """What of a lively frame is simulated, by what stands beside it: with either profile."""
+    """Arguments of :func:`simulated_frame` for one high-motion frame, by row label: with either profile."""
     firsts = chosen_pairs(capture, found.extended_profile)
     if not firsts:
         return {}
@@ -369,7 +369,7 @@ def _shots(capture: Capture, found: Diagnosis) -> dict[str, tuple[Capture, Camer
 def _pictures_figure(
     capture: Capture, simulated: Mapping[str, Picture | None], shots: Mapping[str, tuple[Capture, CameraProfile, int]]
 ) -> bytes | None:
-    """A high-motion frame against its simulation from its neighbour's restored picture, with either profile."""
+    """A high-motion frame beside its simulation from its restored neighbour, with either profile."""
     number = next((number for _, _, number in shots.values()), None)
     if number is None:
         return None
@@ -383,7 +383,7 @@ def _pictures_figure(
 
 
 def simulated_frame(capture: Capture, profile: CameraProfile, number: int) -> Picture | None:
-    """Frame ``number`` as the simulator takes it before the restored next frame; None where that cannot be done."""
+    """Frame ``number`` as simulated from the restored next frame; None if that fails."""
     plan = RestorationPlan(profile, PRESETS["balanced"], imu_gaps_s=capture.imu_gaps_s)
     try:
         scene = restored_scene(capture, plan, number + 1)
@@ -392,7 +392,7 @@ def simulated_frame(capture: Capture, profile: CameraProfile, number: int) -> Pi
         frames = capture.frames[number : number + 2]
         session = recreate_session(capture, frames, profile, profile, scene, SessionSettings(noise_levels=0.0))
     except VirestError as error:
-        log.info("%s: frame %d was not simulated: %s", capture.name, number, error)
+        log.info("%s: frame %d could not be simulated: %s", capture.name, number, error)
         return None
     return render_picture(session, 0)
 
@@ -401,13 +401,13 @@ def simulated_frame(capture: Capture, profile: CameraProfile, number: int) -> Pi
 
 
 def _write_all(folder: Path, files: dict[str, bytes]) -> None:
-    """Write the files in order, the account last; where one cannot be written, what is new goes again."""
-    places = [folder, folder / FIGURES]
-    new_folders = [place for place in places if not place.exists()]
+    """Write the files in order, diagnosis.json last; if one cannot be written, remove all new files."""
+    folders = [folder, folder / FIGURES]
+    new_folders = [path for path in folders if not path.exists()]
     new_files = [folder / name for name in files if not (folder / name).exists()]
     try:
-        for place in places:
-            place.mkdir(parents=True, exist_ok=True)
+        for path in folders:
+            path.mkdir(parents=True, exist_ok=True)
         for name, data in files.items():
             write_whole(folder / name, data)
         for old in (folder / FIGURES).iterdir():
@@ -417,8 +417,8 @@ def _write_all(folder: Path, files: dict[str, bytes]) -> None:
         with suppress(OSError):
             for file in new_files:
                 file.unlink(missing_ok=True)
-            for place in reversed(new_folders):
-                place.rmdir()
+            for path in reversed(new_folders):
+                path.rmdir()
         if isinstance(error, OSError):
             raise output_error(folder, error) from error
         raise

@@ -1,4 +1,4 @@
-"""What ``virest diagnose`` says to people: the causes in a table, a sentence each, what is left, the verdict."""
+"""The printed text of ``virest diagnose``: a table of causes, a sentence each, the remaining residual, the verdict."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from virest.diagnosis.restoration_gain import RestorationGain
 from virest.report.words import residual_words
 
 SHOWN_COMPONENTS = 4
-"""Longer lists are summed up."""
+"""Longer lists are summarised."""
 
 
 def describe(name: str, found: Diagnosis, gain: RestorationGain, wrote: str) -> str:
-    """The causes as a table, what they do for restored frames, what remains, what was written, the verdict."""
+    """The table of causes, the gain for restored frames, the remaining residual, files written, the verdict."""
     nominal = found.nominal
     lines = [
         f"{name}: {nominal.tracks} tracks in {nominal.frames} frames, residual "
@@ -29,7 +29,7 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, wrote: str) -> 
         lines += [line for cause in found.causes for line in _sentences(cause)]
     for field in found.fields:
         lines.append(f"field: {_one_line(field.sentence)}")
-        lines.append(f"  likely: {field.reasons}; to tell: {field.next}")
+        lines.append(f"  likely: {field.reasons}; to confirm: {field.next}")
     lines += [_gain_line(gain), _remaining_line(found.unexplained)]
     lines += [f"note: {_one_line(note)}" for note in found.notes]
     lines.append(f"wrote {wrote}")
@@ -37,14 +37,14 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, wrote: str) -> 
 
 
 def _sentences(cause: Finding) -> list[str]:
-    """The cause in words with the error that it was judged by, and what would explain as much."""
+    """The cause in words with its error measure, and the rivals that explain as much."""
     rivals = ", ".join(f"{rival.name} ({_number(rival.held_out_after)})" for rival in cause.rivals)
-    told = f"{cause.name}: {_one_line(cause.sentence)} (held-out {cause.held_out.quantity})"
-    return [told, f"  as good an explanation: {rivals}"] if rivals else [told]
+    sentence = f"{cause.name}: {_one_line(cause.sentence)} (held-out {cause.held_out.quantity})"
+    return [sentence, f"  equally good explanations: {rivals}"] if rivals else [sentence]
 
 
 def _rows(cause: Finding) -> list[list[str]]:
-    """A row for each number or word that changed; what the cause gains stands on its first."""
+    """One row per number or word that changed; the first row also shows what the cause gains."""
     held_out = cause.held_out
     gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
     judged = [_number(held_out.before), _number(held_out.after), gain]
@@ -56,7 +56,7 @@ def _rows(cause: Finding) -> list[list[str]]:
 
 
 def _values(parameter: str, change: Any) -> list[list[str]]:
-    """Name, given, found, ± of a parameter: a row for each component of a short list."""
+    """Name, given, found, ± of a parameter: one row per component of a short list."""
     found = change.estimate
     if not isinstance(found, list | tuple | np.ndarray):
         return [[parameter, *map(_number, (change.nominal, found, change.std))]]
@@ -64,11 +64,11 @@ def _values(parameter: str, change: Any) -> list[list[str]]:
     if count > SHOWN_COMPONENTS:
         known = np.asarray(found, float)
         return [[parameter, "-", f"{count} values, {_number(known.min())} to {_number(known.max())}", "-"]]
-    given, std = (_spread_out(values, count) for values in (change.nominal, change.std))
+    given, std = (_as_list(values, count) for values in (change.nominal, change.std))
     return [[f"{parameter}[{k}]", *map(_number, (given[k], found[k], std[k]))] for k in range(count)]
 
 
-def _spread_out(values: Any, count: int) -> list[Any]:
+def _as_list(values: Any, count: int) -> list[Any]:
     listed = isinstance(values, list | tuple | np.ndarray) and len(values) == count
     return list(values) if listed else [values] * count
 
@@ -81,7 +81,7 @@ def _number(value: Any) -> str:
 
 def _gain_line(gain: RestorationGain) -> str:
     if not gain.frames:
-        return "restored: the capture is too short to keep frames back from the fits"
+        return "restored: the capture is too short to hold frames out of the fits"
     if math.isnan(gain.sharpness_after):
         return "restored: no two neighbouring frames could be registered"
     return (

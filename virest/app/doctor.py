@@ -1,4 +1,4 @@
-"""``virest doctor``: what is installed, what the machine has, and what that means for the work."""
+"""``virest doctor``: what is installed, what the machine offers, and what that means for processing."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ EXTRAS = {
     "rosbags": ("rosbags",),
 }
 TILE_PX, TILE_TRANSFORMS = 192, 40
-"""Side of the tile whose transforms are timed, and how many are timed together."""
+"""Side of the tile whose transforms are timed, and number of transforms per timing."""
 DECODERS, ENCODER = ("h264", "hevc", "vp9", "av1"), "libx264"
 PER_WORKER_BYTES = 300e6
-"""Peak of a worker at 720x1280 (`python -m virest.app.bench --only memory`)."""
+"""Peak memory of a worker at 720x1280 (`python -m virest.app.bench --only memory`)."""
 USUAL_FFT_S = 0.010
-"""Of the transform below on a core of 2.5 GHz; twice that is worth a word."""
+"""Time of the transform below on a core of 2.5 GHz; a note is given above twice that."""
 
 
 def examine() -> tuple[Json, str, int]:
-    """Facts for ``--json``, the text, and the exit code: 1 where something that virest needs is missing."""
+    """Facts for ``--json``, the text, and the exit code: 1 if a requirement is missing."""
     facts: Json = {
         "virest": __version__,
         "python": platform.python_version(),
@@ -66,7 +66,7 @@ def _version(package: str) -> str | None:
 
 
 def _memory_bytes() -> int | None:
-    """Of the machine, or what the container may use of it; None where the system does not say."""
+    """Memory of the machine, or the container's limit; None if the system does not report it."""
     limits = []
     with suppress(AttributeError, ValueError, OSError):
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -76,7 +76,7 @@ def _memory_bytes() -> int | None:
 
 
 def _abilities() -> Json:
-    """Codecs, and how fast a core transforms a picture."""
+    """Codecs, and the time of Fourier transforms on one core."""
     import av
     import cv2
     import numpy as np
@@ -107,7 +107,7 @@ def _abilities() -> Json:
 
 
 def _tile_s(forward: Transform, inverse: Transform) -> float:
-    """CPU seconds of one tile there and back, with one library: the least of five tries."""
+    """CPU seconds of one tile's forward and inverse transform with one library: the minimum of five runs."""
     import numpy as np
 
     tile = np.random.default_rng(1).random((TILE_PX, TILE_PX), dtype=np.float32)
@@ -122,7 +122,7 @@ def _tile_s(forward: Transform, inverse: Transform) -> float:
 
 
 def processor() -> str | None:
-    """The processor's name as Linux, or else Python, tells it; None where neither does."""
+    """The processor's name as Linux, or else Python, reports it; None if neither does."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -132,10 +132,10 @@ def processor() -> str | None:
 
 
 def _notes(facts: Json) -> list[str]:
-    """What would be slow or fail, and why."""
+    """Notes on what would be slow or fail, and why."""
     notes = []
     if facts["cores"] == 1:
-        notes.append("one core: frames are restored one after the other; --preset fast is many times as fast as best")
+        notes.append("one core: frames are restored one at a time; --preset fast is many times faster than best")
     memory = facts["memory_bytes"]
     if memory is not None and facts["cores"] * PER_WORKER_BYTES > 0.8 * memory:
         jobs = max(int(0.8 * memory / PER_WORKER_BYTES), 1)
@@ -146,12 +146,14 @@ def _notes(facts: Json) -> list[str]:
         notes.append("OpenCV runs without vector instructions: deblurring takes several times as long; reinstall it")
     if "ipp" in facts and facts["ipp"] is None:
         notes.append(
-            "OpenCV transforms without Intel's IPP (not in its build for this processor, or switched off): deblurring "
-            "takes up to half as long again"
+            "OpenCV computes Fourier transforms without Intel IPP (not in its build for this processor, or disabled): "
+            "deblurring takes up to 50 % longer"
         )
     if facts.get("fft_s", 0.0) > 2 * USUAL_FFT_S:
         times = facts["fft_s"] / USUAL_FFT_S
-        notes.append(f"a Fourier transform takes {times:.1f} times the usual time: slow core, or others at work on it")
+        notes.append(
+            f"a Fourier transform takes {times:.1f} times the usual time: slow core, or one shared with other processes"
+        )
     if facts["free_bytes_here"] < 2e9:
         notes.append(
             f"{facts['free_bytes_here'] / 1e9:.1f} GB free here; a minute of 720x1280 as PNGs takes about 2 GB"
@@ -176,8 +178,8 @@ def _describe(facts: Json) -> str:
         lines.append(f"codecs    reads {', '.join(facts['decoders'])}; writes {facts['encoder'] or 'no H.264'}")
         lines.append(f"speed     Fourier transform of 720x1280 in {1e3 * facts['fft_s']:.1f} ms on one core")
         tiles = ", ".join(f"{1e6 * seconds:.0f} µs by {name}" for name, seconds in facts["tile_fft_s"].items())
-        lines.append(f"          a tile of {TILE_PX} px there and back: {tiles} (CPU time)")
+        lines.append(f"          a tile of {TILE_PX} px, forward and inverse: {tiles} (CPU time)")
         lines.append(f"          frames are transformed by {facts['transforms']} ({facts['ipp'] or 'no IPP'})")
     lines += [f"note: {note}" for note in facts["notes"]]
     missing = ", ".join(facts["missing"])
-    return "\n".join([*lines, f"missing: {missing}" if missing else "everything that virest needs is here"])
+    return "\n".join([*lines, f"missing: {missing}" if missing else "all requirements are installed"])

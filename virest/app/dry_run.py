@@ -1,4 +1,4 @@
-"""``virest process --dry-run``: what a run would give and take, from a few frames; nothing is written."""
+"""``virest process --dry-run``: predicted gain, time and size of a run, from a few frames; nothing is written."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from virest.errors import VirestError
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 
 PROBED = 3
-"""Frames of a capture that are restored: the first is left out of the time, since tables are made for it."""
+"""Frames restored per capture; the first does not count for the time, since it also builds tables."""
 PARTLY_FAILED = 9
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What one capture would give and take."""
+    """The predicted result and cost of one capture."""
 
     name: str
     frames: int
@@ -37,7 +37,7 @@ class Forecast:
     gain_db: float | None
     """Median predicted gain; None: deblurring is not expected to help."""
     seconds: float
-    """For the chosen number of processes, planning included."""
+    """Wall-clock time with the chosen number of processes, planning included."""
     bytes: float
 
     def facts(self) -> dict[str, Any]:
@@ -46,9 +46,9 @@ class Forecast:
 
 
 def predict_captures(paths: list[str], options: ProcessOptions, shard: tuple[int, int] = (1, 1)) -> int:
-    """Predict each capture of a batch and print a table, or a line of JSON each.  Returns the exit code."""
+    """Predict each capture of a batch and print a table, or one line of JSON per capture.  Returns the exit code."""
     paths, names = shard_of(paths, shard)
-    apart = dataclasses.replace(options, mode="overwrite")  # an existing run is no obstacle to looking
+    apart = dataclasses.replace(options, mode="overwrite")  # a dry run ignores an existing run
     forecasts, codes = [], []
     for path, name in zip(paths, names, strict=True):
         try:
@@ -75,7 +75,7 @@ def predict(path: str, name: str, options: ProcessOptions) -> Forecast:
     assert planned.plan is not None
     job = planned.job
     usable = [frame for frame in job.selected if frame.skip_reason is None]
-    probed = [_restored(job, planned.index, planned.plan, frame) for frame in _spread(usable)]
+    probed = [_restored(job, planned.index, planned.plan, frame) for frame in _evenly_spaced(usable)]
     known = [found for found in probed if found is not None]
     per_frame_s = float(np.median([found[0] for found in known[1:] or known])) if known else 0.0
     blur = [found[2] for found in known if found[2] is not None]
@@ -91,16 +91,16 @@ def predict(path: str, name: str, options: ProcessOptions) -> Forecast:
     )
 
 
-def _spread(frames: Sequence[Frame]) -> list[Frame]:
-    """A few frames from all over."""
-    places = np.linspace(0, max(len(frames) - 1, 0), min(PROBED, len(frames))).round().astype(int)
-    return [frames[k] for k in places.tolist()]
+def _evenly_spaced(frames: Sequence[Frame]) -> list[Frame]:
+    """PROBED evenly spaced frames, or all if there are fewer."""
+    indices = np.linspace(0, max(len(frames) - 1, 0), min(PROBED, len(frames))).round().astype(int)
+    return [frames[k] for k in indices.tolist()]
 
 
 def _restored(
     job: Job, index: MovieIndex, plan: RestorationPlan, frame: Frame
 ) -> tuple[float, int, float | None, float | None] | None:
-    """Seconds, bytes of the PNG, blur in pixels and predicted gain of a frame; None where it cannot be decoded."""
+    """Seconds, bytes of the PNG, blur in pixels and predicted gain of a frame; None if it cannot be restored."""
     frames = {f.index: f for f in at_true_times(job.capture.frames, plan.profile, job.capture.repeats)}
     first, last = max(frame.index - plan.reach, 0), min(frame.index + plan.reach, len(frames) - 1)
     steps: dict[int, float] = {}

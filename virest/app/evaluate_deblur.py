@@ -1,4 +1,4 @@
-"""``virest evaluate deblur``: restored pictures against truth, over methods (the paper's Case B, Table 1)."""
+"""``virest evaluate deblur``: frames restored by several methods against ground truth (the paper's Case B, Table 1)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ OVER_TIME: tuple[tuple[str, dict[str, Any]], ...] = (
 """Captures on which frames are restored together with their neighbours."""
 OVER_TIME_QUICK = ("shake", "moving")
 JUDGED_OVER_TIME = slice(4, 7)
-"""Of the eleven frames: those with neighbours on both sides for every method."""
+"""Of the 11 frames: those with neighbours on both sides for every method."""
 SINGLE = "virest best, single"
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MAP_GAIN = 2
@@ -71,19 +71,19 @@ SHEET_COLUMNS = 4
 
 @dataclass(frozen=True, slots=True)
 class DeblurOptions:
-    """What to judge and how."""
+    """The options of one evaluation."""
 
     captures: tuple[str, ...] = ()
-    """None: the standard set is simulated, unless two folders are given."""
+    """Empty: simulate the standard set, unless two folders are given."""
     config: Path | None = None
     frames: slice | None = None
     restored: Path | None = None
     reference: Path | None = None
     out: Path | None = None
-    """Difference maps go here."""
+    """Folder for difference maps."""
     quick: bool = False
     over_time: bool = False
-    """Judge restoration together with neighbours, against methods that merge aligned frames."""
+    """Compare joint restoration with neighbouring frames to methods that merge aligned frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,9 +130,9 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
         count, judged = {"frames": FRAMES_QUICK if options.quick else FRAMES}, slice(None)
         if options.over_time:
             count, judged = {}, JUDGED_OVER_TIME
-        names = [(name, wishes | count) for name, wishes in standard if not options.quick or name in quick]
-        told = [{**simulate_command(work / name, **wishes), "capture": name} for name, wishes in names]
-        yield [open_true_capture(work / name, None, judged) for name, _ in names], told
+        names = [(name, settings | count) for name, settings in standard if not options.quick or name in quick]
+        simulated = [{**simulate_command(work / name, **settings), "capture": name} for name, settings in names]
+        yield [open_true_capture(work / name, None, judged) for name, _ in names], simulated
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -141,7 +141,7 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
 
 
 def _all_methods(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture], Picture, tuple[int, int, int, int]]]:
-    """Each frame's index, its picture by every method, its truth, and the rectangle with data; all straightened."""
+    """Index, straightened picture by every method, truth and valid rectangle of each frame."""
     plan = capture.plan(RestorationSettings(deblur="none"))
     plans = {BLURRED: plan} | {f"virest {name}": replace(plan, settings=preset) for name, preset in PRESETS.items()}
     curve = plan.profile.response or ResponseCurve("srgb")
@@ -159,7 +159,7 @@ def _all_methods(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture]
 def _methods_over_time(
     capture: TrueCapture,
 ) -> Iterator[tuple[int, dict[str, Picture], Picture, tuple[int, int, int, int]]]:
-    """As :func:`_all_methods`: methods that merge aligned frames, and ours alone and with neighbours."""
+    """As :func:`_all_methods`, for methods that merge aligned frames, and ours without and with neighbours."""
     plan = capture.plan(RestorationSettings(deblur="none"))
     settings = {SINGLE: replace(PRESETS["best"], neighbours=0)} | {
         f"virest {name}": PRESETS[name] for name in ("balanced", "best")
@@ -182,14 +182,14 @@ def _methods_over_time(
 
 
 def _closest(pictures: Iterable[Picture], truth: Picture, inside: tuple[slice, slice]) -> Picture:
-    """The picture with the least squared error against truth."""
+    """The picture with the smallest squared error against truth."""
     return min(pictures, key=lambda picture: mean_squared_error(picture[inside], truth[inside]))
 
 
 def _baselines(
     recorded: Picture, motion: RowMotion, curve: ResponseCurve, truth: Picture, valid_px: Sequence[int]
 ) -> dict[str, Picture]:
-    """Each baseline's best picture by squared error against truth; those whose library is missing are left out."""
+    """Each baseline's best picture by squared error against truth; baselines without their library are skipped."""
     inside = inner_part(valid_px)
     return {
         name: _closest(baseline_pictures(baseline, recorded, motion, curve), truth, inside)
@@ -210,7 +210,7 @@ def _measure(
 def _draw(
     out: Path | None, name: str, pictures: Mapping[str, Picture], truth: Picture, valid_px: Sequence[int]
 ) -> None:
-    """The pictures above their difference maps, truth first, four beside each other."""
+    """Write the pictures above their difference maps, truth first, SHEET_COLUMNS per row."""
     if out is None:
         return
     inside = inner_part(valid_px)
@@ -235,7 +235,7 @@ def _column(name: str, picture: Picture, truth: Picture) -> Picture:
 def _run_folders(
     options: DeblurOptions, restored: Path, reference: Path, progress: Progress | None
 ) -> tuple[dict[str, Any], str]:
-    """Compare pictures of the same name, each moved over its reference and both cut to what they share."""
+    """Compare pictures of the same name, each aligned to its reference and both cropped to their overlap."""
     names = _common_names(restored, reference)
     results, shifts = [], {}
     real_px = _valid_areas(restored.parent / "parameters.jsonl")
@@ -243,8 +243,8 @@ def _run_folders(
         picture, truth = read_picture(restored / name), read_picture(reference / name)
         if picture.shape != truth.shape:
             raise CaptureError(f"{name}: {_size(picture)} in {restored}, {_size(truth)} in {reference}",
-                               hint="give pictures of one size")  # fmt: skip
-        aligned, shift, shared_px = _laid_over(picture, truth)
+                               hint="give pictures of the same size")  # fmt: skip
+        aligned, shift, shared_px = _aligned(picture, truth)
         shared_px = _common(shared_px, real_px.get(name, shared_px))
         shifts[name] = {"shift_px": [round(float(s), 4) for s in shift], "compared_px": list(shared_px)}
         results += list(_measure(restored.name, name, {"restored": aligned}, truth, shared_px))
@@ -258,16 +258,18 @@ def _run_folders(
 def _common_names(restored: Path, reference: Path) -> list[str]:
     for folder in (restored, reference):
         if not folder.is_dir():
-            raise CaptureError(f"{folder}: no such folder", hint="give two folders of pictures of the same names")
+            raise CaptureError(f"{folder}: no such folder", hint="give two folders with pictures of the same names")
     there = {p.name for p in reference.iterdir()}
     names = sorted(p.name for p in restored.iterdir() if p.suffix.lower() in PICTURE_ENDINGS and p.name in there)
     if not names:
-        raise CaptureError(f"{restored} and {reference} share no picture's name", hint="name pairs alike: 000017.png")
+        raise CaptureError(
+            f"{restored} and {reference} have no file name in common", hint="name pairs alike: 000017.png"
+        )
     return names
 
 
 def _valid_areas(log: Path) -> dict[str, tuple[int, ...]]:
-    """valid_px of each picture, where the folder is that of a ``virest process`` run; beyond it edges are repeated."""
+    """valid_px of each picture if the folder belongs to a ``virest process`` run; outside it the edge is replicated."""
     if not log.is_file():
         return {}
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
@@ -284,11 +286,10 @@ def _size(picture: Picture) -> str:
     return f"{picture.shape[1]}x{picture.shape[0]}"
 
 
-def _laid_over(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.float64], tuple[int, int, int, int]]:
-    """The picture moved to where its reference shows the same; how far it was off; the rectangle that both have.
+def _aligned(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.float64], tuple[int, int, int, int]]:
+    """The picture aligned to its reference, its shift in pixels, and the rectangle that both cover.
 
-    Whole pixels by phase correlation, the rest by least squares; moved by cubic interpolation, and not at all where
-    it is off by less than a fiftieth of a pixel.
+    Whole pixels by phase correlation, the rest by least squares; cubic interpolation, none for shifts below 0.02 px.
     """
     height, width = truth.shape[:2]
     coarse = _whole_shift(picture, truth)
@@ -302,7 +303,7 @@ def _laid_over(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.fl
 
 
 def _whole_shift(picture: Picture, truth: Picture) -> NDArray[np.float64]:
-    """How many whole pixels the picture lies beside its reference, (x, y); none where that makes it no closer."""
+    """Shift (x, y) of the picture against its reference in whole pixels; 0 if aligning does not reduce the error."""
     grey = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in (truth, picture)]
     window = cv2.createHanningWindow(grey[0].shape[::-1], cv2.CV_32F)
     shift = np.rint(np.array(cv2.phaseCorrelate(grey[0], grey[1], window)[0]))
@@ -322,7 +323,7 @@ def _moved(picture: Picture, shift: NDArray[np.float64]) -> Picture:
     return np.asarray(cv2.warpAffine(picture, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-# ── what is said ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _facts(results: list[FrameResult], about: dict[str, Any], case: str = CASE) -> dict[str, Any]:
@@ -369,9 +370,9 @@ def _summary(results: Sequence[FrameResult], methods: Sequence[str]) -> dict[str
 
 
 def _first(results: Sequence[FrameResult], methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """In what part of the frames each preset leads all other methods in PSNR, SSIM and matches at once; else by whom.
+    """Fraction of frames on which each preset beats all other methods in PSNR, SSIM and matches together.
 
-    led_by: how many frames have another method level or ahead in one of the three.
+    led_by: number of frames on which another method is level or ahead in one of the three.
     """
     frames: dict[tuple[str, str], dict[str, FrameResult]] = {}
     for result in results:
@@ -395,7 +396,7 @@ def _text(facts: Mapping[str, Any]) -> str:
     header = ["method", "MSE", "PSNR dB", "SSIM", "matches", "in place"]
     parts = [
         f"CASE {facts['case'].replace(':', ',')}: {facts['frames']} frames, {facts['versions']}",
-        "means over the frames; PSNR of the mean MSE",
+        "means over frames; PSNR of the mean MSE",
         _table(header, _rows(facts["methods"])),
     ]
     if len(facts["by_capture"]) > 1:
@@ -414,21 +415,21 @@ def _rows(summary: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _account(facts: Mapping[str, Any]) -> list[str]:
-    """What the figures were measured on, and how."""
+    """The data and the conditions of the measurement."""
     lines = []
     for name, found in facts["first"].items():
         led_by = ", ".join(f"{method} ({frames})" for method, frames in found["led_by"].items())
-        lines.append(f"{name}: first in PSNR, SSIM and matches at once in {100 * found['part']:.0f} % of the frames"
-                     + (f"; led in one of them by {led_by}" if led_by else ""))  # fmt: skip
+        lines.append(f"{name}: best in PSNR, SSIM and matches together on {100 * found['part']:.0f} % of the frames"
+                     + (f"; matched or beaten in one of them by {led_by}" if led_by else ""))  # fmt: skip
     if "pictures" in facts:
         far = max(max(map(abs, p["shift_px"])) for p in facts["pictures"].values())
-        lines.append(f"each picture moved over its reference, by at most {far:.2f} px, and cut to what both have")
-    lines.append(f"compared inside the area with data less {facts['margin_px']} px; matches: {facts['matching']}")
+        lines.append(f"each picture aligned to its reference (by up to {far:.2f} px) and cropped to the overlap")
+    lines.append(f"compared inside the valid area less a {facts['margin_px']} px border; matches: {facts['matching']}")
     if facts["baselines"]:
-        lines.append("baselines: true kernel at the centre, blended border, linear light unless said, the same warp as "
-                     "ours, the best of their settings on each frame by MSE against truth")  # fmt: skip
+        lines.append("baselines: true kernel of the frame centre, blended border, linear light unless noted, our warp, "
+                     "the best setting for each frame by MSE against truth")  # fmt: skip
         lines += [f"{name}: {title}" for name, title in facts["baselines"].items()]
-    lines += [f"{name}: left out, its library is not installed" for name in facts["left_out"]]
+    lines += [f"{name}: skipped (library not installed)" for name in facts["left_out"]]
     for s in facts.get("simulated", []):
         lines.append(f"{s['capture']}: seed {s['seed']}, {s['width']}x{s['height']}, {s['frames']} frames, exposure "
                      f"{s['exposure_ms'][0]:g} ms, readout {s['readout_ms']:g} ms, blur {s['blur_px']} px")  # fmt: skip
@@ -436,5 +437,5 @@ def _account(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _table(header: list[str], rows: list[list[str]]) -> str:
-    """Numbers to the right: the console's table has its last two columns to the left."""
+    """Right-align all numbers: two empty columns take the place of the console table's left-aligned last two."""
     return table([*header, "", ""], [[*row, "", ""] for row in rows])

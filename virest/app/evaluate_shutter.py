@@ -1,4 +1,4 @@
-"""``virest evaluate shutter``: angles at a board's corners and pictures against truth (the paper's Case A)."""
+"""``virest evaluate shutter``: corner angles and images of a board against ground truth (the paper's Case A)."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], Any]
 METHODS: dict[str, str] = {
     "none": "as recorded",
-    "schubert2018": "constant velocity from the pictures, no perspective (Schubert et al. 2018)",
+    "schubert2018": "constant velocity from tracked points, no perspective (Schubert et al. 2018)",
     "perspective": "one homography through the four corners (the paper's)",
-    "rowwise-rotation": "every row at its own time, turning only",
-    "rowwise": "every row at its own time, with travel and depth where there are any: what virest process does",
+    "rowwise-rotation": "every row at its own time, rotation only",
+    "rowwise": "every row at its own time, with translation and depth if known: what virest process does",
 }
 OURS = "rowwise"
 BITS_PER_PX = 2.0
-"""Of the standard set's movies: a coder's noise moves corners more than straightening does."""
+"""Bit rate of the standard set's movies, high because coding noise moves corners more than straightening does."""
 STANDARD = (
     BoardSetting("chessboard-far", "chessboard", seed=41),
     BoardSetting("aprilgrid-far", "aprilgrid", seed=42),
@@ -50,7 +50,7 @@ STANDARD = (
 )
 QUICK = ("chessboard-far", "chessboard-near")
 JUDGED, JUDGED_QUICK = 10, 4
-"""Frames of each capture of the standard set, evenly chosen."""
+"""Evenly spaced frames per capture of the standard set."""
 CROP_MARGIN_PX = 12
 """Around the board's corners, for the comparison of pictures."""
 MAP_GAIN = 2
@@ -59,15 +59,15 @@ MAP_GAIN = 2
 
 @dataclass(frozen=True, slots=True)
 class ShutterOptions:
-    """What to judge and how."""
+    """The options of one evaluation."""
 
     captures: tuple[str, ...] = ()
-    """None: the standard set is simulated."""
+    """Empty: simulate the standard set."""
     config: Path | None = None
     frames: slice | None = None
     board: str = "auto"
     out: Path | None = None
-    """Difference maps go here."""
+    """Folder for difference maps."""
     quick: bool = False
 
 
@@ -102,7 +102,7 @@ def run_shutter(options: ShutterOptions, progress: Progress | None = None) -> tu
                 progress(capture.name, (position + 1) / len(captures))
     if not results:
         raise CaptureError(
-            "no board was found in any frame by all methods", hint="check --board, or use virest simulate --scene board"
+            "in no frame do all methods find the board", hint="check --board, or use virest simulate --scene board"
         )
     facts = _facts(results, missed, options)
     return facts, _text(facts)
@@ -127,7 +127,7 @@ def _standard(quick: bool) -> list[BoardSetting]:
 
 
 def _simulated(work: Path, setting: BoardSetting, quick: bool) -> TrueCapture:
-    """Write one capture of the standard set; its profile does not say how far the board is."""
+    """Write one capture of the standard set; its profile does not state the distance of the board."""
     session = board_session(setting)
     if np.isfinite(setting.depth_m):
         session = replace(session, nominal=replace(session.nominal, depth_m=None))
@@ -158,7 +158,7 @@ def _judge(capture: TrueCapture, options: ShutterOptions) -> Iterator[FrameResul
 
 
 def _straightened(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture], tuple[int, int, int, int]]]:
-    """Each judged frame's index, its picture by every method, and the rectangle in which ours has data."""
+    """Index, picture by every method and valid rectangle (of ours) of each evaluated frame."""
     settings = RestorationSettings(deblur="none")
     plan = capture.plan(settings)
     plans = {
@@ -178,7 +178,7 @@ def _straightened(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture
 
 
 def _by_constant_velocity(capture: TrueCapture) -> Callable[[int, Picture], Picture | None]:
-    """A function that straightens a frame by the velocity of its points; None where it has too few."""
+    """A function that straightens a frame by the velocity of its tracked points; None for too few points."""
     profile, shutter_ = capture.profile, capture.profile.shutter
     width, height = profile.width, profile.height
     exposure_s = {f.index: shutter_.true_exposure_s(f.exposure_s or 0.0) for f in capture.capture.frames}
@@ -238,7 +238,7 @@ def _neighbour_errors_deg(lattice: Array, truth: Array, everywhere: NDArray[np.b
 
 
 def _around(board: Board, valid_px: Sequence[int]) -> tuple[slice, slice] | None:
-    """Rows and columns around the board where there are data; None: too few."""
+    """Rows and columns around the board inside the valid area; None: too few."""
     x0, y0, x1, y1 = board.box_px()
     left, top = (int(max(v - CROP_MARGIN_PX, low)) for v, low in zip((x0, y0), valid_px[:2], strict=True))
     right, bottom = (int(min(v + CROP_MARGIN_PX, high)) for v, high in zip((x1, y1), valid_px[2:], strict=True))
@@ -250,7 +250,7 @@ def _grey(picture: Picture) -> Picture:
 
 
 def difference_sheet(pictures: Mapping[str, Picture], truth: Picture) -> Picture:
-    """Truth and the difference maps of all methods side by side, each under its name; RGB."""
+    """Truth and the difference maps of all methods side by side, each labelled; RGB."""
     shown = {"truth": truth}
     for method, picture in pictures.items():
         grey = cv2.convertScaleAbs(difference_map(picture, truth), alpha=MAP_GAIN)
@@ -265,7 +265,7 @@ def _titled(name: str, picture: Picture) -> Picture:
     return np.concatenate([head, framed])
 
 
-# ── what is said ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _facts(results: list[FrameResult], missed: dict[str, int], options: ShutterOptions) -> dict[str, Any]:
@@ -288,7 +288,7 @@ def _facts(results: list[FrameResult], missed: dict[str, int], options: ShutterO
 
 
 def _example(results: list[FrameResult]) -> dict[str, Any]:
-    """The corner that was sheared most, as the paper's Table 2 shows one."""
+    """The most sheared corner, as an example like that of the paper's Table 2."""
     worst = max(results, key=lambda r: float(np.abs(r.outer_deg["none"] - r.truth_deg).max()))
     corner = int(np.abs(worst.outer_deg["none"] - worst.truth_deg).argmax())
     names = ("top left", "top right", "bottom right", "bottom left")
@@ -383,12 +383,12 @@ def _capture_table(by_capture: Mapping[str, Any]) -> str:
 
 
 def _account(facts: Mapping[str, Any]) -> str:
-    """What the figures were measured on."""
+    """The data and the conditions of the measurement."""
     lines = [f"{method}: {what}" for method, what in facts["methods"].items()]
     for s in facts["simulated"]:
-        where = "far" if np.isinf(s["depth_m"]) else f"{s['depth_m']:g} m away, travel {s['travel_m_s']:g} m/s"
+        where = "far" if np.isinf(s["depth_m"]) else f"{s['depth_m']:g} m away, moving {s['travel_m_s']:g} m/s"
         lines.append(
-            f"{s['name']}: seed {s['seed']}, {s['width']}x{s['height']}, {s['frames']} frames, {where}, turning "
+            f"{s['name']}: seed {s['seed']}, {s['width']}x{s['height']}, {s['frames']} frames, {where}, rotating "
             f"{s['turn_rad_s']:g} rad/s, exposure {s['exposure_ms']:g} ms, readout {s['readout_ms']:g} ms, "
             f"noise {s['noise_levels']:g} levels, {facts['simulated_bits_per_px']:g} bits/px"
         )
@@ -398,5 +398,5 @@ def _account(facts: Mapping[str, Any]) -> str:
 
 
 def _table(header: list[str], rows: list[list[str]]) -> str:
-    """Numbers to the right: the console's table has its last two columns to the left."""
+    """Right-align all numbers: two empty columns take the place of the console table's left-aligned last two."""
     return table([*header, "", ""], [[*row, "", ""] for row in rows])

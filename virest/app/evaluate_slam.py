@@ -1,7 +1,7 @@
-"""``virest evaluate slam``: what the rolling shutter costs a SLAM, and what restored frames take of that away (Case C).
+"""``virest evaluate slam``: the error that the rolling shutter adds to SLAM, and how much restoration removes (Case C).
 
-Trajectories from global-shutter, rolling-shutter and restored pictures of the same instants, found from the pictures
-alone, aligned by a Sim(3) and scored by evo as ``evo_ape`` does; several runs with seeds of their own.
+Trajectories are estimated from global-shutter, rolling-shutter and restored frames of the same instants, without IMU,
+aligned by a Sim(3) and scored by evo as ``evo_ape`` does; each run has its own seed.
 """
 
 from __future__ import annotations
@@ -53,27 +53,27 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True, slots=True)
 class SlamOptions:
-    """What one ``virest evaluate slam`` was asked for, beside the captures."""
+    """The options of one ``virest evaluate slam``."""
 
     command: str | None = None
-    """SLAM to be run in COLMAP's place, with its placeholders."""
+    """Command line of a SLAM to run instead of COLMAP, with placeholders."""
     seeds: int | None = None
-    """Runs of each capture; None: SEEDS, since COLMAP's result on 24 frames varies up to fivefold with its seed."""
+    """Runs per capture; None: SEEDS, since COLMAP's error on 24 frames varies up to fivefold with its seed."""
     devices: bool = False
     quick: bool = False
     out: Path | None = None
-    """Sequences, trajectories and results stay here; None: nothing stays."""
+    """Keep sequences, trajectories and results here; None: keep nothing."""
     preset: str = "balanced"
     timeout_s: float = TIMEOUT_S
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """One capture to be judged."""
+    """One capture to evaluate."""
 
     name: str
     plan: SlamCapture | None
-    """To be simulated; None: it exists."""
+    """The capture to simulate; None: it exists."""
     path: Path | None
     seeds: int
     table: str
@@ -83,7 +83,7 @@ class _Task:
 def run_slam(
     captures: Sequence[Path], options: SlamOptions, progress: Progress | None = None
 ) -> tuple[dict[str, Any], str, int]:
-    """Judge captures, or the standard ones: facts for ``--json``, the tables, and the exit code."""
+    """Evaluate captures, or the standard ones: facts for ``--json``, the tables, and the exit code."""
     words = None if options.command is None else split_command(options.command)
     tools = _tools(options.command)
     tasks = _tasks(captures, options)
@@ -107,7 +107,7 @@ def run_slam(
 
 
 def _judged(task: _Task, out: Path, words: list[str] | None, options: SlamOptions) -> dict[str, Any]:
-    """One row of a table; a capture that fails is a row with its error."""
+    """One row of a table; a failed capture gives a row with its error."""
     head = {"name": task.name, "table": task.table}
     try:
         path = task.path
@@ -133,9 +133,9 @@ def _scored(sequences: SlamSequences, seeds: int, words: list[str] | None, optio
             runs = list(track_with_colmap(sequences, kind, numbers, SfmSettings()))
         else:
             runs = list(track_with_command(sequences, kind, numbers, words, options.timeout_s))
-        moment, scores = _best_moment(sequences, kind, runs)
+        reference, scores = _best_reference(sequences, kind, runs)
         summaries[kind] = summarise(scores)
-        kinds[kind] = _kind_facts(moment, scores, summaries[kind])
+        kinds[kind] = _kind_facts(reference, scores, summaries[kind])
         log.info("%s, %s: %s", sequences.name, kind, _error_cell(kinds[kind]))
     true, lens = sequences.truth.at(sequences.start_s), sequences.lens
     return {
@@ -150,17 +150,20 @@ def _scored(sequences: SlamSequences, seeds: int, words: list[str] | None, optio
     }
 
 
-def _best_moment(
+def _best_reference(
     sequences: SlamSequences, kind: str, runs: Sequence[dict[int, Any]]
 ) -> tuple[str, list[TrajectoryScore]]:
-    """Score at the time that the pictures show.
+    """Score trajectories at the instant that the frames show.
 
-    Recorded frames have no one time: the first row's start and the middle row's middle are tried, the better counts.
+    The rows of a recorded frame differ in time: the first row's start and the middle row's mid-exposure are both
+    scored, and the better result counts.
     """
-    moments = {"exposure-start": sequences.start_s}
+    references = {"exposure-start": sequences.start_s}
     if kind == "rolling":
-        moments["frame-middle"] = sequences.middle_s
-    scored = {name: [score_path(sequences.truth, found, time_s) for found in runs] for name, time_s in moments.items()}
+        references["frame-middle"] = sequences.middle_s
+    scored = {
+        name: [score_path(sequences.truth, found, time_s) for found in runs] for name, time_s in references.items()
+    }
     best = min(scored, key=lambda name: summarise(scored[name]).median_m)
     return best, scored[best]
 
@@ -175,9 +178,9 @@ def _comparison(summaries: dict[str, ScoreSummary]) -> dict[str, Any]:
     }
 
 
-def _kind_facts(moment: str, scores: Sequence[TrajectoryScore], summary: ScoreSummary) -> dict[str, Any]:
+def _kind_facts(reference: str, scores: Sequence[TrajectoryScore], summary: ScoreSummary) -> dict[str, Any]:
     return {
-        "reference": moment,
+        "reference": reference,
         "rmse_m": [_finite(score.rmse_m) for score in scores],
         "median_m": _finite(summary.median_m),
         "low_m": _finite(summary.low_m),
@@ -205,7 +208,7 @@ def _plan_facts(plan: SlamCapture | None) -> dict[str, Any]:
     }
 
 
-# ── what is asked ──────────────────────────────────────────────────────────────────────────────────────────────────
+# ── tasks ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _tasks(captures: Sequence[Path], options: SlamOptions) -> list[_Task]:
@@ -213,7 +216,7 @@ def _tasks(captures: Sequence[Path], options: SlamOptions) -> list[_Task]:
     if captures:
         names = [Path(path).resolve().name for path in captures]
         if len(set(names)) < len(names):
-            raise OutputError("two captures share one name, and so one folder", hint="rename one")
+            raise OutputError("two captures have the same name and would share one folder", hint="rename one")
         return [_Task(name, None, Path(p), seeds, "sequences") for name, p in zip(names, captures, strict=True)]
     plans: tuple[SlamCapture, ...] = SEQUENCES[:1] if options.quick else SEQUENCES
     phones: tuple[SlamCapture, ...] = (
@@ -229,7 +232,7 @@ def _tasks(captures: Sequence[Path], options: SlamOptions) -> list[_Task]:
 
 
 def _work_folder(out: Path | None, stack: ExitStack) -> Path:
-    """Folder for all that is written; one that goes away again where none was asked for."""
+    """Output folder; a temporary one, removed at the end, if none is given."""
     if out is None:
         folder = Path(tempfile.mkdtemp(prefix="virest-slam-"))
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -241,11 +244,11 @@ def _work_folder(out: Path | None, stack: ExitStack) -> Path:
 
 
 def _tools(command: str | None) -> dict[str, Any]:
-    """Who judged, by version; raises SettingsError where a tool is missing."""
+    """Versions of the tools used; raises SettingsError if one is missing."""
     try:
         used = {"virest": __version__, "evo": version("evo")}
     except PackageNotFoundError:
-        raise SettingsError("trajectories are scored by evo", hint="pip install 'virest[slam]'") from None
+        raise SettingsError("evo is needed to score trajectories", hint="pip install 'virest[slam]'") from None
     if command is not None:
         return {"versions": used, "tracker": command}
     require_pycolmap()
@@ -271,11 +274,11 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-# ── in words ───────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── text ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def describe(facts: dict[str, Any]) -> str:
-    """The tables, and below them what they were made with."""
+    """The tables, followed by tools and summary."""
     parts = []
     for table, head in (("sequences", "sequence"), ("devices", "device")):
         rows = [row for row in facts["results"] if row["table"] == table]
@@ -309,7 +312,7 @@ def _remark(row: dict[str, Any]) -> str:
 
 
 def _error_cell(kind: dict[str, Any]) -> str:
-    """Median error in millimetres, the range over the seeds, and how much was tracked where that is not all."""
+    """Median error in millimetres, range over the seeds, and the tracked fraction if below 100 %."""
     runs = len(kind["rmse_m"])
     if kind["median_m"] is None:
         return f"lost {kind['lost']}/{runs}"
@@ -324,13 +327,15 @@ def _closing(facts: dict[str, Any]) -> list[str]:
     removed, worse = summary["added_error_removed"], summary["worse_than_recorded"]
     tools = ", ".join(f"{name} {number}" for name, number in versions.items())
     lines = [f"evo_ape RMSE after Sim(3) alignment, median (range) over seeds from 0; {tools}; {facts['tracker']}"]
-    moments = {row["kinds"]["rolling"]["reference"] for row in facts["results"] if "error" not in row}
-    if moments:
-        lines.append(f"recorded frames at the better of exposure-start and frame-middle: {', '.join(sorted(moments))}")
+    references = {row["kinds"]["rolling"]["reference"] for row in facts["results"] if "error" not in row}
+    if references:
+        lines.append(
+            f"recorded frames at the better of exposure-start and frame-middle: {', '.join(sorted(references))}"
+        )
     if removed:
         lines.append(
-            f"of the error that the rolling shutter adds, restored frames take away {100 * removed['median']:.1f} % "
-            f"(median), {100 * removed['least']:.1f} % at the least"
+            f"restored frames remove {100 * removed['median']:.1f} % (median; least {100 * removed['least']:.1f} %) "
+            "of the error that the rolling shutter adds"
         )
     lines.append(f"worse than recorded: {', '.join(worse) or 'none'}")
     return lines

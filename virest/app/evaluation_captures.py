@@ -1,4 +1,4 @@
-"""What is judged: captures whose truth lies beside them, and what the program makes of their frames."""
+"""Captures with ground truth for evaluation, and the frames that the program restores from them."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class TrueCapture:
-    """A capture with sharp global-shutter pictures of its frames in truth/frames."""
+    """A capture with sharp global-shutter images of its frames in truth/frames."""
 
     name: str
     capture: Capture
     profile: CameraProfile
     index: MovieIndex
     frames: tuple[Frame, ...]
-    """Those that are judged, in order: usable ones that have a truth."""
+    """Frames to evaluate, in order: usable frames with truth."""
     usable: tuple[Frame, ...]
     """All frames of the movie that are not skipped, in order."""
 
     def recorded(self, reach: int = 0, steps: dict[int, float] | None = None) -> Iterator[tuple[Frame, Picture]]:
-        """The judged frames and up to ``reach`` of the movie before and after each, with their pictures, RGB.
+        """The evaluated frames and up to ``reach`` movie frames before and after each, with RGB pixels.
 
-        steps: takes those of the coder's quantiser.
+        steps: filled with the encoder's quantiser steps.
         """
         judged = {frame.index for frame in self.frames}
         near = {number + step for number in judged for step in range(-reach, reach + 1)}
@@ -60,19 +60,19 @@ class TrueCapture:
         return read_picture(_truth_path(self.capture.folder, number))
 
     def plan(self, settings: RestorationSettings, **profile: Any) -> RestorationPlan:
-        """What ``virest process`` would plan, with some of the profile's values changed."""
+        """The plan of ``virest process``, with some profile values changed."""
         steps: dict[int, float] = {}
         read = partial(self.luma, steps=steps)
         return plan_restoration(self.capture, replace(self.profile, **profile), settings, read, steps)
 
     def restored(self, plan: RestorationPlan) -> Iterator[RestoredFrame]:
-        """What ``virest process`` makes of the judged frames."""
+        """The evaluated frames as ``virest process`` restores them."""
         judged = {frame.index for frame in self.frames}
         steps: dict[int, float] = {}
         return restore_frames(self.recorded(plan.reach, steps), self.capture.imu, plan, judged, steps)
 
     def motions(self, plan: RestorationPlan) -> dict[int, RowMotion]:
-        """The motion over each usable frame, as the plan has it."""
+        """The motion over each usable frame according to the plan."""
         trajectory = self.trajectory(plan)
         reference, known = plan.settings.reference, plan.translations or {}
         return {
@@ -81,18 +81,18 @@ class TrueCapture:
         }
 
     def trajectory(self, plan: RestorationPlan) -> Trajectory:
-        """The orientations that the plan's profile makes of the inertial log."""
+        """The orientations integrated from the inertial log with the plan's profile."""
         return integrate_gyro(self.capture.imu, plan.profile)
 
     def luma(self, numbers: Sequence[int], steps: dict[int, float] | None = None) -> Iterator[tuple[int, Picture]]:
-        """Luma of some frames, those that can be decoded; steps: takes those of the coder's quantiser."""
+        """Luma of the requested frames that can be decoded; steps: filled with the encoder's quantiser steps."""
         for number, picture in read_gray(self.capture.movie, self.index, numbers, steps):
             if picture is not None:
                 yield number, picture
 
 
 def open_true_capture(folder: Path, config: Path | None = None, chosen: slice = slice(None)) -> TrueCapture:
-    """Read a capture that ``virest simulate`` wrote; CaptureError where it has no truth for any chosen frame."""
+    """Read a capture that ``virest simulate`` wrote; CaptureError if no chosen frame has truth."""
     capture = read_capture(folder)
     profile, _ = resolve_profile(capture, config)
     frames = at_true_times(capture.frames, profile, capture.repeats)
@@ -102,17 +102,17 @@ def open_true_capture(folder: Path, config: Path | None = None, chosen: slice = 
     judged = tuple(f for f in usable if f.index in chosen_ones and _truth_path(folder, f.index).is_file())
     if not judged:
         raise CaptureError(
-            f"{folder}: none of {len(numbers)} chosen frames has a truth in {folder.name}/truth/frames",
-            hint="captures with truth are written by virest simulate",
+            f"{folder}: none of {len(numbers)} selected frames has ground truth in {folder.name}/truth/frames",
+            hint="virest simulate writes captures with ground truth",
         )
     return TrueCapture(capture.folder.resolve().name, capture, profile, probe_movie(capture.movie), judged, usable)
 
 
 def read_picture(path: Path) -> Picture:
-    """Read an RGB picture of 8 bits."""
+    """Read an 8-bit RGB picture."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
-        raise CaptureError(f"{path}: is not a picture that can be read", hint="give PNG or JPEG files")
+        raise CaptureError(f"{path}: cannot be read as a picture", hint="give PNG or JPEG files")
     return picture[..., ::-1].astype(np.uint8)
 
 
@@ -121,7 +121,7 @@ def _truth_path(folder: Path, number: int) -> Path:
 
 
 def peer_versions() -> str:
-    """Versions of what was compared with and measured by."""
+    """Versions of virest, OpenCV and the peer library."""
     try:
         peer = f"scikit-image {version('scikit-image')}"
     except PackageNotFoundError:
@@ -130,10 +130,10 @@ def peer_versions() -> str:
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """Write an RGB or grey picture whole or not at all; its folder is made."""
+    """Write an RGB or grey picture atomically; its folder is created."""
     done, coded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
     if not done:
-        raise OutputError(f"{path}: the picture cannot be coded", hint="report this")
+        raise OutputError(f"{path}: the picture cannot be encoded as PNG", hint="please report this")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, coded.tobytes())

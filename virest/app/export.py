@@ -1,13 +1,13 @@
-"""``virest export CAPTURE``: frames and inertial samples in the folders that SLAM tools read, without ROS.
+"""``virest export CAPTURE``: frames and inertial samples in the folder layouts that SLAM tools read, without ROS.
 
     euroc   mav0/cam0/{data/<ns>.png, data.csv, sensor.yaml}, mav0/imu0/{data.csv, sensor.yaml}, dso/cam0/times.txt
     tum     rgb/<s>.png, rgb.txt, accelerometer.txt, imu.txt
     nerfstudio, colmap, gyroflow    see export_scenes
     both    camchain-imucam.yaml, imu.yaml, orb_slam3.yaml, times.txt, camera.yaml, export.json
 
-One clock: samples are brought to the camera's by the profile's offset and skew, and pictures keep their logged stamps
-(``stamps: logged``), from which ``timeshift_cam_imu`` leads to the instant that a picture stands for: its middle, or
-the reference of a restored one.  For tools without such a shift (ORB-SLAM3) ``stamps: instant`` moves the stamps there.
+All data use one clock: samples are converted to the camera's by the profile's offset and skew.  Frames keep their
+logged timestamps (``stamps: logged``); ``timeshift_cam_imu`` leads to the instant that a frame shows: its middle, or
+the reference of a restored frame.  For tools without such a shift (ORB-SLAM3), ``stamps: instant`` writes that instant.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ __all__ = ["ExportOptions", "plan_export", "run_export"]
 log = logging.getLogger(__name__)
 
 PICTURES = {"euroc": "mav0/cam0/data", "tum": "rgb"}
-"""Where the pictures of a format go; ``images`` for the others."""
+"""Image folder of a format; ``images`` for the others."""
 
 
 # ── write ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def run_export(plan: ExportPlan, progress: Callable[[int], Any] | None = None) -> tuple[Json, str]:
-    """Write the folder; returns the mapping for ``--json`` and the lines for people.
+    """Write the folder; returns the mapping for ``--json`` and the printed lines.
 
-    progress is called with 1 for each frame.  The folder appears whole or not at all.  Raises OutputError.
+    progress is called with 1 for each frame.  The folder is written atomically.  Raises OutputError.
     """
     step = progress or (lambda _: None)
     with _whole_folder(plan.target) as part:
@@ -74,7 +74,7 @@ def run_export(plan: ExportPlan, progress: Callable[[int], Any] | None = None) -
             return _write_lens_profile(plan, part)
         written = _write_pictures(plan, part, step)
         if not written:
-            raise CaptureError(f"{plan.capture.name}: no picture can be decoded", hint="copy the movie again")
+            raise CaptureError(f"{plan.capture.name}: no frame can be decoded", hint="copy the movie again")
         if plan.options.format in SCENES:
             _write_scene(plan, written, part)
         else:
@@ -85,9 +85,11 @@ def run_export(plan: ExportPlan, progress: Callable[[int], Any] | None = None) -
 
 
 def _write_lens_profile(plan: ExportPlan, part: Path) -> tuple[Json, str]:
-    """Write Gyroflow's lens profile alone: its gyroscope data stay where they are."""
+    """Write only Gyroflow's lens profile; Gyroflow reads the gyroscope data from the capture."""
     if plan.profile.intrinsics is None:
-        raise CaptureError(f"{plan.capture.name}: the focal length is unknown", hint="virest calibrate --with focal")
+        raise CaptureError(
+            f"{plan.capture.name}: the focal length is unknown", hint="fit it with virest calibrate --with focal"
+        )
     rate_hz = _rate_hz([frame.time_ns for frame in plan.frames])
     text, error_px = gyroflow_profile(replace(plan.profile, intrinsics=plan.standard.intrinsics), rate_hz)
     _write(part / "lens.json", text)
@@ -96,14 +98,14 @@ def _write_lens_profile(plan: ExportPlan, part: Path) -> tuple[Json, str]:
     readout = f"{1e3 * plan.profile.shutter.readout_time_s:.2f} ms" if plan.profile.readout_known else "unknown"
     lines = [
         f"{plan.capture.name}: lens profile for Gyroflow, readout {readout}",
-        f"its fisheye model is within {error_px:.2f} px of this lens",
+        f"its fisheye model matches this lens within {error_px:.2f} px",
         f"wrote {plan.target / 'lens.json'}",
     ]
     return facts, "\n".join(lines)
 
 
 def _write_scene(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> None:
-    """Write what nerfstudio or COLMAP reads beside the pictures."""
+    """Write the files that nerfstudio or COLMAP reads in addition to the images."""
     poses = frame_poses(plan, frames, [_picture_name(plan, frame) for frame in frames])
     if plan.options.format == "nerfstudio":
         files = {"transforms.json": transforms_json(plan, poses)}
@@ -116,7 +118,7 @@ def _write_scene(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> Non
 
 @contextmanager
 def _whole_folder(target: Path) -> Iterator[Path]:
-    """A folder to be filled, that takes its name when all is done; what stood there before stays until then."""
+    """A temporary folder that is renamed to its target at the end; an existing target is kept until then."""
     mark = secrets.token_hex(4)
     part = target.with_name(f".{target.name}.{mark}.part")
     try:
@@ -134,7 +136,7 @@ def _whole_folder(target: Path) -> Iterator[Path]:
 
 
 def _write_pictures(plan: ExportPlan, part: Path, step: Callable[[int], Any]) -> list[ExportFrame]:
-    """Write the pictures; returns the frames that have one, those that cannot be decoded are counted."""
+    """Write the images; returns the written frames and counts those that cannot be decoded."""
     folder = part / PICTURES.get(plan.options.format, "images")
     folder.mkdir(parents=True)
     written = []
@@ -172,7 +174,7 @@ def _pictures(plan: ExportPlan) -> Iterator[tuple[ExportFrame, Path | NDArray[np
 
 
 def _write_tables(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> None:
-    """Write the lists, the samples, and what the tools need to know of camera and sensor."""
+    """Write file lists, samples, and the calibration of camera and IMU."""
     times = [frame.time_ns for frame in frames]
     imu = plan.capture.imu
     accel = _without_holes(imu.time_s, imu.accel_m_s2)
@@ -203,7 +205,7 @@ def _write_tables(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> No
 def _write_calibration(plan: ExportPlan, part: Path, rate_hz: float) -> None:
     lens = plan.standard.intrinsics
     if lens is not None and lens.model == "none":
-        # what reads camera chains knows radtan and equidistant, and seldom a lens without distortion
+        # readers of camera chains support radtan and equidistant, but rarely a lens without distortion
         lens = replace(lens, model="radtan", coefficients=(0.0,) * 5)
     known = plan.profile.time_offset_s is not None
     base = replace(plan.standard, intrinsics=lens, time_offset_s=0.0 if known else None)
@@ -215,11 +217,11 @@ def _write_calibration(plan: ExportPlan, part: Path, rate_hz: float) -> None:
 
 
 def _said(plan: ExportPlan) -> list[str]:
-    """Comments in the written files: what the pictures are, and what their stamps mean."""
+    """Comments for the written files: the kind of the frames, and the meaning of their timestamps."""
     kind = "restored by virest process" if plan.options.restored else "as recorded"
     return [
         f"{plan.capture.name}, pictures {kind}; profile from {Path(plan.source).name}",
-        f"a picture stands for the instant {1e3 * plan.instant_s:.4f} ms after its stamp",
+        f"a picture shows the instant {1e3 * plan.instant_s:.4f} ms after its timestamp",
         *(note.text for note in plan.notes if not note.on_stamps),
     ]
 
@@ -234,7 +236,7 @@ def _rate_hz(times_ns: list[int]) -> float:
 
 
 def _without_holes(time_s: NDArray[np.float64], accel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Accelerations with the rows that have none filled by a straight line; all NaN where there is no accelerometer."""
+    """Accelerations with missing rows interpolated linearly; all NaN without an accelerometer."""
     known = np.isfinite(accel).all(axis=1)
     if known.all() or not known.any():
         return accel
@@ -282,12 +284,12 @@ def _facts(plan: ExportPlan, frames: list[ExportFrame]) -> Json:
 
 
 def describe(facts: Json) -> str:
-    """Lines for people."""
+    """The printed lines."""
     span_s = (facts["span_ns"][1] - facts["span_ns"][0]) / 1e9
     lines = [
         f"{facts['capture']}: {facts['frames']} {facts['pictures']} frames over {span_s:.2f} s and "
-        f"{facts['imu_rows']} inertial rows as {facts['format']}"
+        f"{facts['imu_rows']} IMU samples in {facts['format']} format"
     ]
     lines += [f"left out: {number} frames ({reason})" for reason, number in facts["left_out"].items()]
-    lines.append(f"a frame shows the instant {1e3 * facts['instant_after_stamp_s']:.2f} ms after its stamp")
+    lines.append(f"a frame shows the instant {1e3 * facts['instant_after_stamp_s']:.2f} ms after its timestamp")
     return "\n".join([*lines, f"wrote {facts['folder']}"])

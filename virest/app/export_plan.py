@@ -1,4 +1,4 @@
-"""What an export will hold, decided before anything is written: frames, stamps, profile, times of the samples."""
+"""The plan of an export, made before anything is written: frames, timestamps, profile, times of the samples."""
 
 from __future__ import annotations
 
@@ -44,76 +44,76 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """What an export was asked for."""
+    """The options of one export."""
 
     out: Path
-    """The export goes into a folder of the capture's name in here."""
+    """Write the export to a folder named after the capture in here."""
     format: str = "euroc"
     restored: Path | None = None
-    """A finished run of ``virest process``, whose pictures stand in for the movie's."""
+    """A finished run of ``virest process``, whose frames replace the movie's."""
     config: Path | None = None
     frames: slice = field(default_factory=lambda: slice(None))
-    """Of the movie's frame indices."""
+    """Selection by movie frame index."""
     stamps: str = "logged"
     overwrite: bool = False
     poses: Path | None = None
-    """A trajectory of the camera (TUM), for nerfstudio and COLMAP."""
+    """Camera trajectory (TUM format), for nerfstudio and COLMAP."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExportFrame:
-    """One picture to be written."""
+    """One frame to write."""
 
     index: int
     time_ns: int
-    """As written."""
+    """The timestamp to write."""
     exposure_s: float | None
     picture: Path | None
-    """The restored picture; None: decode the movie's."""
+    """File of the restored frame; None: decode the movie."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExportNote:
-    """What a user of the export should know."""
+    """A note for users of the export."""
 
     text: str
     on_stamps: bool = False
-    """About what the stamps mean, which the written files say in words of their own."""
+    """Whether the note explains the timestamps; the written files have their own text for that."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExportPlan:
-    """Everything decided, nothing written."""
+    """All decisions of an export, before anything is written."""
 
     target: Path
     capture: Capture
     options: ExportOptions
     frames: tuple[ExportFrame, ...]
     left_out: dict[str, int]
-    """Frames by the reason that they are not written."""
+    """Number of omitted frames by reason."""
     profile: CameraProfile
-    """Of the written pictures and samples: their offset, shutter and stamps, not the capture's."""
+    """Profile of the written frames and samples: their offset, shutter and timestamps, not the capture's."""
     instant_s: float
-    """From a written stamp to the instant that its picture stands for."""
+    """From a written timestamp to the instant that its frame shows."""
     imu_time_ns: NDArray[np.int64]
     noise: ImuNoise | None
     source: str
     notes: tuple[ExportNote, ...]
     camera: CameraProfile
-    """Of the capture, as :attr:`profile` is of what is written."""
+    """Profile of the capture itself."""
     velocities: Mapping[int, list[float]]
-    """m/s in camera axes, by frame, where a run knows them."""
+    """Camera velocity in m/s, camera axes, by frame, if the run estimated it."""
     restored_start: bool
-    """Whether restored pictures show the start of the first row's exposure."""
+    """Whether restored frames show the start of the first row's exposure."""
     standard: CameraProfile
-    """The profile as other tools can hold it: the nearest lens of a standard model, and no fields."""
+    """The profile in a form that other tools support: the closest standard lens model, no fields."""
     gyro_rad_s: NDArray[np.float64]
-    """(n, 3) readings with what the profile's fields of the rate add to them."""
+    """(n, 3) gyroscope readings including the profile's rate fields."""
     poses: GivenPoses | None = None
 
 
 def plan_export(path: str, options: ExportOptions) -> ExportPlan:
-    """Read the capture, and the run if one is given, and decide what is written. Raises CaptureError, OutputError."""
+    """Read the capture, and the run if given, and plan the export. Raises CaptureError, OutputError."""
     folder, target = require_folder(Path(path)), options.out / capture_name(path)
     _require_free(target, folder, options)
     capture = read_capture(folder)
@@ -168,15 +168,15 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
 
 
 def _require_free(target: Path, capture: Path, options: ExportOptions) -> None:
-    """Raise OutputError where the export's place is taken by anything but an export that may be replaced."""
+    """Raise OutputError if the target exists and is not an export that may be replaced."""
     for kept in (capture, options.restored):
         place = target.resolve()
         if kept is not None and (place == kept.resolve() or place in kept.resolve().parents):
-            raise OutputError(f"{target}: is where {kept} lies", hint="choose another folder with --out")
+            raise OutputError(f"{target}: would overwrite {kept}", hint="choose another folder with --out")
     if not target.exists() and not target.is_symlink():
         return
     if not (target / RECORD).is_file():
-        raise OutputError(f"{target}: exists and is not an export of virest", hint="choose another folder with --out")
+        raise OutputError(f"{target}: exists and is not a virest export", hint="choose another folder with --out")
     if not options.overwrite:
         raise OutputError(f"{target}: holds an export", hint="--overwrite replaces it, --out chooses another folder")
 
@@ -196,7 +196,7 @@ def _read_account(run: RunFolder, capture: Capture) -> Json:
 
 
 def _restored_pictures(run: RunFolder, capture: Capture, left_out: dict[str, int]) -> dict[int, Path]:
-    """Picture of each frame that the run has one of. Raises CaptureError where its frames are not the capture's."""
+    """File of each frame that the run has written. Raises CaptureError if its frames are not the capture's."""
     pictures: dict[int, Path] = {}
     try:
         lines = read_lines(run.parameters)
@@ -218,7 +218,7 @@ def _restored_pictures(run: RunFolder, capture: Capture, left_out: dict[str, int
 
 
 def _velocities(run: RunFolder) -> dict[int, list[float]]:
-    """The camera's velocity of each frame that a run knows it of."""
+    """Camera velocity by frame, if the run estimated it."""
     motions = {line["frame"]: line.get("motion") or {} for line in read_lines(run.parameters)}
     return {number: motion["velocity_m_s"] for number, motion in motions.items() if motion.get("velocity_m_s")}
 
@@ -237,12 +237,12 @@ def _choose(
     pictures: dict[int, Path] | None,
     left_out: dict[str, int],
 ) -> list[Frame]:
-    """The frames to be written: those selected and used, or those that the run has pictures of."""
+    """The frames to write: selected usable ones, or those that the run has written."""
     frames = at_true_times(capture.frames, profile, capture.repeats)
     chosen = [frames[i] for i in sorted(range(len(frames))[options.frames])]
     if pictures is not None:
         stalled = [frame for frame in chosen if frame.index in pictures and STALL in frame.skip_codes]
-        if stalled:  # restored at times that the run found and the capture does not know
+        if stalled:  # restored at times that the run estimated and the capture does not hold
             left_out["of an encoder's stall"] = len(stalled)
         return [frame for frame in chosen if frame.index in pictures and frame not in stalled]
     for frame in chosen:
@@ -253,7 +253,7 @@ def _choose(
 
 
 def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> NDArray[np.float64]:
-    """(n,) seconds from each stamp to the instant that its picture stands for.
+    """(n,) seconds from each timestamp to the instant that its frame shows.
 
     reference: ``exposure-start`` of the first row, else the middle: half the readout and half the exposure later.
     """
@@ -273,7 +273,7 @@ def _stamped(
     pictures: dict[int, Path] | None,
     left_out: dict[str, int],
 ) -> tuple[ExportFrame, ...]:
-    """The frames with the stamps that are written; those at the time of the one before (repeats) are left out."""
+    """The frames with the timestamps to write; repeats of the previous frame's time are omitted."""
     found: list[ExportFrame] = []
     for frame, instant_s in zip(chosen, instants_s.tolist(), strict=True):
         moved = frame.time_s != capture.frames[frame.index].time_s
@@ -290,11 +290,11 @@ def _stamped(
 def _written_profile(
     profile: CameraProfile, instants_s: NDArray[np.float64], options: ExportOptions
 ) -> tuple[CameraProfile, float]:
-    """The profile of what is written, and the seconds from a written stamp to the instant of its picture.
+    """The profile of the written data, and the seconds from a written timestamp to the instant of its frame.
 
-    Samples are on the camera's clock, so what was offset, skew or delay over time is gone, and so are fields of the
-    rate, which the samples hold.  A restored picture has no rows and no
-    exposure; a raw one keeps both, and where its stamp is moved to its middle, the first row is half a readout before.
+    Samples are on the camera's clock, so offset, skew and delay over time vanish, as do rate fields, which the samples
+    include.  A restored frame has no readout and no exposure; a recorded one keeps both, and if its timestamp is moved
+    to its middle, the first row is half a readout earlier.
     """
     logged = options.stamps == "logged"
     instant_s = float(np.median(instants_s)) if logged else 0.0
@@ -321,10 +321,10 @@ def _written_profile(
 def _for_frames(
     profile: CameraProfile, frames: tuple[ExportFrame, ...], capture: Capture, options: ExportOptions
 ) -> CameraProfile:
-    """The profile for these frames alone: their gains, and what runs over time counted from the first of them.
+    """The profile for these frames alone: their gains, and time-dependent terms counted from the first of them.
 
-    Pulsing light and defocus are gone from a restored picture, no frame is later than its stamp any more, and stretches
-    of the log that were bridged can be trusted.
+    Restored frames have no flicker and no defocus, no frame lags its timestamp, and bridged stretches of the log can be
+    trusted.
     """
     later_s = (frames[0].time_ns - capture.stamp_0_ns) / 1e9
     profile = counted_from(profile, later_s, frames[0].time_ns)
@@ -342,7 +342,7 @@ def _for_frames(
 
 
 def _corrected_gyro(capture: Capture, profile: CameraProfile) -> NDArray[np.float64]:
-    """The gyroscope's readings (n, 3) as they would be if it had no error but bias, scale and noise."""
+    """Gyroscope readings (n, 3) corrected for all errors but bias, scale and noise."""
     missing = missing_rate_rad_s(capture.imu, profile)
     if missing is None:
         return capture.imu.gyro_rad_s
@@ -350,7 +350,7 @@ def _corrected_gyro(capture: Capture, profile: CameraProfile) -> NDArray[np.floa
 
 
 def _imu_time_ns(capture: Capture, profile: CameraProfile) -> NDArray[np.int64]:
-    """Times of the samples on the camera's clock, whole nanoseconds, rising."""
+    """Times of the samples on the camera's clock, whole nanoseconds, ascending."""
     camera_s = profile.camera_time_s(capture.imu.time_s)
     return np.asarray(capture.stamp_0_ns + np.rint(camera_s * 1e9).astype(np.int64), np.int64)
 
@@ -361,13 +361,13 @@ def _notes(
     notes = []
     if profile.time_offset_s is None:
         notes.append(
-            "the time offset between camera and IMU is unknown: samples keep their times; find it by `virest calibrate`"
+            "the time offset between camera and IMU is unknown: samples keep their times; run `virest calibrate`"
         )
     if profile.intrinsics is None:
         notes.append("the focal length is unknown: no camera calibration is written; give --config, or calibrate")
     if rates := {field.covariates[0]: 1 for field in profile.fields if field.kind == "rate"}:
         over = ", ".join(rates)
-        notes.append(f"the readings of the gyroscope are written with the fields of its rate over {over} added")
+        notes.append(f"gyroscope readings are written with the profile's rate fields over {over} added")
     if unbridged := profile.unbridged_s:
         spans = ", ".join(f"{begin:.2f} to {end:.2f} s" for begin, end in unbridged[:3])
         more = f" and {len(unbridged) - 3} more" if len(unbridged) > 3 else ""
@@ -378,8 +378,8 @@ def _notes(
     shift_ms = 1e3 * float(np.median(instants_s))
     if options.stamps == "logged" and abs(shift_ms) > 1.0:
         text = (
-            f"a picture stands for an instant {shift_ms:.1f} ms after its stamp (timeshift_cam_imu); for tools that "
-            "cannot shift times, as ORB-SLAM3, export with --stamps instant"
+            f"a picture shows the instant {shift_ms:.1f} ms after its timestamp (timeshift_cam_imu); for tools without "
+            "a time shift, such as ORB-SLAM3, export with --stamps instant"
         )
         found.append(ExportNote(text, on_stamps=True))
     return found

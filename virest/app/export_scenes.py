@@ -1,7 +1,7 @@
-"""What reconstruction tools read: ``transforms.json`` (nerfstudio), a COLMAP model, a Gyroflow lens profile.
+"""Files for reconstruction tools: ``transforms.json`` (nerfstudio), a COLMAP model, a Gyroflow lens profile.
 
-Poses are those of a trajectory file, where one is given.  Otherwise the gyroscope tells orientations only; positions
-are then zero for COLMAP, which is a start and no reconstruction, and no pose is written for nerfstudio.
+Poses come from a trajectory file, if given.  Otherwise only orientations are known, from the gyroscope: COLMAP gets
+zero positions, a starting point and not a reconstruction, and nerfstudio gets no poses.
 
 COLMAP and nerfstudio count pixels from the top-left corner of the first one, so cx and cy are half a pixel larger than
 in a camera profile.  nerfstudio's camera axes are OpenGL's: x right, y up, z back.
@@ -33,18 +33,18 @@ Array = NDArray[np.float64]
 Json = dict[str, Any]
 HALF_PX = 0.5
 OPENGL = np.diag([1.0, -1.0, -1.0])
-"""OpenGL's camera axes in ours, and the reverse."""
+"""Rotation between OpenGL's camera axes and ours, in both directions."""
 FIT_ANGLES = 400
 
 
 @dataclass(frozen=True, slots=True)
 class FramePose:
-    """Where the camera was, and how it moved, for one exported frame."""
+    """Camera pose and motion for one exported frame."""
 
     frame: ExportFrame
     name: str
     rotation_world_cam: Array
-    """(3, 3) at the instant that the frame stands for."""
+    """(3, 3) at the instant that the frame shows."""
     position_m: Array | None
     """(3,) in the world; None: unknown."""
     rate_rad_s: Array
@@ -88,12 +88,12 @@ def _time_ns(text: str) -> int:
 
 
 def frame_poses(plan: ExportPlan, frames: list[ExportFrame], names: list[str]) -> list[FramePose]:
-    """Poses and motion of the exported frames, by the gyroscope and, where given, a trajectory."""
+    """Poses and motion of the exported frames, from the gyroscope and, if given, a trajectory."""
     camera = plan.camera
     if camera.intrinsics is None:
         raise CaptureError(
             f"{plan.capture.name}: the focal length is unknown, so {plan.options.format} cannot be written",
-            hint="give --config, or fit it by virest calibrate --with focal",
+            hint="give --config, or fit it with virest calibrate --with focal",
         )
     trajectory = integrate_gyro(plan.capture.imu, camera)
     lens = moving_lens(trajectory, camera)
@@ -140,7 +140,7 @@ def _pose(
 
 
 def transforms_json(plan: ExportPlan, poses: list[FramePose]) -> str:
-    """``transforms.json``: intrinsics, and for each frame what is known of its time, motion and pose."""
+    """``transforms.json``: intrinsics, and the known time, motion and pose of each frame."""
     lens = plan.standard.intrinsics
     assert lens is not None
     content: Json = {
@@ -254,7 +254,7 @@ def _shutter_json(plan: ExportPlan, poses: list[FramePose]) -> str:
 
 
 def gyroflow_profile(profile: CameraProfile, fps: float) -> tuple[str, float]:
-    """A lens profile for Gyroflow, and what its fisheye model leaves of ours, pixels at the worst place."""
+    """A lens profile for Gyroflow, and the largest error of its fisheye model in pixels."""
     lens = profile.intrinsics
     assert lens is not None
     coefficients, error_px = fisheye_coefficients(lens)
@@ -301,10 +301,10 @@ _DIRECTIONS = {
 
 
 def fisheye_coefficients(lens: Intrinsics) -> tuple[tuple[float, ...], float]:
-    """k1 to k4 of the equidistant model that is nearest to the lens over the picture, and the worst error in pixels.
+    """k1 to k4 of the equidistant model closest to the lens over the frame, and the largest error in pixels.
 
     Model: θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸); along a ray at angle θ the lens has the radius r_d.  Least
-    squares over angles from the centre to the farthest corner; tangential terms have no place in it.
+    squares over angles from the centre to the farthest corner; tangential terms are ignored.
     """
     if lens.model == "fisheye":
         return lens.coefficients, 0.0

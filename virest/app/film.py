@@ -1,4 +1,4 @@
-"""A film of a run: restored frames, or recorded beside restored ones, as MP4 with the movie's stamps and rotation."""
+"""A video of a run: restored frames, or recorded beside restored ones, as MP4 with the movie's stamps and rotation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from virest.errors import OutputError
 Picture = NDArray[np.uint8]
 TICKS_PER_S = 90_000
 QUALITY = "17"
-"""x264's constant rate factor: hardly a difference to the PNGs is to be seen."""
+"""x264's constant rate factor: hardly distinguishable from the PNGs."""
 BT601 = 6
 UPRIGHT = (1, 0, 0, 1)
 _BOXES_WITH_BOXES = (b"moov", b"trak", b"mdia")
@@ -29,12 +29,12 @@ _MOST_HEADER_BYTES = 64 * 2**20
 
 
 def write_film(
-    path: Path, frames: Iterable[tuple[int, Picture]], fps: float, turn: tuple[int, int, int, int] = UPRIGHT
+    path: Path, frames: Iterable[tuple[int, Picture]], fps: float, rotation: tuple[int, int, int, int] = UPRIGHT
 ) -> int:
-    """Write (stamp in ns from the first, RGB picture) as H.264; the film appears whole or not at all.
+    """Write (timestamp in ns from the first, RGB picture) as H.264, atomically.
 
-    turn: a, b, c, d of the display matrix, as :func:`display_turn` reads it.  Returns the number of frames.  Raises
-    OutputError.
+    rotation: a, b, c, d of the display matrix, as :func:`display_matrix` reads it.  Returns the number of frames.
+    Raises OutputError.
     """
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     count, size = 0, (0, 0)
@@ -53,10 +53,10 @@ def write_film(
                 container.mux(stream.encode(frame))
                 count += 1
             if stream is None:
-                raise OutputError(f"{path}: no frame to show", hint="choose other frames")
+                raise OutputError(f"{path}: no frame to show", hint="select other frames")
             container.mux(stream.encode(None))
-        if turn != UPRIGHT:
-            _set_turn(part, turn, *size)
+        if rotation != UPRIGHT:
+            _write_display_matrix(part, rotation, *size)
         os.replace(part, path)
     except OSError as error:
         raise output_error(path, error) from error
@@ -66,9 +66,9 @@ def write_film(
     return count
 
 
-def side_by_side(left: Picture, right: Picture, turn: tuple[int, int, int, int]) -> Picture:
-    """Two pictures of one size, so that they stand beside each other as displayed: stacked in a film that is turned."""
-    a, b, _, _ = turn
+def side_by_side(left: Picture, right: Picture, rotation: tuple[int, int, int, int]) -> Picture:
+    """Join two pictures of one size so that players show them side by side: stacked if the video is rotated by 90°."""
+    a, b, _, _ = rotation
     if a:
         return np.hstack([left, right] if a > 0 else [right, left])
     return np.vstack([right, left] if b > 0 else [left, right])
@@ -86,7 +86,7 @@ def _stream(container: Any, width: int, height: int, fps: float) -> Any:
 
 
 def _even(picture: Picture) -> Picture:
-    """The picture with a repeated last row or column where its size is odd, as the format wants it."""
+    """The picture with its last row or column repeated if its size is odd; the format needs even sizes."""
     height, width = picture.shape[:2]
     if height % 2 or width % 2:
         picture = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
@@ -96,27 +96,27 @@ def _even(picture: Picture) -> Picture:
 # ── the rotation of an MP4 or MOV file ───────────────────────────────────────────────────────────────────────────────
 
 
-def display_turn(path: Path) -> tuple[int, int, int, int]:
-    """a, b, c, d of the movie's display matrix, each −1, 0 or 1 (ISO/IEC 14496-12); UPRIGHT where it has none."""
+def display_matrix(path: Path) -> tuple[int, int, int, int]:
+    """a, b, c, d of the movie's display matrix, each −1, 0 or 1 (ISO/IEC 14496-12); UPRIGHT if it has none."""
     found = next(_picture_tracks(path), None)
     if found is None:
         return UPRIGHT
     _, matrix = found
     a, b, _, c, d = struct.unpack(">5i", matrix[:20])
-    turn = tuple(round(value / 65536) for value in (a, b, c, d))
-    return turn if sorted(map(abs, turn)) == [0, 0, 1, 1] else UPRIGHT  # type: ignore[return-value]
+    rotation = tuple(round(value / 65536) for value in (a, b, c, d))
+    return rotation if sorted(map(abs, rotation)) == [0, 0, 1, 1] else UPRIGHT  # type: ignore[return-value]
 
 
-def _set_turn(path: Path, turn: tuple[int, int, int, int], width: int, height: int) -> None:
-    """Write the display matrix; the offset brings the turned picture back to the corner."""
-    place, _ = next(_picture_tracks(path))
-    a, b, c, d = turn
+def _write_display_matrix(path: Path, rotation: tuple[int, int, int, int], width: int, height: int) -> None:
+    """Write the display matrix; its offset moves the rotated picture back to the origin."""
+    position, _ = next(_picture_tracks(path))
+    a, b, c, d = rotation
     x = width * (a < 0) + height * (c < 0)
     y = width * (b < 0) + height * (d < 0)
     one, last = 1 << 16, 1 << 30
     matrix = struct.pack(">9i", a * one, b * one, 0, c * one, d * one, 0, x * one, y * one, last)
     with path.open("r+b") as file:
-        file.seek(place)
+        file.seek(position)
         file.write(matrix)
 
 
@@ -124,13 +124,13 @@ def _picture_tracks(path: Path) -> Iterator[tuple[int, bytes]]:
     """File position and bytes of the matrix of each track that has a size."""
     try:
         with path.open("rb") as file:
-            for place, size in _boxes(file, 0, path.stat().st_size):
-                file.seek(place)
+            for position, size in _boxes(file, 0, path.stat().st_size):
+                file.seek(position)
                 version = file.read(1)[0]
-                at = place + (52 if version == 1 else 40)
+                at = position + (52 if version == 1 else 40)
                 file.seek(at)
                 data = file.read(44)
-                if len(data) == 44 and size >= at - place + 44 and any(data[36:44]):
+                if len(data) == 44 and size >= at - position + 44 and any(data[36:44]):
                     yield at, data[:36]
     except (OSError, IndexError, AttributeError):
         return

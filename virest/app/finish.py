@@ -1,4 +1,4 @@
-"""What is done to a run's pictures once all are written: a film, a crop that all share, and no frames at all."""
+"""The last step of a run, once all frames are written: write a video, crop all frames alike, remove the frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.film import display_turn, side_by_side, write_film
+from virest.app.film import display_matrix, side_by_side, write_film
 from virest.app.outputs import write_picture
 from virest.app.run_folder import RunFolder, parse_lines
 from virest.camera.intrinsics import Intrinsics
@@ -30,51 +30,51 @@ Crop = tuple[int, int, int, int]
 LEAST_CROP_PX = 16
 NAME_FIELD = "{capture}"
 LENS_ESTIMATES = ("k1", "k2", "p1", "p2", "k3", "k4")
-"""Of a profile: they say nothing of a picture without distortion."""
+"""Profile entries that do not apply to an undistorted picture."""
 
 
 @dataclass(frozen=True, slots=True)
-class FinishWishes:
-    """What a run does with its pictures in the end."""
+class FinishOptions:
+    """What to do with a run's frames at its end."""
 
     film: str | None = None
-    """Path of the film; ``{capture}`` stands for the capture's name."""
+    """Path of the video; ``{capture}`` is replaced by the capture's name."""
     side_by_side: bool = False
     keep_frames: bool = True
     crop: bool = False
 
     @property
     def any(self) -> bool:
-        """Whether there is something to do."""
+        """Whether anything is requested."""
         return self.film is not None or self.crop
 
     def film_of(self, name: str) -> Path | None:
-        """The film of a capture."""
+        """The video path of a capture."""
         return None if self.film is None else Path(self.film.replace(NAME_FIELD, name))
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """What was done to the pictures."""
+    """What was done to the frames."""
 
     crop_px: Crop | None = None
     film: Path | None = None
     kept: bool = True
 
     def changed(self, line: Json) -> Json:
-        """A line of parameters.jsonl, as its picture now is."""
+        """A line of parameters.jsonl, updated for its changed picture."""
         if self.crop_px is not None and line["output"] is not None:
             x0, y0, x1, y1 = self.crop_px
             line = {**line, "crop_px": list(self.crop_px), "valid_px": [0, 0, x1 - x0, y1 - y0]}
         return line if self.kept else {**line, "output": None}
 
     def profile(self, profile: CameraProfile) -> CameraProfile:
-        """The camera of the pictures: cropping moves the principal point."""
+        """The camera of the output frames: cropping moves the principal point."""
         return profile if self.crop_px is None else cropped_profile(profile, self.crop_px)
 
 
 def pictures_profile(plan: RestorationPlan) -> CameraProfile:
-    """The camera of a run's pictures before any crop: a pinhole where the lens's distortion is undone."""
+    """The camera of a run's frames before any crop: a pinhole if lens distortion is removed."""
     profile = plan.profile
     if profile.intrinsics is None or not plan.settings.undistort:
         return profile
@@ -83,7 +83,7 @@ def pictures_profile(plan: RestorationPlan) -> CameraProfile:
 
 
 def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
-    """The camera whose pictures are the rectangle (x0, y0, x1, y1) of this one's; row times stay with ``crop_px``."""
+    """The camera of frames cropped to (x0, y0, x1, y1); row times still refer to the full frame, by ``crop_px``."""
     x0, y0, x1, y1 = crop_px
     lens = profile.intrinsics
     if lens is not None:
@@ -94,11 +94,11 @@ def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
     return dataclasses.replace(profile, width=x1 - x0, height=y1 - y0, intrinsics=lens).with_fields(moved)
 
 
-def require_finishable(wishes: FinishWishes, name: str, run: Path, *, overwrite: bool) -> None:
-    """Raise OutputError, before any work, where the wishes cannot be met."""
-    if wishes.any and is_remote(run):
-        raise OutputError("--video and --crop need --out in a file system", hint="process into a folder, then upload")
-    film = wishes.film_of(name)
+def require_finishable(options: FinishOptions, name: str, run: Path, *, overwrite: bool) -> None:
+    """Raise OutputError, before any work, if the request cannot be fulfilled."""
+    if options.any and is_remote(run):
+        raise OutputError("--video and --crop need a local --out", hint="process to a folder, then upload")
+    film = options.film_of(name)
     if film is None:
         return
     if film.is_dir() or not film.absolute().parent.is_dir():
@@ -114,38 +114,39 @@ def finish_pictures(
     logs: Iterable[Path],
     movie: Path,
     index: MovieIndex,
-    wishes: FinishWishes,
+    options: FinishOptions,
     name: str,
     lens: Intrinsics | None = None,
 ) -> Finished:
-    """Crop the frames, write the film, and take the frames away, as wished.  Doing it again does no harm.
+    """Crop the frames, write the video and remove the frames, as requested; repeating it is harmless.
 
-    lens: whose distortion the run's pictures are without; recorded ones that stand in for them lose it too.
+    lens: the lens whose distortion was removed from the run's frames; recorded frames shown in their place are
+    undistorted too.
     """
     lines = [line for log in read_each(logs) for line in parse_lines(log)]
-    crop_px = common_rectangle(lines) if wishes.crop else None
+    crop_px = common_rectangle(lines) if options.crop else None
     if crop_px is not None:
         for line in lines:
             if line["output"] is not None:
                 for place in (run.picture(line["frame"]), run.mask(line["frame"])):
                     _crop_file(place, crop_px)
-    film = wishes.film_of(name)
+    film = options.film_of(name)
     if film is not None and lines:
-        turn = display_turn(movie)
+        rotation = display_matrix(movie)
         first_ns = lines[0]["timestamp_ns"]
-        frames = _film_frames(run, lines, movie, index, crop_px, turn if wishes.side_by_side else None, lens)
-        write_film(film, ((ns - first_ns, picture) for ns, picture in frames), _rate(lines), turn)
-    if not wishes.keep_frames:
+        frames = _film_frames(run, lines, movie, index, crop_px, rotation if options.side_by_side else None, lens)
+        write_film(film, ((ns - first_ns, picture) for ns, picture in frames), _rate(lines), rotation)
+    if not options.keep_frames:
         for line in lines:
             run.picture(line["frame"]).unlink(missing_ok=True)
-    return Finished(crop_px, film, wishes.keep_frames)
+    return Finished(crop_px, film, options.keep_frames)
 
 
 def common_rectangle(lines: Iterable[Json]) -> Crop:
-    """The rectangle that holds recorded data in every frame that has a picture.  Raises OutputError for none."""
+    """The rectangle with recorded data in every written frame.  Raises OutputError if there is none."""
     inside = [line["valid_px"] for line in lines if line["output"] is not None]
     if not inside:
-        raise OutputError("--crop: no frame has a picture", hint="leave --crop out")
+        raise OutputError("--crop: no frame was written", hint="omit --crop")
     x0, y0 = np.max([px[:2] for px in inside], axis=0).tolist()
     x1, y1 = np.min([px[2:] for px in inside], axis=0).tolist()
     if min(x1 - x0, y1 - y0) < LEAST_CROP_PX:
@@ -154,7 +155,7 @@ def common_rectangle(lines: Iterable[Json]) -> Crop:
 
 
 def _crop_file(path: Path, crop_px: Crop) -> None:
-    """Cut a picture to the rectangle, unless that was done before."""
+    """Crop a picture to the rectangle, unless it is cropped already."""
     x0, y0, x1, y1 = crop_px
     picture = _read_png(path)
     if picture is not None and picture.shape[:2] != (y1 - y0, x1 - x0):
@@ -177,7 +178,7 @@ def _film_frames(
     beside: Any,
     lens: Intrinsics | None,
 ) -> Iterator[tuple[int, Picture]]:
-    """Stamp and picture of each frame; one without a restored picture is shown as recorded, but for the distortion."""
+    """Timestamp and picture of each frame; frames without a restored picture are shown as recorded, undistorted."""
     wanted = {line["frame"]: line for line in lines}
     numbers = sorted(wanted)
     stored = all(run.picture(number).is_file() for number in numbers)
@@ -200,6 +201,6 @@ def _film_frames(
 
 
 def _rate(lines: list[Json]) -> float:
-    """Frames a second by the stamps' median step."""
+    """Frames per second by the median step of the timestamps."""
     steps = np.diff([line["timestamp_ns"] for line in lines])
     return float(np.clip(1e9 / np.median(steps), 1.0, 1000.0)) if len(steps) and np.median(steps) > 0 else 30.0

@@ -1,4 +1,4 @@
-"""The line of ``parameters.jsonl`` that a frame's result is written as."""
+"""One frame's result as a line of ``parameters.jsonl``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from virest.restoration.parameters import Json
 def frame_line(
     capture: str, profile: CameraProfile, restored: RestoredFrame, picture: Path, seconds: dict[str, float]
 ) -> Json:
-    """What was found out about one frame and what became of it.  picture: where it is written, if there is one."""
+    """The measured degradation and the result of one frame.  picture: where it is written, if at all."""
     frame, found = restored.frame, restored.degradation
     line: Json = {
         "capture": capture,
@@ -31,7 +31,7 @@ def frame_line(
 
 
 def steps_done(restored: RestoredFrame) -> list[str]:
-    """What was done to a frame: ``deblurred``, ``straightened``, ``undistorted``."""
+    """Steps applied to a frame: ``deblurred``, ``straightened``, ``undistorted``."""
     found, is_restored = restored.degradation, restored.status == "restored"
     steps = {
         "deblurred": is_restored and found is not None and found.deblur is not None,
@@ -42,7 +42,7 @@ def steps_done(restored: RestoredFrame) -> list[str]:
 
 
 def _not_looked_at(profile: CameraProfile) -> dict[str, Any]:
-    """Of a frame that was left out, or failed, before its motion was looked at."""
+    """The entries of a frame that was skipped, or failed, before its motion was computed."""
     return {
         "motion": None,
         "depth_m": None,

@@ -33,7 +33,7 @@ EVIDENCE = {
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is hidden in one capture, and what the reader should look for."""
+    """The effect hidden in one capture, and its visible signs."""
 
     value: str
     """VALUE of ``simulate --effect NAME=VALUE``."""
@@ -45,18 +45,20 @@ class Case:
 CASES: dict[str, Case] = {
     "time_offset": Case("0.012", "residuals proportional to angular acceleration; no trend over the row"),
     "clock_skew": Case("0.004", "residuals that grow from the first frame to the last"),
-    "readout_time": Case("0.012", "residuals that grow linearly from the first row to the last, with the turn rate"),
-    "readout_direction": Case("bottom_to_top", "the strongest trend over the row: every row has the wrong time"),
+    "readout_time": Case(
+        "0.012", "residuals that grow linearly from the first row to the last, with the rotation rate"
+    ),
+    "readout_direction": Case("bottom_to_top", "the strongest trend over the rows: every row has the wrong time"),
     "timestamp_reference": Case(
-        "exposure_end", "as a time offset, but it follows the exposure", (("exposure_ms", (4.0, 12.0)),)
+        "exposure_end", "like a time offset, but proportional to the exposure", (("exposure_ms", (4.0, 12.0)),)
     ),
     "exposure_time": Case("1.5", "blur longer than predicted; tracked points hardly change"),
     "gyro_bias": Case("0.03,-0.02,0.025", "a constant shift from frame to frame, whatever the motion"),
-    "gyro_scale": Case("1.03", "residuals proportional to the turn rate; roll separates it from the focal length"),
-    "gyro_lowpass": Case("12", "as a time offset, but fast turns are too small: the gyroscope's own low pass"),
+    "gyro_scale": Case("1.03", "residuals proportional to the rotation rate; roll separates it from the focal length"),
+    "gyro_lowpass": Case("12", "like a time offset, but fast rotations are too small: the gyroscope's own low pass"),
     "imu_rotation": Case("0.02,-0.015,0.03", "residuals across the direction of motion"),
-    "focal_length": Case("1.03", "residuals proportional to the turn rate in pitch and yaw, not in roll"),
-    "pixel_aspect": Case("1.02", "residuals that grow with the turn rate in pitch, not in yaw or roll"),
+    "focal_length": Case("1.03", "residuals proportional to the rotation rate in pitch and yaw, not in roll"),
+    "pixel_aspect": Case("1.02", "residuals that grow with the rotation rate in pitch, not in yaw or roll"),
     "focal_drift": Case("0.02", "residuals that grow over time: the lens refocuses"),
     "radial_distortion": Case("-0.06", "residuals that grow with the distance from the picture's centre"),
     "principal_point": Case("12,-9", "residuals under roll about the optical axis"),
@@ -69,14 +71,14 @@ CASES: dict[str, Case] = {
     "black_level": Case("0.04", "brightness that disagrees in the shadows", (("auto_exposure_ev", 3.0),)),
     "vignetting": Case("0.3", "points that darken towards the corners"),
     "flicker": Case("0.15,100", "bright and dark bands across the rows, moving from frame to frame"),
-    "gain_drift": Case("0.03", "frames that are brighter or darker than exposure × ISO says"),
+    "gain_drift": Case("0.03", "frames that are brighter or darker than exposure × ISO predicts"),
     "sharpening": Case("0.9,1.2", "overshoot beside edges: the phone sharpens; blur paths stay as predicted"),
     "defocus": Case("1.6", "blur that is as strong along the motion as across it"),
 }
 
 
 def write_gallery(docs: Path, names: Sequence[str]) -> None:
-    """Simulate, diagnose and draw the chosen effects; the page lists every effect that was drawn, now or before."""
+    """Simulate, diagnose and draw the chosen effects; the page lists every effect drawn now or before."""
     images = docs / "images" / "gallery"
     images.mkdir(parents=True, exist_ok=True)
     kept = images / "results.json"

@@ -1,4 +1,4 @@
-"""``virest import``: a ROS bag or MCAP file becomes a capture folder: pictures with stamps, IMU, camera.yaml."""
+"""``virest import``: convert a ROS bag or MCAP file to a capture folder: images with timestamps, IMU, camera.yaml."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from virest.errors import CaptureError, OutputError
 
 Json = dict[str, Any]
 MODELS = {"plumb_bob": "radtan", "equidistant": "fisheye", "fisheye": "fisheye"}
-AXES = "the axes between IMU and camera are not in a bag: virest calibrate finds them"
+AXES = "a bag does not hold the rotation between IMU and camera: virest calibrate estimates it"
 
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """What one ``virest import`` was asked for."""
+    """The options of one ``virest import``."""
 
     out: Path
     image: str | None = None
@@ -34,17 +34,17 @@ class ImportOptions:
 
 
 def run_import(path: Path, options: ImportOptions, progress: Callable[[int], Any] | None = None) -> tuple[Json, str]:
-    """Unpack a bag.  The folder appears whole or not at all; the mapping for ``--json`` and the text for people."""
+    """Convert a bag, atomically; returns the mapping for ``--json`` and the printed text."""
     out, step = options.out, progress or (lambda _: None)
     if out.exists() and not (options.overwrite and _is_import(out)):
-        hint = "name another folder" if not out.is_dir() else "--overwrite replaces an earlier import only"
+        hint = "name another folder" if not out.is_dir() else "--overwrite replaces only an earlier import"
         raise OutputError(f"{out}: exists already", hint=hint)
     part = out.with_name(out.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     try:
         with Bag(path, options.image, options.imu) as bag:
             facts = _unpack(bag, part, step)
-        read_capture(part)  # what cannot be read back is not a capture
+        read_capture(part)  # fail now if the result cannot be read back
         if out.exists():
             shutil.rmtree(out)
         part.rename(out)
@@ -59,7 +59,7 @@ def run_import(path: Path, options: ImportOptions, progress: Callable[[int], Any
 
 
 def _is_import(folder: Path) -> bool:
-    """Whether nothing but an earlier import stands in the folder."""
+    """Whether the folder holds an earlier import and nothing else."""
     own = {"data", "data.csv", "imu.csv", "camera.yaml"}
     return folder.is_dir() and {p.name for p in folder.iterdir()} <= own
 
@@ -77,7 +77,7 @@ def _unpack(bag: Bag, part: Path, step: Callable[[int], Any]) -> Json:
         size = (picture.shape[1], picture.shape[0])
         step(1)
     if not lines:
-        raise CaptureError(f"{bag.path.name}: no pictures in {topics.image}", hint="choose another by --image")
+        raise CaptureError(f"{bag.path.name}: no images in {topics.image}", hint="choose another by --image")
     write_whole(part / "data.csv", ("#timestamp [ns],filename\n" + "\n".join(lines) + "\n").encode())
     rows = [",".join([str(t), *(f"{v:.9g}" for v in row)]) for t, row in zip(time_ns.tolist(), samples, strict=True)]
     head = "#timestamp [ns],gx [rad/s],gy,gz,ax [m/s^2],ay,az\n"
@@ -85,7 +85,7 @@ def _unpack(bag: Bag, part: Path, step: Callable[[int], Any]) -> Json:
     camera = bag.camera(topics.camera) if topics.camera else None
     notes = [AXES]
     if camera is None or (camera.width, camera.height) != size:
-        notes.append("no CameraInfo of the pictures' size: the lens is unknown")
+        notes.append("no CameraInfo matches the image size: the lens is unknown")
     else:
         write_whole(part / "camera.yaml", _profile_text(camera).encode())
     return {
@@ -95,7 +95,7 @@ def _unpack(bag: Bag, part: Path, step: Callable[[int], Any]) -> Json:
 
 
 def _profile_text(camera: BagCamera) -> str:
-    """A profile with the lens; what a bag does not say stays unknown."""
+    """A profile with the lens; values that the bag does not hold stay unknown."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     values = np.array(camera.distortion)
     model = MODELS.get(camera.model, "none") if np.any(values) else "none"

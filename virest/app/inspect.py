@@ -1,4 +1,4 @@
-"""What is in a capture and what is wrong with it, before any work: the command `virest inspect`."""
+"""The command `virest inspect`: what a capture holds and what is wrong with it, before any processing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOT_APPLIED_S = 1e-6
 
 
 def inspect_capture(path: Path) -> tuple[dict[str, Any], str, int]:
-    """(JSON mapping, table for people, exit code) of one folder; faults become notes, 4 where it cannot be used."""
+    """(JSON mapping, printed table, exit code) of one folder; errors become notes, and the code 4 if it is unusable."""
     try:
         capture = read_capture(path)
     except CaptureError as fault:
@@ -31,7 +31,7 @@ def inspect_capture(path: Path) -> tuple[dict[str, Any], str, int]:
 
 
 def describe(capture: Capture) -> str:
-    """Tabulate a capture for people."""
+    """The printed table of a capture."""
     return _describe_facts(as_json(capture))
 
 
@@ -87,14 +87,14 @@ def as_json(capture: Capture) -> dict[str, Any]:
 
 
 def _frame_counts(frames: tuple[Frame, ...]) -> dict[str, Any]:
-    """How many frames there are, how many can be used, and how many cannot for each cause."""
+    """Number of recorded frames, of usable ones, and of unusable ones by cause."""
     codes = [code for frame in frames for code in frame.skip_codes]
     skipped = {code: codes.count(code) for code in sorted(set(codes))}
     return {"recorded": len(frames), "usable": sum(f.skip_reason is None for f in frames), "skipped": skipped}
 
 
 def _clock(source: str, shift_ns: int, difference_ns: int | None) -> dict[str, Any]:
-    """What was added to the camera's stamps, and what edge_epochs.txt has, whether or not that had to be applied."""
+    """The shift added to the camera's timestamps, and the difference in edge_epochs.txt, applied or not."""
     difference_s = None if difference_ns is None else difference_ns / 1e9
     return {"source": source, "shift_s": shift_ns / 1e9, "edge_epochs_difference_s": difference_s}
 
@@ -119,13 +119,13 @@ def _dropped(counts: dict[str, int]) -> dict[str, dict[str, int]]:
 
 
 def _frame_gaps(frames: tuple[Frame, ...], frame_s: Any, period_s: float) -> list[dict[str, float]]:
-    """Where frames lie more than one and a half periods apart."""
+    """Gaps of more than 1.5 frame periods."""
     steps = np.diff(frame_s)
     return [{"frame": frames[i + 1].index, "gap_s": float(steps[i])} for i in np.flatnonzero(steps > 1.5 * period_s)]
 
 
 def _skipped(frames: tuple[Frame, ...]) -> list[dict[str, Any]]:
-    """Runs of neighbouring frames that are left out for the same causes, with the first one's reason."""
+    """Runs of consecutive frames skipped for the same causes, with the first frame's reason."""
     runs: list[dict[str, Any]] = []
     for frame in frames:
         if frame.skip_reason is None:
@@ -154,7 +154,7 @@ def _profile_notes(capture: Capture) -> list[Note]:
 
 
 def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
-    """What can still be said of a capture that cannot be used: each file on its own."""
+    """The facts of an unusable capture: each file by itself."""
     folder = path.absolute()
     facts: dict[str, Any] = {
         "capture": folder.resolve().name if _is_folder(folder) else folder.name,
@@ -173,7 +173,7 @@ def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
                 _look_at(path, reader, facts, notes)
         others = [name for name in missing if name not in str(fault)]
         if others:
-            notes.append(Note("error", "files-missing", f"missing too: {', '.join(others)}"))
+            notes.append(Note("error", "files-missing", f"also missing: {', '.join(others)}"))
     facts["notes"] = [_note(note) for note in notes]
     return facts
 
@@ -190,7 +190,7 @@ def _code(fault: CaptureError) -> str:
 
 
 def _look_at(path: Path, reader: Callable[[Path], Any], facts: dict[str, Any], notes: list[Note]) -> None:
-    """Add what one file holds, or why it cannot be read."""
+    """Add the content of one file, or why it cannot be read."""
     try:
         found = reader(path)
     except CaptureError as fault:
@@ -230,7 +230,7 @@ def _describe_facts(facts: dict[str, Any]) -> str:
 
 
 def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    """(title, text) of each line that has something to say."""
+    """(title, text) of each line that is not empty."""
     rows: list[tuple[str, str]] = [("kind", facts["kind"])] if "kind" in facts else []
     if movie := facts.get("movie"):
         size = f"{movie['width']}x{movie['height']}"
@@ -242,7 +242,7 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         text = f"source {clock['source']}, camera stamps shifted by {clock['shift_s']:.6f} s"
         difference_s = clock["edge_epochs_difference_s"]
         if difference_s is not None and abs(difference_s - clock["shift_s"]) > NOT_APPLIED_S:
-            text += f" (edge_epochs.txt: the clocks lie {difference_s:.6f} s apart, which this source does not need)"
+            text += f" (edge_epochs.txt: the clocks differ by {difference_s:.6f} s; not needed for this source)"
         rows.append(("clock", text))
     for name, span in (facts.get("span_s") or facts.get("logged_span_s") or {}).items():
         rows.append(("span", f"{name} {span[0]:.3f} to {span[1]:.3f} s"))
@@ -258,7 +258,7 @@ def _camera_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("gaps", f"IMU {len(gaps)}, frames {len(facts['frame_gaps'])}"))
     rows += [("imu gap", f"{start:.3f} to {end:.3f} s ({(end - start) * 1e3:.0f} ms)") for start, end in gaps[:8]]
     repeats = facts["repeats"]
-    rows.append(("repeats", f"frames {', '.join(map(str, repeats))}" if repeats else "none seen in the first 2 s"))
+    rows.append(("repeats", f"frames {', '.join(map(str, repeats))}" if repeats else "none in the first 2 s"))
     rows.append(("start-up lag", f"{_shown(facts['startup_lag_s'], '.2f')} s" if facts["startup_lag_s"] else "none"))
     for run in facts["skipped"][:8]:
         rows.append(("left out", f"frames {run['first']}–{run['last']}: {run['reason']}"))

@@ -1,4 +1,4 @@
-"""A run as a list of segments: small, picklable, idempotent pieces of work for any concurrent.futures.Executor."""
+"""A run as a list of segments: small, picklable, idempotent tasks for any concurrent.futures.Executor."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from virest.errors import OutputError, RestorationError, VirestError
 log = logging.getLogger(__name__)
 
 LOOK_S = 5.0
-"""How often to look after the workers while nothing comes back."""
+"""How often to check the workers while no result arrives."""
 MOST_AHEAD = 8
-"""Calls begun before their results are wanted: enough to keep many workers in work, few enough to keep memory flat."""
+"""Calls started before their results are needed: enough to keep many workers busy, few enough to limit memory."""
 
 Running = dict[Future[dict[str, int]], Segment]
 
 
 class Workers:
-    """An executor that can be started again, and the number of segments that may be in flight."""
+    """An executor that can be restarted, and the number of segments that may be in flight."""
 
     def __init__(self, jobs: int, scheduler: str | None = None, *, verbose: bool = False) -> None:
         self.jobs = jobs
@@ -45,24 +45,24 @@ class Workers:
 
     @property
     def slots(self) -> int:
-        """Segments in flight at once: enough to keep every worker busy, few enough to keep memory flat."""
+        """Segments in flight at once: enough to keep every worker busy, few enough to limit memory."""
         if isinstance(self._executor, ClusterExecutor):
             return self._executor.slots
         return 1 if self.here else self.jobs + 1
 
-    def start(self, *places: Path) -> None:
-        """Have workers at hand that see these places. Raises SettingsError where a cluster's do not."""
+    def start(self, *paths: Path) -> None:
+        """Start workers that can read these paths. Raises SettingsError if a cluster's workers cannot."""
         if self._executor is None:
             self._executor = self._start()
         if isinstance(self._executor, ClusterExecutor):
-            self._executor.require_places(list(places))
+            self._executor.require_paths(list(paths))
 
     def submit(self, segment: Segment) -> Future[dict[str, int]]:
-        """Hand a segment to the executor."""
+        """Submit a segment to the executor."""
         return self.call(run_segment, segment)
 
     def call(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
-        """Have a function called by a worker."""
+        """Submit a function call to a worker."""
         if self._executor is None:
             self._executor = self._start()
         if not isinstance(self._executor, ProcessPoolExecutor):
@@ -76,7 +76,7 @@ class Workers:
 
     @property
     def started(self) -> Executor | None:
-        """The executor at hand, another one after a restart: then what was given to the last one is lost."""
+        """The current executor; a different one after a restart, when work submitted to the last one is lost."""
         return self._executor
 
     def _start(self) -> Executor:
@@ -87,23 +87,23 @@ class Workers:
         return process_pool(self.jobs, verbose=self.verbose)
 
     def check(self) -> None:
-        """Look whether anybody is still at work; called while nothing comes back. Raises RestorationError."""
+        """Check that workers are still alive; called while no result arrives. Raises RestorationError."""
         if isinstance(self._executor, ClusterExecutor):
             self._executor.check()
 
     def lost(self) -> VirestError:
-        """The error of work that was called off from outside."""
+        """The error for work that was cancelled from outside."""
         if isinstance(self._executor, ClusterExecutor):
             return self._executor.lost()
         return RestorationError("the job was cancelled", hint="continue with --resume")
 
     def renew(self) -> None:
-        """After a worker's death: a pool is broken and begins anew, a cluster has others."""
+        """After a worker's death: a pool is broken and is restarted, a cluster has other workers."""
         if not isinstance(self._executor, ClusterExecutor):
             self.kill()
 
     def kill(self) -> None:
-        """Stop all work now; the next submit starts anew."""
+        """Stop all work now; the next submit restarts the workers."""
         executor, self._executor = self._executor, None
         if executor is None:
             return
@@ -114,16 +114,16 @@ class Workers:
         executor.shutdown(wait=False, cancel_futures=True)
 
     def close(self) -> None:
-        """Let the workers go, once they are idle."""
+        """Shut the workers down once they are idle."""
         if self._executor is not None:
             self._executor.shutdown()
             self._executor = None
 
 
 def run_segments(segments: Iterable[Segment], workers: Workers) -> Iterator[tuple[Segment, dict[str, int]]]:
-    """Run segments, a bounded number at a time; yields each as it is done, with its counts by status.
+    """Run segments, a bounded number at a time; yields each when finished, with its counts by status.
 
-    A segment that was lost with its worker is tried once more, alone; lost again, its frames fail.
+    A segment lost with its worker is retried once, alone; if it is lost again, its frames fail.
     """
     waiting = iter(segments)
     running: Running = {}
@@ -145,7 +145,7 @@ def run_segments(segments: Iterable[Segment], workers: Workers) -> Iterator[tupl
 def _fill(
     running: dict[Future[dict[str, int]], Segment], waiting: Iterator[Segment], workers: Workers
 ) -> list[Segment]:
-    """Submit until the slots are full; gives back the segment that a broken pool would not take."""
+    """Submit until the slots are full; returns the segment that a broken pool refused, if any."""
     for segment in islice(waiting, max(workers.slots - len(running), 0)):
         try:
             running[workers.submit(segment)] = segment
@@ -163,7 +163,7 @@ def _await_first(futures: Iterable[Future[Result]], workers: Workers) -> set[Fut
 
 
 def _collect(future: Future[dict[str, int]], segment: Segment, workers: Workers) -> dict[str, int] | None:
-    """The counts of a finished segment; None where its worker died."""
+    """The counts of a finished segment; None if its worker died."""
     try:
         return future.result()
     except OutputError:
@@ -172,7 +172,7 @@ def _collect(future: Future[dict[str, int]], segment: Segment, workers: Workers)
         raise workers.lost() from None
     except BrokenExecutor:
         return None
-    except Exception as error:  # explained in the frames' lines; the other segments go on
+    except Exception as error:  # reported in the frames' lines; the other segments continue
         if is_unreachable(error):
             raise
         if _is_killed(error):
@@ -182,7 +182,7 @@ def _collect(future: Future[dict[str, int]], segment: Segment, workers: Workers)
 
 
 def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator[tuple[Segment, dict[str, int]]]:
-    """Collect what a broken pool still holds, then try each lost segment alone in a new one."""
+    """Collect the finished segments of a broken pool, then retry each lost segment alone in a new one."""
     for future, segment in list(running.items()):
         counts = _collect(future, segment, workers)
         if counts is None:
@@ -192,7 +192,7 @@ def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator
     running.clear()
     for segment in sorted(lost, key=lambda s: s.frames[0].index):
         frames = f"frames {segment.frames[0].index}-{segment.frames[-1].index}"
-        log.warning("%s: a worker died on %s or its neighbours; trying again", segment.capture_name, frames)
+        log.warning("%s: a worker died on %s or its neighbours; retrying", segment.capture_name, frames)
         workers.renew()
         counts = _collect(workers.submit(segment), segment, workers)
         yield (
@@ -203,14 +203,14 @@ def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator
 
 
 def _is_killed(error: Exception) -> bool:
-    """Whether an error says that a call's workers died: a pool's, or Dask's once it gives a call up."""
+    """Whether an error means that a worker died: a broken pool, or a call that Dask has given up."""
     return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
 
 
 class PrefetchedCalls(Generic[Result]):
-    """Calls whose results are wanted one after the other; workers begin some of them before it is their turn.
+    """Calls whose results are needed in order; workers start some of them ahead of time.
 
-    A call that was lost with its worker is tried once more, alone; lost again, it raises RestorationError.
+    A call lost with its worker is retried once, alone; if it is lost again, it raises RestorationError.
     """
 
     def __init__(self, function: Callable[..., Result], calls: Sequence[tuple[Any, ...]], workers: Workers) -> None:
@@ -220,7 +220,7 @@ class PrefetchedCalls(Generic[Result]):
         self._begun: dict[int, tuple[Future[Result], Executor | None]] = {}
 
     def result(self, number: int, name: str) -> Result:
-        """The result of a call, or what it raised; ``name`` is for the log."""
+        """The result of a call; raises what the call raised.  ``name`` is for the log."""
         if number not in self._begun or self._begun[number][1] is not self._workers.started:
             self._begun.pop(number, None)
             self.begin(number)
@@ -231,13 +231,13 @@ class PrefetchedCalls(Generic[Result]):
             except Exception as error:
                 if not _is_killed(error):
                     raise
-        log.warning("%s: a worker died while this capture or a neighbour was planned; trying again", name)
+        log.warning("%s: a worker died while planning this capture or the next; retrying", name)
         return self._alone(number)
 
     def begin(self, number: int) -> None:
-        """Have the call and some after it begun: best done where workers will soon have nothing else to do.
+        """Start the call and some after it; best called when workers will soon be idle.
 
-        One that was lost waits for its turn: it may be the one that kills its worker.
+        A lost call waits for its turn: it may be the one that kills its worker.
         """
         last = number + min(self._workers.slots, MOST_AHEAD)
         for following in range(number, min(last, len(self._calls))):
@@ -250,7 +250,7 @@ class PrefetchedCalls(Generic[Result]):
             self._begun[following] = (future, self._workers.started)
 
     def _taken(self, number: int) -> Future[Result] | None:
-        """The call's future; None where the workers that had it are gone."""
+        """The call's future; None if the workers that ran it are gone."""
         future, executor = self._begun.pop(number, (None, None))
         return future if executor is self._workers.started else None
 
@@ -262,7 +262,7 @@ class PrefetchedCalls(Generic[Result]):
             raise self._workers.lost() from None
 
     def _alone(self, number: int) -> Result:
-        """The call once more in fresh workers that have nothing else to do."""
+        """Retry the call in new workers that have no other work."""
         self._begun.clear()
         self._workers.renew()
         try:
@@ -271,5 +271,5 @@ class PrefetchedCalls(Generic[Result]):
             if not _is_killed(error):
                 raise
             self._workers.renew()
-            text = "the worker process died twice while this capture was read and planned"
-            raise RestorationError(text, hint="--resume tries again; fewer --jobs take less memory") from None
+            text = "the worker process died twice while reading and planning this capture"
+            raise RestorationError(text, hint="--resume retries; fewer --jobs need less memory") from None

@@ -1,4 +1,4 @@
-"""``virest --man``: the manual page ``virest.1`` (roff), made of what ``--help`` shows, so that both say the same."""
+"""``virest --man``: the manual page ``virest.1`` (roff), generated from the text of ``--help``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from virest import __version__
 
 EXIT_CODES = (
     (0, "done"),
-    (1, "a fault of virest; please report it"),
+    (1, "a bug in virest; please report it"),
     (2, "usage"),
     (3, "settings or profile"),
     (4, "capture unusable: video, IMU, clock"),
@@ -20,9 +20,9 @@ EXIT_CODES = (
     (10, "only with virest diagnose --check: the verdict is not consistent"),
     (130, "interrupted; --resume continues"),
 )
-"""As docs/exit-codes.md has them."""
+"""The same texts as in docs/exit-codes.md."""
 VERBATIM = "\b"
-"""Begins a paragraph of a help text that keeps its lines."""
+"""Marks a help paragraph whose line breaks are kept."""
 
 
 def man_page(program: Any) -> str:
@@ -76,6 +76,6 @@ def _options(command: Any, context: Any) -> Iterator[str]:
 
 
 def _text(text: str) -> str:
-    """Text as roff takes it: hyphens that can be copied, no line that begins as a request."""
+    """Text escaped for roff: hyphens that can be copied, no line that begins like a request."""
     escaped = text.replace("\\", "\\e").replace("-", "\\-")
     return f"\\&{escaped}" if escaped[:1] in (".", "'") or not escaped else escaped

@@ -1,7 +1,7 @@
-"""The process's own memory: pictures come and go by the dozen a frame, and are not handed back to the system between.
+"""Memory allocation: keep freed memory in the process, since each frame allocates and frees dozens of pictures.
 
-The C library returns every freed picture to the system, which clears it, page by page, when the next one asks: a sixth
-of a frame's time.  Kept, it is used again at once.
+By default the C library returns each freed picture to the system, which must clear every page again for the next one:
+1/6 of a frame's time.  Kept memory is reused at once.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import ctypes
 import sys
 
 MAPPED_FROM_BYTES, KEPT_BYTES = 64 << 20, 128 << 20
-"""Pieces below the first come from memory that is kept; at most the second of it may lie free."""
+"""Allocations below the first come from the kept heap; at most the second may be free in it."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Names in glibc's malloc.h."""
 
 
 def keep_freed_memory() -> bool:
-    """Have this process keep what it frees, up to KEPT_BYTES; False where the C library cannot be told (not glibc)."""
+    """Keep freed memory in this process, up to KEPT_BYTES; False if the C library has no such setting (not glibc)."""
     if not sys.platform.startswith("linux"):
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)

@@ -13,16 +13,16 @@ JOINT = "-"
 
 
 def shard_of(paths: list[str], shard: tuple[int, int] = (1, 1)) -> tuple[list[str], list[str]]:
-    """Paths and names of the i-th of N parts of a batch, taken in turn: the parts differ by one capture at most."""
+    """Paths and names of the i-th of N parts of a batch, dealt in turn: part sizes differ by at most one capture."""
     names = batch_names(paths)
     part, parts = shard
     return paths[part - 1 :: parts], names[part - 1 :: parts]
 
 
 def batch_names(paths: list[str]) -> list[str]:
-    """A name for each capture: its folder's, or, where several folders share that, its path below their common one.
+    """A name for each capture: its folder's name, or, if several share it, the path below their common folder.
 
-    Raises OutputError for a capture given twice, and for names that still coincide.
+    Raises OutputError for a capture given twice, and for names that still collide.
     """
     names = [capture_name(path) for path in paths]
     groups: dict[str, list[int]] = defaultdict(list)
@@ -41,18 +41,18 @@ def batch_names(paths: list[str]) -> list[str]:
 
 
 def _relative_names(paths: list[str], name: str) -> list[str]:
-    """Paths of folders of one name below their common folder, with dashes."""
-    places = [resolved(path) for path in paths]
-    if len(set(places)) < len(places):
+    """Paths of equally named folders below their common folder, joined by dashes."""
+    absolute = [resolved(path) for path in paths]
+    if len(set(absolute)) < len(absolute):
         raise OutputError(
             f"{len(paths)} captures are named {name!r} ({', '.join(paths)}): the same folder is given twice and would "
             "share one output folder",
             hint="give each capture once",
         )
-    common = os.path.commonpath(places) if not any("://" in place for place in places) else ""
+    common = os.path.commonpath(absolute) if not any("://" in place for place in absolute) else ""
     if not common:
         raise OutputError(
             f"{len(paths)} captures are named {name!r} ({', '.join(paths)}) and would share one output folder",
             hint="process them with different --out, or rename one",
         )
-    return [JOINT.join(PurePath(os.path.relpath(place, common)).parts) for place in places]
+    return [JOINT.join(PurePath(os.path.relpath(place, common)).parts) for place in absolute]

@@ -1,4 +1,4 @@
-"""``virest profile``: a camera profile to start from, and the readout times of known phones."""
+"""``virest profile``: create a camera profile, and list the readout times of known phones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ COMMENTS = {
 
 @dataclass(frozen=True, slots=True)
 class NewProfile:
-    """What ``virest profile new`` was asked for."""
+    """The options of one ``virest profile new``."""
 
     capture: Path | None = None
     device: str | None = None
@@ -45,18 +45,18 @@ class NewProfile:
     overwrite: bool = False
 
 
-def run_new_profile(wishes: NewProfile) -> tuple[Json, str]:
-    """Write the profile; the mapping for ``--json`` and the text for people."""
-    if wishes.out.exists() and not wishes.overwrite:
-        raise OutputError(f"{wishes.out}: exists already", hint="name another by --out, or pass --overwrite")
-    profile, source = _base(wishes)
+def run_new_profile(request: NewProfile) -> tuple[Json, str]:
+    """Write the profile; returns the mapping for ``--json`` and the printed text."""
+    if request.out.exists() and not request.overwrite:
+        raise OutputError(f"{request.out}: exists already", hint="name another by --out, or pass --overwrite")
+    profile, source = _base(request)
     notes = [f"base: {source}"]
-    if (focal := _focal_px(wishes, profile)) is not None:
+    if (focal := _focal_px(request, profile)) is not None:
         centre = (profile.width - 1) / 2, (profile.height - 1) / 2
         lens = Intrinsics(profile.width, profile.height, focal, focal, *centre)
         profile = replace(profile, intrinsics=lens)
-    if wishes.device is not None:
-        entry = _entry(wishes.device, profile)
+    if request.device is not None:
+        entry = _entry(request.device, profile)
         shutter = replace(profile.shutter, readout_time_s=entry.readout_s)
         profile = profile.with_estimate(
             "readout_time_s", entry.readout_s, entry.std_s, entry.source, shutter=shutter, readout_known=True
@@ -65,19 +65,19 @@ def run_new_profile(wishes: NewProfile) -> tuple[Json, str]:
         notes.append(
             f"readout {1e3 * entry.readout_s:.2f} ms of {entry.device} at {entry.width}x{entry.height}: {entry.source}"
         )
-    write_whole(wishes.out, commented(profile, notes).encode())
+    write_whole(request.out, commented(profile, notes).encode())
     unknown = [name for name, known in (
         ("focal length", profile.intrinsics is not None), ("readout time", profile.readout_known),
         ("time offset", profile.time_offset_s is not None), ("response", profile.response is not None),
     ) if not known]  # fmt: skip
     if unknown:
         notes.append(f"unknown: {', '.join(unknown)}; virest calibrate fits what the motion determines")
-    facts = {"profile": profile_mapping(profile), "path": str(wishes.out), "notes": notes}
-    return facts, "\n".join([*notes, f"wrote {wishes.out}"])
+    facts = {"profile": profile_mapping(profile), "path": str(request.out), "notes": notes}
+    return facts, "\n".join([*notes, f"wrote {request.out}"])
 
 
 def commented(profile: CameraProfile, notes: list[str]) -> str:
-    """The profile's YAML with a word on each key that readers ask about."""
+    """The profile's YAML with comments on its main keys."""
     lines = [f"# {note}" for note in notes]
     for line in format_profile(profile).splitlines():
         key = line.strip().partition(":")[0]
@@ -119,24 +119,26 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _base(wishes: NewProfile) -> tuple[CameraProfile, str]:
-    if wishes.capture is not None:
-        capture = read_capture(wishes.capture)
+def _base(request: NewProfile) -> tuple[CameraProfile, str]:
+    if request.capture is not None:
+        capture = read_capture(request.capture)
         profile, source = resolve_profile(capture)
         return profile, f"{capture.name}, {source}"
-    if wishes.size is None:
+    if request.size is None:
         raise SettingsError("neither a capture nor a frame size is given", hint="pass CAPTURE, or --size WxH")
-    return phone_profile(*wishes.size), "a phone's usual axes"
+    return phone_profile(*request.size), "typical phone axes"
 
 
-def _focal_px(wishes: NewProfile, profile: CameraProfile) -> float | None:
-    if wishes.focal_px is not None:
-        return wishes.focal_px
-    if wishes.fov_deg is None:
+def _focal_px(request: NewProfile, profile: CameraProfile) -> float | None:
+    if request.focal_px is not None:
+        return request.focal_px
+    if request.fov_deg is None:
         return None
-    if not 1 < wishes.fov_deg < 170:
-        raise SettingsError(f"field of view {wishes.fov_deg:g} is not in 1 to 170 degrees", hint="along the long side")
-    return max(profile.width, profile.height) / 2 / math.tan(math.radians(wishes.fov_deg) / 2)
+    if not 1 < request.fov_deg < 170:
+        raise SettingsError(
+            f"field of view {request.fov_deg:g} is not in 1 to 170 degrees", hint="give the angle along the long side"
+        )
+    return max(profile.width, profile.height) / 2 / math.tan(math.radians(request.fov_deg) / 2)
 
 
 def _entry(device: str, profile: CameraProfile) -> Readout:
@@ -150,6 +152,6 @@ def _entry(device: str, profile: CameraProfile) -> Readout:
         modes = ", ".join(f"{entry.device} {entry.width}x{entry.height}" for entry in found)
         raise SettingsError(
             f"no readout time of {device!r} at {profile.width}x{profile.height} is known ({modes})",
-            hint="a readout holds for one mode; virest calibrate measures it",
+            hint="a readout time applies to one mode; virest calibrate measures it",
         )
     return same[0]

@@ -1,4 +1,4 @@
-"""What became of the captures of a call, as a table of at most 80 columns, and which command helps next."""
+"""The results of a call as a table of at most 80 columns, and the command to run next."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ WIDTH, MOST_VERDICT = 80, 21
 
 @dataclass(frozen=True, slots=True)
 class CaptureOutcome:
-    """What became of one capture."""
+    """The result of one capture."""
 
     name: str
     path: str
-    """As it was given."""
+    """The path as given."""
     folder: Path
     counts: dict[str, int]
     """Frames by status."""
     verdict: str
     seconds: float
-    """Wall-clock time of restoring, as the progress bar counts it; reading and planning come before."""
+    """Wall-clock time of restoration alone, as in the progress bar; without reading and planning."""
     advice: str = ""
-    """The command that would make more of this capture; empty: none is known to."""
+    """The command that would improve this capture's result; empty: none known."""
     film: Path | None = None
 
     @property
     def exit_code(self) -> int:
-        """9 where a frame failed."""
+        """9 if a frame failed, else 0."""
         return PARTLY_FAILED if self.counts.get("failed") else 0
 
 
 def summary(outcomes: list[CaptureOutcome]) -> str:
-    """A table of the captures, where the results are, and what to do next."""
+    """A table of the captures, the paths of the results, and what to do next."""
     verdicts = [o.verdict if len(outcomes) == 1 else _cut(o.verdict, MOST_VERDICT) for o in outcomes]
     verdicts = [verdict.partition(":")[0] for verdict in verdicts]
     longest = min(max(map(len, verdicts), default=0), MOST_VERDICT)
@@ -54,7 +54,7 @@ def summary(outcomes: list[CaptureOutcome]) -> str:
 
 
 def next_steps(outcomes: list[CaptureOutcome]) -> list[str]:
-    """One line for a call: the command that helps most."""
+    """One line per call: the most useful next command."""
     if len(outcomes) > 1:
         return [f"next: virest report {shlex.quote(str(outcomes[0].folder.parent))} shows them all"]
     only = outcomes[0]
@@ -63,7 +63,7 @@ def next_steps(outcomes: list[CaptureOutcome]) -> list[str]:
     if only.advice:
         return [f"next: {only.advice.replace('CAPTURE', path)}"]
     if extended.is_file():
-        return [f"next: virest report {folder} shows it; a diagnosis is there: --config {shlex.quote(str(extended))}"]
+        return [f"next: virest report {folder} shows it; its diagnosis suggests --config {shlex.quote(str(extended))}"]
     return [f"next: virest report {folder} shows it; virest diagnose {path} tests the camera model"]
 
 

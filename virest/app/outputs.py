@@ -1,4 +1,4 @@
-"""Single files of a run's output: each appears whole or not at all, JSON without NaN, errors with a hint."""
+"""Output files: written atomically, JSON without NaN, errors with a hint."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from virest.capture.location import RemotePath, is_remote, locate
 from virest.errors import OutputError, RestorationError
 
 UNPRINTABLE = ("Cc", "Zl", "Zp")
-"""Control characters and separators of lines, by their Unicode category."""
+"""Unicode categories of control characters and line separators."""
 SIGNIFICANT_DIGITS = 10
 
 
 _HINTS = {
-    errno.ENOSPC: "free some space there, then go on (a run with --resume)",
-    errno.EDQUOT: "your quota is used up; free some space, then go on (a run with --resume)",
-    errno.EROFS: "choose a folder that can be written with --out",
-    errno.EACCES: "choose a folder that you may write with --out",
-    errno.EPERM: "choose a folder that you may write with --out",
-    errno.ENOTDIR: "a part of this path is a file; choose another folder with --out",
+    errno.ENOSPC: "free some space there, then repeat the command (process: with --resume)",
+    errno.EDQUOT: "your quota is exhausted; free some space, then repeat the command (process: with --resume)",
+    errno.EROFS: "the disk is read-only; choose another folder with --out",
+    errno.EACCES: "no permission to write there; choose another folder with --out",
+    errno.EPERM: "no permission to write there; choose another folder with --out",
+    errno.ENOTDIR: "part of this path is a file; choose another folder with --out",
     errno.EEXIST: "this path is a file; choose another folder with --out",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
-    """The system's complaint as one of ours, with what to do next."""
+    """An operating-system error as an OutputError with a hint."""
     hint = _HINTS.get(error.errno or 0, "check the folder given to --out")
     return OutputError(f"{path}: cannot be written: {error.strerror or error}", hint=hint)
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that it appears whole or not at all. Raises OutputError."""
+    """Write a file atomically. Raises OutputError."""
     if isinstance(path, RemotePath):
         try:
             path.write_whole(data)
@@ -78,7 +78,7 @@ def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON takes it: no NaN (null), no infinity (``"inf"``), floats to ten digits, arrays as lists."""
+    """A value ready for JSON: NaN as null, infinity as ``"inf"``, floats to 10 digits, arrays as lists."""
     match value:
         case bool() | str() | int() | None:
             return value
@@ -103,7 +103,7 @@ def _plain_float(value: float) -> float | str | None:
 
 
 def json_line(value: dict[str, Any]) -> str:
-    """One record on one line."""
+    """One record as one line of JSON."""
     return json.dumps(plain(value), allow_nan=False)
 
 
@@ -115,7 +115,7 @@ def file_facts(path: Path) -> dict[str, Any]:
 
 
 def resolved(place: str | os.PathLike[str]) -> str:
-    """Where a path really lies, links followed; an address as it is."""
+    """A path with links resolved; a remote address unchanged."""
     found = locate(place)
     return str(found) if is_remote(found) else os.path.realpath(found)
 
@@ -128,7 +128,5 @@ def capture_name(path: str) -> str:
     place = locate(path)
     name = place.name if is_remote(place) else os.path.basename(os.path.abspath(place))
     if not name or name in (".", "..") or any(unicodedata.category(c) in UNPRINTABLE for c in name) or "/" in name:
-        raise OutputError(
-            f"{path!r}: no usable name for an output folder: {name!r}", hint="rename the capture's folder"
-        )
+        raise OutputError(f"{path!r}: {name!r} cannot name an output folder", hint="rename the capture's folder")
     return name

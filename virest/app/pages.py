@@ -51,18 +51,18 @@ BLOCK = re.compile(
 NUMBER = re.compile(r"(?<![\w.])[-+−]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 CLOCK = re.compile(r"\s*(?:s|ms|µs|frames/s)\b")
 CLOCK_HEADS = ("frames/s", "time s")
-"""Units and columns of what a clock says: no run repeats it."""
+"""Units and columns of timings, which no run repeats."""
 ROUNDING, RELATIVE = 1.5, 0.02
-"""How far a repeated figure may lie off, in units of its last digit or of itself: processors round differently."""
+"""Tolerance of a repeated figure, in units of its last digit or of itself: processors round differently."""
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One session of a page, with what it printed."""
+    """One session of a page with its output."""
 
     page: Path
     start: int
-    """Where in the page's text the block begins, and where it ends."""
+    """Start and end of the block in the page's text."""
     end: int
     took_s: float | None
     """CPU time of the last run; None: it was never run."""
@@ -70,16 +70,16 @@ class Block:
     session: str
     """Commands behind ``$``, each with its output below."""
     version: str
-    """Of the virest that printed it."""
+    """Version of virest that printed it."""
 
     @property
     def commands(self) -> list[str]:
-        """What is typed, line for line."""
+        """The typed commands, with their line breaks."""
         return [command for command, _ in steps(self.session)]
 
     @property
     def output(self) -> str:
-        """What was printed, without the commands."""
+        """The printed output, without the commands."""
         return "".join(output for _, output in steps(self.session))
 
 
@@ -97,7 +97,7 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def steps(session: str) -> list[tuple[str, str]]:
-    """Each command of a session, lines that it continues on included, and its output."""
+    """Each command of a session, including continuation lines, and its output."""
     found: list[tuple[str, str]] = []
     going_on = False
     for line in session.splitlines(keepends=True):
@@ -131,7 +131,7 @@ def _cpu_s() -> float:
 
 
 def _run(command: str, folder: Path) -> str:
-    """What a command prints, with paths as a reader sees them. Raises SettingsError where it fails."""
+    """A command's output, with paths as a reader sees them. Raises SettingsError if it fails."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     environment = {**os.environ, "PATH": path, "COLUMNS": "120", "PYTHONUNBUFFERED": "1"}
     line = ["bash", "-o", "pipefail", "-c", command]
@@ -145,7 +145,7 @@ def _run(command: str, folder: Path) -> str:
 
 
 def block_text(block: Block, session: str, took_s: float) -> str:
-    """A block as it stands in the page; where speeds are in it, the machine below."""
+    """A block as written in the page; if it shows speeds, with the machine below."""
     head = ", ".join([_duration(took_s), *block.needs])
     machine = f"*{processor() or 'unknown processor'}, {_count(cores(), 'core')}*\n" if has_speeds(session) else ""
     return f"<!-- figures: {head} -->\n```console\n{session}```\n{machine}<!-- end: virest {__version__} -->"
@@ -156,12 +156,12 @@ def _count(number: int, what: str) -> str:
 
 
 def has_speeds(session: str) -> bool:
-    """Whether something in a session depends on how fast the machine is."""
+    """Whether a session's output depends on the speed of the machine."""
     return any(head in session for head in (*CLOCK_HEADS, "CPU ms"))
 
 
 def rewrite(block: Block, session: str, took_s: float) -> None:
-    """Write a block's new session into its page, as the page stands now."""
+    """Write a block's new session into the current text of its page."""
     text = block.page.read_text(encoding="utf-8")
     now = next(found for found in blocks(block.page) if found.commands == block.commands)
     write_whole(block.page, (text[: now.start] + block_text(block, session, took_s) + text[now.end :]).encode())
@@ -171,7 +171,7 @@ def rewrite(block: Block, session: str, took_s: float) -> None:
 
 
 def differences(shown: str, now: str) -> list[str]:
-    """Lines of a session that are no longer printed so; clocks and the last digits may differ."""
+    """Lines of a session whose output has changed; timings and last digits may differ."""
     old, new = _readings(shown), _readings(now)
     if len(old) != len(new):
         return [f"{len(old)} lines shown, {len(new)} printed"]
@@ -180,14 +180,14 @@ def differences(shown: str, now: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """One line: its words, and its numbers but for those of a clock."""
+    """One line: its words, and its numbers except timings."""
 
     text: str
     words: str
     numbers: tuple[str, ...]
 
     def same(self, other: _Reading) -> bool:
-        """Whether the other line says the same."""
+        """Whether the other line has the same content."""
         pairs = zip(self.numbers, other.numbers, strict=False)
         alike = len(self.numbers) == len(other.numbers) and all(_close(a, b) for a, b in pairs)
         return alike and self.words == other.words
@@ -208,12 +208,12 @@ def _readings(session: str) -> list[_Reading]:
 
 
 def value(number: str) -> float:
-    """A number as pages write it."""
+    """The value of a number in the notation of the pages."""
     return float(number.replace(",", "").replace("−", "-"))
 
 
 def last_digit(number: str) -> float:
-    """What one unit of a number's last digit is worth."""
+    """The value of one unit of a number's last digit."""
     mantissa, _, power = number.partition("e")
     return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
 
@@ -274,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _brought_up_to_date(block: Block, only_check: bool) -> bool:
-    """Run one block and write it; with ``only_check`` say whether it is as it was. False too where a command fails."""
+    """Run one block and write it, or with ``only_check`` compare it. False if it differs or a command fails."""
     about = f"{block.page.name}: {block.commands[-1]}"
     try:
         session, took_s = rerun(block)

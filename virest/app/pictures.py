@@ -1,4 +1,4 @@
-"""Write the documentation's pictures from simulated captures: ``python -m virest.app.pictures docs/images``.
+"""Generate the documentation's pictures from simulated captures: ``python -m virest.app.pictures docs/images``.
 
 ``make figures`` calls it, and virest.app.gallery for the gallery of effects.
 """
@@ -31,7 +31,7 @@ from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_
 
 Picture = NDArray[np.uint8]
 COLOURS = 192
-"""Of a palette picture: a third of the bytes. Photographs keep all of theirs."""
+"""Colours of a palette picture, a third of the size; photographs keep full colour."""
 PHOTOGRAPHS = ("before_after", "joint", "blur_paths")
 ARROW_STEP_PX = 80
 
@@ -46,7 +46,7 @@ class _Shot:
     recorded: Picture
     restored: Picture
     single: Picture
-    """Restored without its neighbours."""
+    """Restored without neighbouring frames."""
     truth: Picture
 
 
@@ -70,7 +70,7 @@ def write_pictures(folder: Path) -> None:
 
 
 def compact(png: bytes) -> bytes:
-    """The same picture with a palette."""
+    """The picture reduced to a palette."""
     from PIL import Image
 
     out = io.BytesIO()
@@ -121,7 +121,7 @@ def _before_after(shot: _Shot, side: int = 330, corner: tuple[int, int] = (600, 
 
 
 def _joint(shot: _Shot, side: int = 250, corner: tuple[int, int] = (340, 200)) -> bytes:
-    """What neighbours bring, on one part of a frame."""
+    """A detail of a frame restored without and with its neighbours."""
     (x, y), names = corner, ("as recorded", "this frame alone", "with its neighbours", "truth")
     pictures = (shot.recorded, shot.single, shot.restored, shot.truth)
     return strip_figure([(n, p[y : y + side, x : x + side]) for n, p in zip(names, pictures, strict=True)])

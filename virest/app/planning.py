@@ -1,4 +1,4 @@
-"""Reading a capture and planning its restoration: in the program itself, or ahead of its turn in a worker."""
+"""Read a capture and plan its restoration: in the main process, or ahead of its turn in a worker."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest import __version__
-from virest.app.finish import FinishWishes
+from virest.app.finish import FinishOptions
 from virest.app.outputs import file_facts, plain
 from virest.app.run_folder import Mode, RunFolder, check_run
-from virest.app.segments import PictureWishes
+from virest.app.segments import PictureOptions
 from virest.app.worker_processes import prepare_worker
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
@@ -41,28 +41,28 @@ from virest.restoration.undistortion import require_undistortable
 log = logging.getLogger(__name__)
 
 MOST_STALLS = 6
-"""Stalls whose frames are told, the first ones: the cost does not grow with the movie."""
+"""Maximum number of stalls that are corrected, the first ones: a bound on the cost for long movies."""
 SHOWN_CHARACTERS = 200
-"""Of a name that is longer, in messages."""
+"""Length to which messages cut longer names."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessOptions:
-    """What one ``virest process`` was asked for, beside the captures."""
+    """The options of one ``virest process``."""
 
     out: Path
     settings: RestorationSettings
     config: Path | None = None
     frames: slice = field(default_factory=lambda: slice(None))
-    """Of the movie's frame indices."""
+    """Selection by movie frame index."""
     jobs: int = 1
     scheduler: str | None = None
     mode: Mode = "new"
     command: str = ""
-    pictures: PictureWishes = PictureWishes()  # noqa: RUF009  (frozen)
-    finish: FinishWishes = FinishWishes()  # noqa: RUF009  (frozen)
+    pictures: PictureOptions = PictureOptions()  # noqa: RUF009  (frozen)
+    finish: FinishOptions = FinishOptions()  # noqa: RUF009  (frozen)
     json_lines: bool = False
-    """Give each frame's line on standard output, in frame order, as they are done."""
+    """Print each frame's line on standard output, in frame order, as soon as it is finished."""
     quiet: bool = False
     verbose: bool = False
 
@@ -73,16 +73,16 @@ class Job:
 
     name: str
     path: str
-    """As it was given."""
+    """The path as given."""
     run: RunFolder
     capture: Capture
     profile: CameraProfile
     profile_source: str
     selected: tuple[Frame, ...]
     request: dict[str, Any]
-    """What must be equal for a run to be continued, and what run.json repeats."""
+    """What must be equal for a run to be resumed; also stored in run.json."""
     inputs: tuple[Path, ...]
-    """The files that the request tells of."""
+    """The input files that the request describes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,22 +96,22 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A capture that was read and planned, here or by a worker; as far as that went."""
+    """The outcome of reading and planning a capture, here or in a worker; incomplete after an error."""
 
     job: Job | None = None
     index: MovieIndex | None = None
-    """None where the run is finished and only to be repeated."""
+    """None if the run is already finished."""
     plan: RestorationPlan | None = None
     error: VirestError | None = None
-    """Why it went no further."""
+    """The error that stopped planning."""
     seconds: float = 0.0
-    """Wall-clock time that it took."""
+    """Wall-clock time of planning."""
     messages: tuple[Message, ...] = ()
-    """What was said meanwhile, where another process was at work."""
+    """Log messages of the worker, if planned in another process."""
 
 
 def plan_capture(path: str, name: str, options: ProcessOptions) -> Planned:
-    """Read a capture and plan its restoration. An error of ours comes back with what is known until then."""
+    """Read a capture and plan its restoration. A VirestError is returned with what is known so far."""
     began = time.perf_counter()
     planned = Planned()
     try:
@@ -130,7 +130,7 @@ def plan_capture(path: str, name: str, options: ProcessOptions) -> Planned:
 
 
 def plan_elsewhere(path: str, name: str, options: ProcessOptions) -> Planned:
-    """The same in a worker; what it says is kept, for the capture's turn."""
+    """The same in a worker; log messages are collected for the capture's turn."""
     prepare_worker()
     with _Keeper(logging.DEBUG if options.verbose else logging.INFO) as messages:
         planned = plan_capture(path, name, options)
@@ -138,10 +138,10 @@ def plan_elsewhere(path: str, name: str, options: ProcessOptions) -> Planned:
 
 
 class _Keeper(logging.Handler):
-    """Keeps what one thread logs; a cluster's worker may have others at work in the same process."""
+    """Collects the log messages of one thread; a cluster's worker may run others in the same process."""
 
     at_work = 0
-    """How many keepers there are; the first lowers the logger's level, the last puts it back."""
+    """Number of active collectors; the first lowers the logger's level, the last restores it."""
     level_before = logging.NOTSET
     gate = threading.Lock()
 
@@ -151,7 +151,7 @@ class _Keeper(logging.Handler):
         self.kept: list[Message] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a line."""
+        """Collect a message."""
         if record.thread == self.thread:
             self.kept.append(Message(record.name, record.levelno, record.getMessage()))
 
@@ -175,25 +175,25 @@ class _Keeper(logging.Handler):
 
 
 def say(messages: Sequence[Message]) -> None:
-    """Log here what was kept elsewhere."""
+    """Log messages that were collected in a worker."""
     for message in messages:
         logging.getLogger(message.logger).log(message.level, "%s", message.text)
 
 
 def require_startable(path: str, name: str, options: ProcessOptions) -> None:
-    """Raise what can be told before any reading: no capture, or a run in its place."""
+    """Raise errors that are known before reading: no capture, or an existing run in its output folder."""
     _require_capture(path)
     if options.mode == "new":
         check_run(RunFolder(options.out / name), {}, "new")
 
 
 def shown(name: str) -> str:
-    """A name as messages have it: not of any length."""
+    """A name for messages, cut to SHOWN_CHARACTERS."""
     return name if len(name) <= SHOWN_CHARACTERS else f"{name[:SHOWN_CHARACTERS]}…"
 
 
 def _require_capture(path: str) -> None:
-    """Raise CaptureError where the path names no folder."""
+    """Raise CaptureError if the path is not a folder."""
     place = locate(path)
     try:
         if place.is_dir():
@@ -206,7 +206,7 @@ def _require_capture(path: str) -> None:
 
 
 def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> Job:
-    """Read the capture and the profile, select frames, and note down the request."""
+    """Read the capture and the profile, select frames, and record the request."""
     capture = read_capture(locate(path))
     for note in capture.notes:
         log.log(logging.INFO if note.severity == "info" else logging.WARNING, "%s: %s", name, note.text)
@@ -220,14 +220,14 @@ def _read_job(path: str, name: str, run: RunFolder, options: ProcessOptions) -> 
 
 
 def _selected(capture: Capture, profile: CameraProfile, options: ProcessOptions) -> tuple[Frame, ...]:
-    """The frames that were asked for, at the times that a profile gives them."""
+    """The selected frames, at their times by the profile."""
     frames = at_true_times(capture.frames, profile, capture.repeats)
     chosen = sorted(range(len(frames))[options.frames])
     return tuple(_admit(frames[i], keep_start_up=options.settings.keep_start_up) for i in chosen)
 
 
 def _admit(frame: Frame, *, keep_start_up: bool) -> Frame:
-    """The frame, without its reason to be left out where that is only the recorder's start-up and it is to be kept."""
+    """The frame, without its skip reason if that is only the recorder's start-up and start-up frames are kept."""
     if keep_start_up and frame.only_startup:
         return dataclasses.replace(frame, skip_reason=None, skip_codes=())
     return frame
@@ -246,14 +246,14 @@ def _request(
         "profile_sha256": hashlib.sha256(mapping.encode()).hexdigest(),
         "inputs": [file_facts(file) for file in inputs],
     }
-    wishes = {**dataclasses.asdict(options.pictures), **dataclasses.asdict(options.finish)}
-    if options.pictures != PictureWishes() or options.finish != FinishWishes():
-        request["outputs"] = wishes
+    outputs = {**dataclasses.asdict(options.pictures), **dataclasses.asdict(options.finish)}
+    if options.pictures != PictureOptions() or options.finish != FinishOptions():
+        request["outputs"] = outputs
     return plain(request)
 
 
 def _input_files(capture: Capture, config: Path | None) -> Iterator[Path]:
-    """Movie or list of pictures, logs, and the profile: the capture's own, or the one given by --config."""
+    """Movie or list of images, logs, and the profile: the capture's own, or the one given by --config."""
     yield from (file for file in capture.inputs if file.is_file())
     own = capture.folder / PROFILE_NAME
     if config is not None:
@@ -263,7 +263,7 @@ def _input_files(capture: Capture, config: Path | None) -> Iterator[Path]:
 
 
 def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> RestorationPlan:
-    """Have what is unknown estimated; say what was found."""
+    """Estimate unknown profile values and log the results."""
     steps: dict[int, float] = {}
 
     def read_decodable(numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -273,10 +273,10 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
 
     plan = plan_restoration(job.capture, job.profile, settings, read_decodable, steps)
     for name, estimate in plan.profile.estimates.items():
-        told = name == "time_offset_s" and any(note.code is NoteCode.TIME_OFFSET for note in plan.said)
-        if name not in job.profile.estimates and not told:
-            said = with_deviation(name, estimate.value, estimate.std)
-            log.info("%s: %s %s (%s)", job.name, name, said, estimate.source)
+        logged = name == "time_offset_s" and any(note.code is NoteCode.TIME_OFFSET for note in plan.said)
+        if name not in job.profile.estimates and not logged:
+            text = with_deviation(name, estimate.value, estimate.std)
+            log.info("%s: %s %s (%s)", job.name, name, text, estimate.source)
     for note in plan.notes:
         log.info("%s: %s", job.name, note)
     for warning in plan.warnings:
@@ -289,25 +289,25 @@ def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> Restora
 
 
 def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) -> tuple[Job, RestorationPlan]:
-    """Frames of an encoder's stalls at the times of what they show, where points tell; else they stay left out.
+    """Give frames of encoder stalls the times of their content, if tracked points determine them; else they stay out.
 
-    Their translations were worked out for the times of their stamps, and go.
+    Their translations were computed for the logged times, and are dropped.
     """
     capture, found = job.capture, []
     if plan.copy_reason is not None:
         return job, plan
     for stall in capture.stalls[:MOST_STALLS]:
         pictures = read_gray(capture.movie, index, stall_window(capture, stall))
-        told = fit_stall(capture, plan.profile, stall, {n: p for n, p in pictures if p is not None})
-        if told is None:
-            log.info("%s: points do not tell when frames %d-%d were taken", job.name, *stall)
+        fit = fit_stall(capture, plan.profile, stall, {n: p for n, p in pictures if p is not None})
+        if fit is None:
+            log.info("%s: the true times of frames %d-%d could not be determined from points", job.name, *stall)
             continue
-        found.append(told)
-        late_s = capture.frames[told.shows[0]].time_s - capture.frames[told.first].time_s
+        found.append(fit)
+        late_s = capture.frames[fit.shows[0]].time_s - capture.frames[fit.first].time_s
         text = (
-            f"the encoder's stall is followed: frames {told.first} to {told.last}, up to {1e3 * late_s:.0f} ms later "
-            f"than stamped, are taken at their true times (by points within {1e3 * told.rest_s[0]:+.1f} "
-            f"± {1e3 * told.rest_s[1]:.1f} ms)"
+            f"encoder stall corrected: frames {fit.first} to {fit.last}, up to {1e3 * late_s:.0f} ms later than "
+            f"stamped, are used at their true times (remaining error by points {1e3 * fit.rest_s[0]:+.1f} "
+            f"± {1e3 * fit.rest_s[1]:.1f} ms)"
         )
         log.warning("%s: %s", job.name, text)
         plan = plan.noted(NoteCode.TRUE_TIMES, text)
@@ -321,9 +321,9 @@ def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) ->
 
 
 def _check_lens(name: str, lens: Intrinsics | None) -> None:
-    """Say where there is no distortion to be undone.  Raises SettingsError where it cannot be."""
+    """Warn if there is no distortion to remove.  Raises SettingsError if it cannot be removed."""
     if lens is not None and lens.is_distorted:
         require_undistortable(lens)
         return
     why = "the focal length is unknown" if lens is None else "the profile's lens has no distortion"
-    log.warning("%s: --undistort changes nothing: %s; virest calibrate --with distortion may find it", name, why)
+    log.warning("%s: --undistort has no effect: %s; virest calibrate --with distortion may find it", name, why)

@@ -1,7 +1,7 @@
-"""Pictures as PNG (ISO/IEC 15948): each row less the one above, deflated by ISA-L, without loss.
+"""Lossless PNG encoding (ISO/IEC 15948): "up" filter, deflated by ISA-L.
 
-A restored movie is written frame by frame, so the encoder counts: ISA-L's deflate takes a quarter of the time of
-zlib's for files of the same size.
+Every restored frame is written, so encoding time matters: ISA-L's deflate takes 1/4 of zlib's time for files of the
+same size.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEVEL = 1
-"""Of ISA-L's four; 0 gives a sixth more bytes in hardly less time."""
+"""Of ISA-L's four levels; level 0 gives files 1/6 larger in hardly less time."""
 _FILTER_UP = 2
 _COLOUR_TYPES = {1: 0, 3: 2}
-"""Channels to PNG's colour type: greyscale, truecolour."""
+"""PNG's colour type by number of channels: greyscale, truecolour."""
 MOST_PX = 2**31 - 1
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:
     """A PNG file of an RGB picture (height, width, 3) or a grey one (height, width).
 
-    Raises ValueError for other shapes, for pictures without pixels, and for other types than 8 bits.
+    Raises ValueError for other shapes, for empty pictures, and for types other than 8 bits.
     """
     channels = _channels(picture)
     height, width = picture.shape[:2]
@@ -35,7 +35,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
 
 
 def less_row_above(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """PNG's filter "up", (height, 1 + bytes): each row less the one above, modulo 256, after its filter's number."""
+    """PNG's filter "up", (height, 1 + bytes): filter number, then the row minus the one above, modulo 256."""
     filtered = np.empty((len(rows), rows.shape[1] + 1), np.uint8)
     filtered[:, 0] = _FILTER_UP
     filtered[0, 1:] = rows[0]
@@ -47,13 +47,11 @@ def _channels(picture: NDArray[np.uint8]) -> int:
     channels = 1 if picture.ndim == 2 else picture.shape[-1]
     right = picture.dtype == np.uint8 and picture.ndim in (2, 3) and channels in _COLOUR_TYPES
     if not right or not picture.size or max(picture.shape) > MOST_PX:
-        raise ValueError(
-            f"{picture.dtype} {picture.shape}: no picture of 8 bits, (height, width) or (height, width, 3)"
-        )
+        raise ValueError(f"{picture.dtype} {picture.shape}: not an 8-bit picture (height, width) or (height, width, 3)")
     return channels
 
 
 def _chunk(kind: bytes, data: bytes) -> tuple[bytes, ...]:
-    """Length, kind, data and checksum, in the parts that make a chunk."""
+    """The parts of a chunk: length, type, data, checksum."""
     checksum = isal_zlib.crc32(data, isal_zlib.crc32(kind))
     return struct.pack(">I", len(data)), kind, data, struct.pack(">I", checksum)

@@ -26,7 +26,7 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class PreviewOptions:
-    """What one ``virest preview`` was asked for, beside the capture."""
+    """The options of one ``virest preview``."""
 
     out: Path | None = None
     config: Path | None = None
@@ -36,7 +36,7 @@ class PreviewOptions:
 
 
 def run_preview(path: str, options: PreviewOptions) -> tuple[Json, str]:
-    """Restore one frame and write the picture; the mapping for ``--json`` and the text for people."""
+    """Restore one frame and write the picture; returns the mapping for ``--json`` and the printed text."""
     capture = api.open(path, options.config)
     out = options.out or Path(f"{capture.name}-preview.png")
     if out.exists() and not options.overwrite:
@@ -47,7 +47,7 @@ def run_preview(path: str, options: PreviewOptions) -> tuple[Json, str]:
     if restored.picture is None or found is None:
         raise CaptureError(
             f"{capture.name}: frame {number} is {restored.status}: {'; '.join(restored.warnings)}",
-            hint="choose another by --frame",
+            hint="choose another with --frame",
         )
     title = f"{capture.name}, frame {number}"
     write_whole(out, preview_figure(capture.read_frame(number), restored.picture, found.blur.tiles, title))
@@ -59,12 +59,12 @@ def most_blurred(capture: api.Capture) -> int:
     """The usable frame whose exposure × turn rate is largest, by the gyroscope alone."""
     usable = [frame for frame in capture.frames if frame.skip_reason is None]
     if not usable:
-        raise CaptureError(f"{capture.name}: no frame can be used", hint="virest inspect says why")
+        raise CaptureError(f"{capture.name}: no frame can be used", hint="virest inspect shows why")
     return max(usable, key=lambda frame: _turned_rad(capture, frame)).index
 
 
 def _turned_rad(capture: api.Capture, frame: Frame) -> float:
-    """Angle that the camera turns while the frame is exposed and read; across its own axis counts, roll does not."""
+    """Rotation during the frame's exposure and readout, in rad; pitch and yaw count, roll does not."""
     profile = capture.profile
     readout_s = profile.shutter.readout_time_s if profile.readout_known else 0.0
     exposure_s = (frame.exposure_s or 0.0) * profile.shutter.exposure_scale

@@ -1,4 +1,4 @@
-"""``virest process``: read captures, have their frames restored, and write down what came out."""
+"""``virest process``: read captures, restore their frames, and write the results."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ class CaptureSlot:
     """One of the captures of a call."""
 
     path: str
-    """As it was given."""
+    """The path as given."""
     name: str
     number: int = 0
     among: int = 1
-    """How many captures there are."""
+    """Number of captures."""
     ahead: PrefetchedCalls[Planned] | None = None
-    """The workers that plan; None: it is done here."""
+    """Plans prefetched by the workers; None: planned here."""
 
     def begin_next(self) -> None:
-        """Give the captures that follow to the workers, behind what they still have of this one."""
+        """Submit the next captures to the workers, queued behind the rest of this one."""
         if self.ahead:
             self.ahead.begin(self.number + 1)
 
@@ -74,10 +74,10 @@ class CaptureSlot:
 
 
 def process_captures(paths: list[str], options: ProcessOptions, shard: tuple[int, int] = (1, 1)) -> int:
-    """Process captures one after the other. Returns the exit code: a capture's own, or 9 where some of many failed.
+    """Process captures one by one. Returns the exit code: the capture's own for one, 9 if some of several failed.
 
-    With several workers the captures are read and planned by them, some ahead of their turn.  shard: only the i-th of N
-    parts of the captures, (i, N); their names are those in the whole batch.
+    Several workers also read and plan the captures, some ahead of their turn.  shard: (i, N), only the i-th of N parts
+    of the captures; names are those in the whole batch.
     """
     paths, names = shard_of(paths, shard)
     _require_out(options.out)
@@ -88,18 +88,18 @@ def process_captures(paths: list[str], options: ProcessOptions, shard: tuple[int
     workers = Workers(options.jobs, options.scheduler, verbose=options.verbose)
     try:
         if options.scheduler is not None:
-            workers.start()  # before any reading, so that a wrong address costs nothing
+            workers.start()  # before any reading, so that a wrong address fails at once
         ahead = _planned_ahead(paths, names, options, workers)
         for number, (path, name) in enumerate(zip(paths, names, strict=True)):
             try:
-                turn = CaptureSlot(path, name, number, len(paths), ahead)
-                outcomes.append(_process(turn, options, workers))
+                slot = CaptureSlot(path, name, number, len(paths), ahead)
+                outcomes.append(_process(slot, options, workers))
                 codes.append(outcomes[-1].exit_code)
             except (BrokenPipeError, SettingsError, MemoryError) as error:
                 if isinstance(error, BrokenPipeError) or len(paths) == 1:
                     raise
                 codes.append(console.report_error(error, shown(name)))
-            except Exception as error:  # a failed capture is a normal, explained outcome of a batch
+            except Exception as error:  # a failed capture must not stop the batch; run.json explains it
                 if is_lost(error):
                     raise
                 codes.append(console.report_error(error, shown(name)))
@@ -127,51 +127,51 @@ def _require_out(out: Path) -> None:
 
 
 def process_capture(path: str, name: str, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
-    """Process one capture into OUT/<name>. One that cannot be processed leaves its account there all the same."""
+    """Process one capture into OUT/<name>; a failure is recorded in run.json there."""
     return _process(CaptureSlot(path, name), options, workers)
 
 
-def _process(turn: CaptureSlot, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
-    """Process the capture whose turn it is, and account for it if that cannot be."""
+def _process(slot: CaptureSlot, options: ProcessOptions, workers: Workers) -> CaptureOutcome:
+    """Process the current capture; record the failure if it cannot be processed."""
     began = time.perf_counter()
     planned = Planned()
     try:
-        require_startable(turn.path, turn.name, options)
-        with console.progress_bar(None, f"{shown(turn.name)}: reading and planning", quiet=options.quiet):
-            planned = turn.plan(options)
-        seconds = planned.seconds if turn.ahead else time.perf_counter() - began
+        require_startable(slot.path, slot.name, options)
+        with console.progress_bar(None, f"{shown(slot.name)}: reading and planning", quiet=options.quiet):
+            planned = slot.plan(options)
+        seconds = planned.seconds if slot.ahead else time.perf_counter() - began
         say(planned.messages)
         if planned.error is not None:
-            if turn.ahead and isinstance(planned.error, CaptureError):
-                workers.start(locate(turn.path))  # a worker that does not see the capture is another error
+            if slot.ahead and isinstance(planned.error, CaptureError):
+                workers.start(locate(slot.path))  # a worker that cannot read the capture is a different error
             raise planned.error
-        return _process_planned(turn, planned, options, workers, seconds)
+        return _process_planned(slot, planned, options, workers, seconds)
     except Exception as error:
         if not (isinstance(error, OutputError | BrokenPipeError) or is_lost(error)):
-            lost_s = time.perf_counter() - began + (planned.seconds if turn.ahead else 0.0)
-            _leave_account(turn, options, planned, error, lost_s)
+            lost_s = time.perf_counter() - began + (planned.seconds if slot.ahead else 0.0)
+            _record_failure(slot, options, planned, error, lost_s)
         raise
 
 
 def _process_planned(
-    turn: CaptureSlot, planned: Planned, options: ProcessOptions, workers: Workers, seconds: float
+    slot: CaptureSlot, planned: Planned, options: ProcessOptions, workers: Workers, seconds: float
 ) -> CaptureOutcome:
-    """Have a planned capture's segments done; ``seconds`` went into its plan."""
+    """Run a planned capture's segments; planning took ``seconds``."""
     began = time.perf_counter() - seconds
     assert planned.job is not None
-    run = RunFolder(options.out / turn.name)
-    job = dataclasses.replace(planned.job, run=run, path=turn.path)
+    run = RunFolder(options.out / slot.name)
+    job = dataclasses.replace(planned.job, run=run, path=slot.path)
     found = check_run(run, job.request, options.mode)
     if planned.index is None or planned.plan is None or (found == "finished" and options.mode == "resume"):
         with opened_run(run, job.request, "resume"):
             return _repeat_finished(job, options)
-    require_finishable(options.finish, turn.name, run.path, overwrite=options.mode != "new")
+    require_finishable(options.finish, slot.name, run.path, overwrite=options.mode != "new")
     with opened_run(run, job.request, options.mode):
         try:
             if options.pictures.masks:
                 run.masks.mkdir(exist_ok=True)
             workers.start(job.capture.movie, run.path)
-            return _run(job, planned.index, planned.plan, options, workers, began, turn.begin_next)
+            return _run(job, planned.index, planned.plan, options, workers, began, slot.begin_next)
         except BaseException:
             workers.kill()
             raise
@@ -183,9 +183,9 @@ def _process_planned(
 def _planned_ahead(
     paths: list[str], names: list[str], options: ProcessOptions, workers: Workers
 ) -> PrefetchedCalls[Planned] | None:
-    """The captures' plans, made by the workers; None where they are better made here, each at its turn.
+    """The captures' plans, computed by the workers; None if planning here, in turn, is better.
 
-    A cluster's workers need not see the file of --config.
+    A cluster's workers may not be able to read the file of --config.
     """
     if len(paths) == 1 or workers.here or (options.scheduler is not None and options.config is not None):
         return None
@@ -193,10 +193,10 @@ def _planned_ahead(
         return PrefetchedCalls(
             plan_elsewhere, [(path, name, options) for path, name in zip(paths, names, strict=True)], workers
         )
-    apart = dataclasses.replace(options, out=options.out.absolute())  # a worker may stand in another folder
-    places = [str(locate(path).absolute()) for path in paths]
+    apart = dataclasses.replace(options, out=options.out.absolute())  # a worker's current folder may differ
+    absolute = [str(locate(path).absolute()) for path in paths]
     return PrefetchedCalls(
-        plan_elsewhere, [(place, name, apart) for place, name in zip(places, names, strict=True)], workers
+        plan_elsewhere, [(path, name, apart) for path, name in zip(absolute, names, strict=True)], workers
     )
 
 
@@ -209,14 +209,14 @@ def _run(
     began: float,
     given_out: Callable[[], None],
 ) -> CaptureOutcome:
-    """Run the segments that are not done yet, then finish the run's folder; tells when all are given out."""
+    """Run the remaining segments, then finish the run's folder; ``given_out`` is called when all are submitted."""
     parts = cut_frames(job.selected, job.capture.keyframes or index.keyframes)
     numbers = [tuple(frame.index for frame in part) for part in parts]
     restoring = time.perf_counter()
     done = finished_segments(job.run, numbers)
     _clean(job.run, [frame for n in done for frame in n])
     if done:
-        log.info("%s: %d of %d segments were done before", job.name, len(done), len(parts))
+        log.info("%s: %d of %d segments are already done", job.name, len(done), len(parts))
     todo = (
         make_segment(part, job.capture, job.name, index, plan, job.run, options.pictures)
         for part, n in zip(parts, numbers, strict=True)
@@ -284,7 +284,7 @@ def _work(
 def _in_order(
     run: RunFolder, numbers: list[tuple[int, ...]], done: set[tuple[int, ...]]
 ) -> Callable[[tuple[int, ...] | None], None]:
-    """A function to be told of finished segments, that gives out their lines as soon as all before are given."""
+    """A callback for finished segments that prints their lines as soon as all earlier ones are printed."""
     waiting = list(reversed(numbers))
     finished = set(done)
 
@@ -299,24 +299,24 @@ def _in_order(
     return give
 
 
-def _leave_account(
-    turn: CaptureSlot, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float
+def _record_failure(
+    slot: CaptureSlot, options: ProcessOptions, planned: Planned, error: Exception, wall_s: float
 ) -> None:
-    """Write down why a capture could not be processed, where no run stands in its folder.
+    """Record in run.json why a capture could not be processed, unless its folder holds a run.
 
     A single mistyped path writes no run.json.
     """
     try:
-        if turn.among == 1 and not locate(turn.path).is_dir():
+        if slot.among == 1 and not locate(slot.path).is_dir():
             return
-        account = failure_account(turn.path, turn.name, options, planned.job, error, wall_s)
-        write_failure(RunFolder(options.out / turn.name), account)
+        account = failure_account(slot.path, slot.name, options, planned.job, error, wall_s)
+        write_failure(RunFolder(options.out / slot.name), account)
     except (VirestError, OSError, ValueError) as fault:
-        log.warning("%s: this failure leaves no account: %s", shown(turn.name), shown(str(fault)))
+        log.warning("%s: this failure could not be recorded in run.json: %s", shown(slot.name), shown(str(fault)))
 
 
 def _warn_about(name: str, counts: dict[str, int], selected: int, copy_reason: str | None) -> None:
-    """What a user must know of the frames, unless planning said it (``copy_reason``)."""
+    """Warn about frames that were not restored, unless planning has explained it (``copy_reason``)."""
     if not selected:
         log.warning("%s: --frames selects no frame of this movie", name)
     elif counts["failed"]:
@@ -333,8 +333,8 @@ def _warn_about(name: str, counts: dict[str, int], selected: int, copy_reason: s
 
 
 def _repeat_finished(job: Job, options: ProcessOptions) -> CaptureOutcome:
-    """The outcome of a run that was finished before."""
-    log.info("%s: was finished before; nothing to do", job.name)
+    """The outcome of a run that is already finished."""
+    log.info("%s: already finished; nothing to do", job.name)
     account = json.loads(job.run.run_json.read_bytes())
     if options.json_lines:
         _emit_lines(job.run)
@@ -342,11 +342,11 @@ def _repeat_finished(job: Job, options: ProcessOptions) -> CaptureOutcome:
 
 
 def _advice(plan: RestorationPlan) -> str:
-    """The command that would make more of a capture whose profile is unknown, or contradicted by the frames."""
+    """The command that would improve the result, if the profile is incomplete or contradicted by the frames."""
     if plan.refuses(NoteCode.NOT_FOLLOWING):
         return "record again with electronic stabilisation off; virest inspect CAPTURE lists what this recording holds"
     if plan.contradicted is not None:
-        return "the frames contradict the profile: virest diagnose CAPTURE, then process with --config extended.yaml"
+        return "the frames contradict the profile: run virest diagnose CAPTURE, then process --config extended.yaml"
     unknown = [
         name
         for name, known in (
@@ -358,7 +358,7 @@ def _advice(plan: RestorationPlan) -> str:
     ]
     if unknown:
         names = " and ".join(unknown)
-        return f"{names} unknown: virest calibrate CAPTURE --with focal, then process with --config camera.yaml"
+        return f"{names} unknown: run virest calibrate CAPTURE --with focal, then process --config camera.yaml"
     return ""
 
 

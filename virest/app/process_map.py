@@ -1,6 +1,6 @@
-"""Independent pieces of one command's work, side by side in processes: `process` has segments, these have calls.
+"""Run independent calls of one command in parallel processes (`process` uses segments instead).
 
-Results come in the order of the calls, so that nothing depends on the number of processes.
+Results are in the order of the calls, so they do not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def process_map(jobs: int) -> Iterator[ParallelMap]:
-    """Calls distributed over ``jobs`` processes, which start when they are first needed; one: this process."""
+    """Map calls over ``jobs`` processes, started on first use; one job runs in this process."""
     shared = _SharedOut(jobs)
     try:
         yield shared if jobs > 1 else one_by_one
     except BaseException:
-        shared.kill()  # Ctrl-C waits for nobody
+        shared.kill()  # Ctrl-C does not wait for workers
         raise
     finally:
         shared.close()
@@ -44,19 +44,19 @@ class _SharedOut:
         arguments: Iterable[tuple[Any, ...]],
         done: Callable[[int], None] | None = None,
     ) -> list[Any]:
-        """As `Each` says; what a dying worker leaves undone is done here."""
+        """See `ParallelMap`; calls lost with a dying worker are repeated here."""
         calls = list(arguments)
         if len(calls) < 2 or self.jobs == 1:
             return one_by_one(function, calls, done)
         try:
             futures = [self._submit(function, parts) for parts in calls]
-            return [_told(future, place, done) for place, future in enumerate(futures)]
+            return [_result_of(future, place, done) for place, future in enumerate(futures)]
         except BrokenExecutor:
             self._give_up()
             return one_by_one(function, calls, done)
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        """As `Background` says."""
+        """See `Background`."""
         here = partial(function, *arguments)
         if self.jobs == 1:
             return here
@@ -76,9 +76,9 @@ class _SharedOut:
         return result
 
     def _give_up(self) -> None:
-        """From here on this process does the work of the others, one of which has died."""
+        """Run all further calls in this process, after a worker has died."""
         if self.jobs > 1:
-            log.warning("a worker process died; its work is done again in this one")
+            log.warning("a worker process died; its work is repeated in the main process")
         self.close()
         self.jobs, self._pool = 1, None
 
@@ -88,18 +88,18 @@ class _SharedOut:
         return submit_uninterrupted(self._pool, function, *parts)
 
     def close(self) -> None:
-        """Let the processes go; what they have not begun is not wanted any more."""
+        """Shut the processes down; calls not yet started are cancelled."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
     def kill(self) -> None:
-        """End the processes in the middle of what they do."""
+        """Kill the processes without waiting for their calls."""
         if self._pool is not None:
             for process in list((self._pool._processes or {}).values()):
                 process.kill()
 
 
-def _told(future: Future[Any], place: int, done: Callable[[int], None] | None) -> Any:
+def _result_of(future: Future[Any], place: int, done: Callable[[int], None] | None) -> Any:
     result = future.result()
     if done is not None:
         done(place)

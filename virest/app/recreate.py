@@ -1,4 +1,4 @@
-"""``virest simulate OUT --like CAPTURE``: a measured capture taken once more by the simulator, with known truth."""
+"""``virest simulate OUT --like CAPTURE``: re-create a measured capture in the simulator, with known ground truth."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ log = logging.getLogger(__name__)
 Picture = NDArray[np.uint8]
 Json = dict[str, Any]
 NEAREST_PART = 0.25
-"""The scene is the calmest of this part of the frames: those that look most nearly where all look on average."""
+"""The scene is the frame with the least motion among this fraction of frames, those nearest the mean view."""
 MAX_TRIES = 5
 MOST_PICTURES = 64
-"""Looked at for the bits of a pixel, where a capture is a list of pictures."""
+"""Number of image files that are measured for the bits per pixel of a capture without a movie."""
 BITS_PER_PX = (0.03, 2.0)
-"""The recording's own rate of bits is taken over, within this."""
+"""The recording's own bit rate is used, within these limits."""
 
 
 def simulate_like(
@@ -53,12 +53,12 @@ def simulate_like(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Json:
-    """Write a capture with the stamps, exposures, inertial samples, size and profile of another; returns a summary.
+    """Write a capture with the timestamps, exposures, inertial samples, size and profile of another; returns a summary.
 
-    The scene is one of its frames, restored.  effects: hidden from everything but ``truth/``, as in any simulation.
+    The scene is one of its frames, restored.  effects: stated only in ``truth/``, as in any simulation.
     """
     if Path(out).resolve() == Path(like).resolve():
-        raise OutputError(f"{out}: is the capture that is to be re-created", hint="name another folder")
+        raise OutputError(f"{out}: is the capture to re-create", hint="name another folder")
     capture = read_capture(like)
     given, source = resolve_profile(capture, config)
     log.info("%s: camera profile from %s", capture.name, source)
@@ -92,10 +92,10 @@ def simulate_like(
 
 
 def count_frames(like: Path, frames: slice | None = None) -> int:
-    """How many frames a re-creation is about to render, for the progress bar; 0 where the capture cannot be read."""
+    """Number of frames to render, for the progress bar; 0 if the capture cannot be read."""
     try:
         capture = read_capture(like, look_at_pictures=False)
-    except VirestError:  # said by whoever renders
+    except VirestError:  # reported when rendering starts
         return 0
     return len(known_frames(capture.frames[frames or slice(None)]))
 
@@ -103,7 +103,7 @@ def count_frames(like: Path, frames: slice | None = None) -> int:
 def scene_plan(
     capture: Capture, profile: CameraProfile, settings: RestorationSettings = PRESETS["balanced"]
 ) -> RestorationPlan:
-    """What a restoration of this capture needs, unknown values filled in. Raises SettingsError without focal length."""
+    """The capture's restoration plan, unknown values estimated. Raises SettingsError without a focal length."""
     index = probe_movie(capture.movie)
 
     def read_decodable(numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
@@ -120,16 +120,16 @@ def scene_plan(
 
 
 def find_scene(capture: Capture, plan: RestorationPlan, frames: Sequence[Frame]) -> ScenePicture:
-    """Restore the frame that the scene is made of: near the middle of all views, and calm."""
+    """Restore the frame that becomes the scene: near the mean view, with little motion."""
     for number in _scene_order(capture, plan.profile, frames)[:MAX_TRIES]:
         scene = restored_scene(capture, plan, number)
         if scene is not None:
             return scene
-    raise CaptureError(f"{capture.name}: no frame can be restored as the scene", hint="see `virest process`")
+    raise CaptureError(f"{capture.name}: no frame can be restored as the scene", hint="virest process shows why")
 
 
 def restored_scene(capture: Capture, plan: RestorationPlan, number: int) -> ScenePicture | None:
-    """One restored frame, or its decoded picture where restoring is refused; None: it cannot be had."""
+    """One restored frame, or the decoded frame if it is copied; None if it is not available."""
     frames = at_true_times(capture.frames, plan.profile, capture.repeats)
     frame = dataclasses.replace(frames[number], skip_reason=None, skip_codes=())
     _, picture = next(read_frames(capture.movie, probe_movie(capture.movie), number, number), (number, None))
@@ -140,7 +140,7 @@ def restored_scene(capture: Capture, plan: RestorationPlan, number: int) -> Scen
 
 
 def blur_px(session: Session) -> float:
-    """Median over the frames of the picture's motion at its centre during one exposure, in pixels."""
+    """Median over the frames of the image motion at the centre during one exposure, in pixels."""
     lens = session.true.intrinsics
     assert lens is not None
     captures = session.shows.tolist()
@@ -155,18 +155,18 @@ def blur_px(session: Session) -> float:
 
 def _kept(capture: Capture, frames: slice | None) -> tuple[Frame, ...]:
     if frames is not None and frames.step not in (None, 1):
-        raise SettingsError("a re-creation takes frames that follow each other", hint="write --frames A:B")
+        raise SettingsError("--like needs consecutive frames", hint="write --frames A:B")
     chosen = capture.frames[frames or slice(None)]
     kept = known_frames(chosen)
     if len(kept) < len(chosen):
-        log.warning("%s: %d frames without time or motion left out", capture.name, len(chosen) - len(kept))
+        log.warning("%s: skipped %d frames without time or motion", capture.name, len(chosen) - len(kept))
     if not kept:
         raise CaptureError(f"{capture.name}: --frames selects no frame", hint=f"it has {len(capture.frames)}")
     return kept
 
 
 def _scene_order(capture: Capture, profile: CameraProfile, frames: Sequence[Frame]) -> list[int]:
-    """Movie indices, the best scene first: of the quarter nearest to the mean view the calmest."""
+    """Movie indices, best scene first: by least motion within the frames nearest the mean view."""
     trajectory = integrate_gyro(capture.imu, profile)
     usable = [frame for frame in frames if frame.skip_reason is None] or list(frames)
     time_s = np.array([float(profile.imu_time_s(frame.time_s)) for frame in usable])
@@ -185,7 +185,7 @@ def _fps(frames: Sequence[Frame]) -> float:
 
 
 def _bits_per_px(capture: Capture) -> float:
-    """Bits of a pixel in the movie, or in the files of listed pictures: the mean of some, evenly over the list."""
+    """Bits per pixel of the movie, or of listed image files: the mean of evenly spaced ones."""
     if is_picture_source(capture.movie):
         found = read_picture_list(capture.movie)
         files = [found.base / name for name in found.names[:: -(-len(found.names) // MOST_PICTURES)]]

@@ -1,8 +1,7 @@
-"""``virest report RUN_DIR``: runs and diagnoses, with pictures before and after, as one page that needs no network.
+"""``virest report RUN_DIR``: runs and diagnoses with frames before and after, as one self-contained page.
 
-RUN_DIR is the folder of one capture (run.json, diagnosis.json, or both), or one that holds several such folders.
-The pictures before are decoded from the capture's movie, which is looked for where the run found it and is taken only
-if it is that very movie, by size and sha256.
+RUN_DIR is the folder of one capture (run.json, diagnosis.json, or both), or a folder of several of them.  Recorded
+frames are decoded from the capture's movie at its path in run.json, if its size and sha256 match.
 """
 
 from __future__ import annotations
@@ -57,14 +56,14 @@ log = logging.getLogger(__name__)
 REPORT = "report.html"
 RUN, DIAGNOSIS, EXTENDED, FIGURES = "run.json", "diagnosis.json", "extended.yaml", "figures"
 FIGURE = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.png")
-"""What `diagnose` calls its figures; nothing else is looked at, whatever a diagnosis.json names."""
+"""File names of `diagnose`'s figures; no other file is read, whatever diagnosis.json names."""
 FRAMES_SHOWN, MOST_FRAMES = 6, 24
-"""Of one capture, and of all captures of a page together, where no number is asked for."""
+"""Default numbers of frames shown: of one capture, and of all captures of a page together."""
 PICTURE_BYTES = 4_200_000
-"""All frames of a page together, as text; with the figures that keeps a page below some 6 MB."""
+"""All frames of a page together, base64 encoded; with the figures, a page stays below about 6 MB."""
 MAX_PROFILE_BYTES, MAX_PICTURE_BYTES = 1 << 20, 256 << 20
 PARTLY_FAILED = 9
-ONLY_AFTER = "the pictures before are not shown"
+ONLY_AFTER = "recorded frames are not shown"
 
 Json = dict[str, Any]
 Picture = NDArray[np.uint8]
@@ -72,20 +71,20 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class ReportOptions:
-    """What one ``virest report`` was asked for, beside the folder."""
+    """The options of one ``virest report``."""
 
     out: Path | None = None
-    """RUN_DIR/report.html where it is None."""
+    """None: RUN_DIR/report.html."""
     frames: int | None = None
-    """How many to show of each capture."""
+    """Number of frames to show per capture."""
     capture: Path | None = None
-    """The capture's folder, or one that holds the captures, where they are no longer where the run found them."""
+    """The capture's folder, or the folder of the captures, if moved since the run."""
     overwrite: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class ReportOutcome:
-    """What came of it."""
+    """The result."""
 
     facts: Json
     text: str
@@ -94,7 +93,7 @@ class ReportOutcome:
 
 @dataclass(frozen=True, slots=True)
 class _Movie:
-    """The movie of a run, ready to be decoded."""
+    """The movie of a run, ready for decoding."""
 
     path: Path
     index: MovieIndex
@@ -104,10 +103,10 @@ class _Movie:
 
 
 def write_report(run_dir: Path, options: ReportOptions) -> ReportOutcome:
-    """Read what stands in RUN_DIR and write the page.
+    """Read the results in RUN_DIR and write the page.
 
-    Raises CaptureError where there is nothing to report, OutputError where the page is in the way or cannot be
-    written.  Of several captures, those that cannot be read are named, left out, and lead to exit code 9.
+    Raises CaptureError if there is nothing to report, OutputError if the page exists or cannot be written.  Of several
+    captures, unreadable ones are reported and skipped, and the exit code is 9.
     """
     target = options.out or run_dir / REPORT
     _require_dir(run_dir)
@@ -141,17 +140,17 @@ def _require_dir(run_dir: Path) -> None:
 
 
 def _require_target(target: Path, overwrite: bool) -> None:
-    """Raise OutputError, before any work, for what stands in the page's place."""
+    """Raise OutputError, before any work, if the page cannot be written there."""
     if target.is_dir():
         raise OutputError(f"{target}: is a folder", hint="--out takes a file")
     if not target.parent.is_dir():
-        raise OutputError(f"{target.parent}: no such folder", hint="make it, or choose another place with --out")
+        raise OutputError(f"{target.parent}: no such folder", hint="create it, or choose another path with --out")
     if (target.exists() or target.is_symlink()) and not overwrite:
-        raise OutputError(f"{target}: exists", hint="--overwrite replaces it, --out chooses another place")
+        raise OutputError(f"{target}: exists already", hint="--overwrite replaces it, --out chooses another path")
 
 
 def find_folders(run_dir: Path) -> list[Path]:
-    """The folder itself where it holds a run or a diagnosis, else those of its folders that do."""
+    """The folder itself if it holds a run or a diagnosis, else its subfolders that do."""
     try:
         inside = sorted(path for path in run_dir.iterdir() if path.is_dir())
     except OSError as error:
@@ -164,7 +163,7 @@ def find_folders(run_dir: Path) -> list[Path]:
     if any((path / ".run").exists() for path in (run_dir, *inside)):
         raise CaptureError(f"{run_dir}: its run is not finished", hint="finish it with virest process --resume")
     raise CaptureError(
-        f"{run_dir}: neither {RUN} nor {DIAGNOSIS}, here or one folder below",
+        f"{run_dir}: holds neither {RUN} nor {DIAGNOSIS}, nor do its subfolders",
         hint="pass OUT/<capture> of a run, or OUT itself",
     )
 
@@ -174,7 +173,7 @@ def _holds_results(folder: Path) -> bool:
 
 
 def read_folder(folder: Path, options: ReportOptions, among: int) -> CaptureRecord:
-    """All that stands in the folder of one capture, its share of the page's bytes given by ``among`` how many."""
+    """The results in the folder of one capture; ``among``: number of captures that share the page's bytes."""
     run = _read_run(folder, options, among) if (folder / RUN).exists() else None
     diagnosis = _read_diagnosis(folder) if (folder / DIAGNOSIS).exists() else None
     name = str(run.account["capture"]) if run else folder.resolve().name
@@ -206,7 +205,7 @@ def _show(
     max_bytes: int,
     crop_px: tuple[int, int, int, int] | None = None,
 ) -> ShownFrame:
-    """A frame with its pictures before and after, cut alike; one that was copied has no after."""
+    """A frame with its pictures before and after, cropped alike; a copied frame has no picture after."""
     x0, y0, x1, y1 = crop_px or (0, 0, None, None)
     before = None if movie is None else _recorded(movie, facts.frame)
     before = None if before is None else before[y0:y1, x0:x1]
@@ -221,7 +220,7 @@ def _show(
 
 
 def _recorded(movie: _Movie, frame: int) -> Picture | None:
-    """A frame of the movie; None where it cannot be decoded."""
+    """A frame of the movie; None if it cannot be decoded."""
     try:
         found = read_frames(movie.path, movie.index, frame, frame)
         return next((picture for number, picture in found if number == frame), None)
@@ -231,7 +230,7 @@ def _recorded(movie: _Movie, frame: int) -> Picture | None:
 
 
 def read_picture(path: Path) -> Picture | None:
-    """An RGB picture of 8 bits; None, and a warning, where it cannot be read."""
+    """An 8-bit RGB picture; None, and a warning, if it cannot be read."""
     try:
         data = np.frombuffer(read_bytes(path, MAX_PICTURE_BYTES), np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
@@ -239,7 +238,7 @@ def read_picture(path: Path) -> Picture | None:
         log.warning("%s", str(error).strip().splitlines()[-1])
         return None
     if picture is None:
-        log.warning("%s: is not a picture", path)
+        log.warning("%s: cannot be read as a picture", path)
     return None if picture is None else np.asarray(picture, np.uint8)
 
 
@@ -247,22 +246,22 @@ def read_picture(path: Path) -> Picture | None:
 
 
 def find_movie(account: Account, folder: Path, hint: Path | None) -> tuple[_Movie | None, str]:
-    """The movie (or list or folder of pictures) from which the run was made, or None and what to say of that.
+    """The movie (or list or folder of images) of the run, or None and a note why it is missing.
 
-    A file is taken only if size and sha256 are those in run.json.
+    A file is accepted only if its size and sha256 match run.json.
     """
     names = _movie_names(account)
     if not names:
-        return None, f"The run does not say which movie it was made from; {ONLY_AFTER}."
+        return None, f"run.json names no movie; {ONLY_AFTER}."
     other = None
-    for path in dict.fromkeys(place / name for place in _places(account, folder, hint) for name in names):
+    for path in dict.fromkeys(root / name for root in _possible_folders(account, folder, hint) for name in names):
         with suppress(OSError, ValueError, VirestError):
             if path.is_dir() or any(_is_same(path, item) for item in account.inputs):
                 return _Movie(path, probe_movie(path)), ""
             other = other or (path if path.exists() else None)
     if other is not None:
-        return None, f"{other} is not the movie that the run was made from; {ONLY_AFTER}."
-    return None, f"The capture's movie was not found (--capture says where it is); {ONLY_AFTER}."
+        return None, f"{other} is not the movie of this run; {ONLY_AFTER}."
+    return None, f"The capture's movie was not found (give its folder with --capture); {ONLY_AFTER}."
 
 
 def _is_same(path: Path, known: Input) -> bool:
@@ -272,14 +271,14 @@ def _is_same(path: Path, known: Input) -> bool:
 
 
 def _movie_names(account: Account) -> list[str]:
-    """Where the movie may lie inside the capture's folder: as run.json says, else each input that is named as one."""
+    """Possible names of the movie in the capture's folder: as run.json states, else each input with a movie suffix."""
     if account.folder and account.movie:
         return [os.path.relpath(account.movie, account.folder)]
     return [item.file for item in account.inputs if Path(item.file).suffix.lower() in MOVIE_SUFFIXES]
 
 
-def _places(account: Account, folder: Path, hint: Path | None) -> Iterator[Path]:
-    """Folders in which the capture may lie, the likeliest first."""
+def _possible_folders(account: Account, folder: Path, hint: Path | None) -> Iterator[Path]:
+    """Possible folders of the capture, most likely first."""
     if hint is not None:
         yield from (hint, hint / folder.resolve().name)
         return
@@ -307,7 +306,7 @@ def _read_diagnosis(folder: Path) -> DiagnosisRecord:
 
 
 def _figures(folder: Path) -> Iterator[tuple[str, Embedded]]:
-    """The diagnosis's figures: what the causes do to pictures and residuals first, then the ladder."""
+    """The diagnosis's figures: first the effect of the causes on pictures and residuals, then the ladder."""
     order = ("residuals.png", "pictures.png")
     names = [path.name for path in _inside(folder) if FIGURE.fullmatch(path.name)]
     for name in sorted(names, key=lambda n: (order.index(n) if n in order else len(order), n)):
@@ -323,7 +322,7 @@ def _inside(folder: Path) -> Iterable[Path]:
         return ()
 
 
-# ── what the command says ────────────────────────────────────────────────────────────────────────────────────────
+# ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _facts(target: Path, size: int, records: Sequence[CaptureRecord], failures: list[Json]) -> Json:

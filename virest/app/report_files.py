@@ -1,4 +1,4 @@
-"""What run.json, parameters.jsonl and diagnosis.json have to hold for a page: files of unknown origin, checked."""
+"""Validated reading of run.json, parameters.jsonl and diagnosis.json for a page; the files are not trusted."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ class Account(_Lenient):
     verdict: str
     warnings: list[str] = Field(default_factory=list)
     failure: dict[str, Any] | None = None
-    """Of a capture that could not be processed; there are no pictures then."""
+    """Why the capture could not be processed; there are no frames then."""
 
 
 class Tile(_Lenient):
-    """The blur at one place."""
+    """The blur of one tile."""
 
     centre_px: tuple[float, float]
     angle_rad: float
@@ -147,12 +147,12 @@ class DiagnosisFile(_Lenient):
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """The content of a plain file of bounded size. Raises CaptureError."""
+    """The content of a regular file of bounded size. Raises CaptureError."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
             raise CaptureError(
-                f"{path}: is not a regular file of at most {limit >> 20} MB", hint="was it written by virest?"
+                f"{path}: is not a regular file of at most {limit >> 20} MB", hint="check that virest wrote this file"
             )
         return path.read_bytes()
     except OSError as error:
@@ -160,15 +160,15 @@ def read_bytes(path: Path, limit: int) -> bytes:
 
 
 def read_model(path: Path, model: type[Model], kind: str) -> Model:
-    """A JSON file, checked. Raises CaptureError with the first thing that is wrong."""
+    """A JSON file, validated. Raises CaptureError with the first error."""
     try:
         return model.model_validate(json.loads(read_bytes(path, MAX_ACCOUNT_BYTES)))
     except ValidationError as error:
         raise CaptureError(
-            f"{path}: {_complaint(error)}: this is no {kind}", hint="was it written by virest?"
+            f"{path}: {_complaint(error)}: not a valid {kind}", hint="check that virest wrote this file"
         ) from None
     except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path}: is no JSON ({error})", hint="run the command that wrote it again") from None
+        raise CaptureError(f"{path}: not valid JSON ({error})", hint="repeat the command that wrote it") from None
 
 
 def _complaint(error: ValidationError) -> str:
@@ -178,9 +178,9 @@ def _complaint(error: ValidationError) -> str:
 
 
 def read_frame_lines(folder: Path, expected: int) -> tuple[dict[int, FrameFacts], list[str]]:
-    """What the lines of parameters.jsonl tell, by line number, and a note where some cannot be read.
+    """The frames of parameters.jsonl by line number, and a note if some lines cannot be read.
 
-    Tiles are not kept, a long run has millions; those of the frames shown are read again.
+    Tiles are not kept, since a long run has millions; those of the frames shown are read again.
     """
     path = folder / "parameters.jsonl"
     frames: dict[int, FrameFacts] = {}
@@ -195,7 +195,7 @@ def read_frame_lines(folder: Path, expected: int) -> tuple[dict[int, FrameFacts]
     notes = []
     if bad or len(frames) != expected:
         which = f"; line {bad[0]} is the first that cannot be read" if bad else ""
-        notes.append(f"parameters.jsonl tells of {len(frames)} of {expected} frames{which}: the page shows those only.")
+        notes.append(f"parameters.jsonl describes {len(frames)} of {expected} frames{which}: only those are shown.")
         log.warning("%s: %s", folder.name, notes[0])
     return frames, notes
 

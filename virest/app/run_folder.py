@@ -1,13 +1,13 @@
-"""A run's folder: OUT/<capture>/frames/*.png, parameters.jsonl, run.json; who may write there, and how it is finished.
+"""A run's folder: OUT/<capture>/frames/*.png, parameters.jsonl, run.json; locking, resuming and finishing.
 
-A run's folder tells its own state::
+The files in a run's folder define its state::
 
-    run.json          the run is finished; or its ``failure`` says why there is none: no obstacle for a run
-    .run              it is not: the request it was started with; --resume continues it
+    run.json          the run is finished; with ``failure``, the reason why there is none (a new run may start)
+    .run              the run is unfinished: its request; --resume continues it
     .segments/        logs of the finished segments of an unfinished run
-    .lock             held (flock) by the process that works here; the system lets go of it when that dies
+    .lock             held (flock) by the process that uses the folder; released by the system when that dies
 
-Behind an address (``s3://…``) every file is put there by one request, the folders are only names, and there is no lock.
+In object storage (``s3://…``) one request writes each file, folders are only name prefixes, and there is no lock.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ except ImportError:  # Windows
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
 PART = re.compile(r".*\.[0-9a-f]{8}\.part")
 BESIDE = ("diagnosis.json", "extended.yaml", "figures", "report.html")
-"""What `diagnose` writes into the same folder: no obstacle for a run, and none of its files."""
+"""Files of `diagnose` in the same folder: they do not belong to a run and do not block one."""
 REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs", "outputs")
 
 Mode = Literal["new", "resume", "overwrite"]
@@ -48,24 +48,24 @@ Change = Callable[[dict[str, Any]], dict[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """The places of one run, below OUT/<capture>."""
+    """The paths of one run, below OUT/<capture>."""
 
     path: Path
 
     @property
     def frames(self) -> Path:
-        """Folder of the pictures."""
+        """Folder of the restored frames."""
         return self.path / "frames"
 
     @property
     def masks(self) -> Path:
-        """Folder of the masks, where they are asked for."""
+        """Folder of the masks, if requested."""
         return self.path / "masks"
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        """Folders of this run's own files, those that are there."""
-        return tuple(place for place in (self.path, self.frames, self.masks) if place.is_dir())
+        """Existing folders of this run's own files."""
+        return tuple(folder for folder in (self.path, self.frames, self.masks) if folder.is_dir())
 
     @property
     def segments(self) -> Path:
@@ -79,34 +79,34 @@ class RunFolder:
 
     @property
     def lock(self) -> Path:
-        """Held while a process works here."""
+        """Lock file, held while a process uses the folder."""
         return self.path / ".lock"
 
     @property
     def parameters(self) -> Path:
-        """One line a frame."""
+        """parameters.jsonl: one line per frame."""
         return self.path / "parameters.jsonl"
 
     @property
     def run_json(self) -> Path:
-        """The finished run's account."""
+        """run.json of the finished run."""
         return self.path / "run.json"
 
     def picture(self, frame: int) -> Path:
-        """Where a frame's picture goes."""
+        """Path of a restored frame."""
         return self.frames / f"{frame:06d}.png"
 
     def mask(self, frame: int) -> Path:
-        """Where a frame's mask goes."""
+        """Path of a frame's mask."""
         return self.masks / f"{frame:06d}.png"
 
     def segment_log(self, first: int, last: int) -> Path:
-        """Where a segment's lines go."""
+        """Path of a segment's log."""
         return self.segments / f"{first}-{last}.jsonl"
 
 
 def check_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Found:
-    """What stands in a run's folder; raises OutputError where that is in the way. Changes nothing."""
+    """State of a run's folder; raises OutputError if it blocks the run. Changes nothing."""
     found, old = find_run(run)
     if found == "nothing":
         return found
@@ -121,14 +121,14 @@ def check_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Found:
         )
     if mode == "resume" and (differences := _differences(old, request)):
         raise OutputError(
-            f"{run.path}: --resume, but this run was started with other {'; '.join(differences)}",
-            hint="repeat that command, or start anew with --overwrite",
+            f"{run.path}: --resume: this run was started with different {'; '.join(differences)}",
+            hint="repeat that command, or start over with --overwrite",
         )
     return found
 
 
 def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
-    """Whether a run stands here, and its request. Raises OutputError for a folder or file that is not one of ours."""
+    """State of the run in this folder, and its request. Raises OutputError for foreign files or folders."""
     if run.path.exists() and not run.path.is_dir():
         raise OutputError(f"{run.path}: is a file", hint="choose another folder with --out")
     if run.frames.is_symlink() or run.segments.is_symlink():
@@ -136,7 +136,7 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
     for file, found in ((run.state, "unfinished"), (run.run_json, "finished")):
         old = _read_request(file)
         if old is not None:
-            return ("nothing", {}) if _tells_of_failure(old) else (found, old)  # type: ignore[return-value]
+            return ("nothing", {}) if _records_failure(old) else (found, old)  # type: ignore[return-value]
     try:
         inside = run.path.iterdir() if run.path.is_dir() else ()
         foreign = [p.name for p in inside if p != run.lock and p.name not in BESIDE and not _is_own_part(p.name)]
@@ -144,20 +144,20 @@ def find_run(run: RunFolder) -> tuple[Found, dict[str, Any]]:
         raise output_error(run.path, error) from error
     if foreign:
         raise OutputError(
-            f"{run.path}: holds {len(foreign)} files or folders that are no run of virest ({sorted(foreign)[0]!r}, …)",
+            f"{run.path}: holds {len(foreign)} entries that do not belong to a virest run ({sorted(foreign)[0]!r}, …)",
             hint="choose another folder with --out",
         )
     return "nothing", {}
 
 
 def _is_own_part(name: str) -> bool:
-    """Whether a file is what a run that was killed in its first moment leaves."""
+    """Whether a file is a leftover of a run that was killed at its start."""
     return bool(PART.fullmatch(name) and OWN_FILES.fullmatch(name))
 
 
 def _read_request(path: Path) -> dict[str, Any] | None:
     try:
-        if not path.is_file():  # a pipe would be waited for
+        if not path.is_file():  # reading a pipe would block
             return None
         content = json.loads(path.read_bytes())
     except (FileNotFoundError, NotADirectoryError):
@@ -167,13 +167,13 @@ def _read_request(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) and "profile_sha256" in content else None
 
 
-def _tells_of_failure(account: dict[str, Any]) -> bool:
-    """Whether a run.json is that of a capture that could not be processed: there is nothing in it to be kept."""
+def _records_failure(account: dict[str, Any]) -> bool:
+    """Whether a run.json only records a failure, so that it may be replaced."""
     return isinstance(account.get("failure"), dict)
 
 
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Which parts of two requests differ, in words."""
+    """The parts in which two requests differ, in words."""
     names = []
     for key in REQUEST_KEYS:
         before, now = (_without_places(request.get(key)) for request in (old, new))
@@ -191,7 +191,7 @@ def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
 
 
 def _without_places(value: Any) -> Any:
-    """Facts of files without their folders: a capture that was moved is still the same one."""
+    """Facts of files without their folders, so that a moved capture still matches."""
     if not isinstance(value, list):
         return value
     return [{k: v for k, v in facts.items() if k != "path"} if isinstance(facts, dict) else facts for facts in value]
@@ -207,9 +207,9 @@ def _changed_files(before: Any, now: Any) -> list[str]:
 
 @contextmanager
 def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[Found]:
-    """Hold a run's folder: locked, checked, and made ready; yields what was found there.
+    """Lock a run's folder, check it and prepare it; yields the state found.
 
-    When the body fails, no half-written file stays; a run of which no segment was finished leaves nothing at all.
+    If the body fails, half-written files are removed; a run without any finished segment leaves nothing.
     """
     fresh = not run.path.exists()
     try:
@@ -225,7 +225,7 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
                     if found == "nothing":
                         _remove_failure(run)
                 else:
-                    _clear_scaffolding(run)  # a run killed in its last moment leaves some
+                    _clear_scaffolding(run)  # left by a run that was killed just before its end
                 yield found if mode == "resume" else "nothing"
             except BaseException:
                 _leave(run)
@@ -237,7 +237,7 @@ def opened_run(run: RunFolder, request: dict[str, Any], mode: Mode) -> Iterator[
 
 
 def _take(handle: int) -> None:
-    """Lock an open file for this process alone.  Raises OSError where another one holds it."""
+    """Lock an open file exclusively.  Raises OSError if another process holds the lock."""
     if fcntl is not None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     else:  # Windows
@@ -256,18 +256,18 @@ def _locked(run: RunFolder) -> Iterator[None]:
         except OSError:
             os.close(handle)
             raise OutputError(
-                f"{run.path}: another virest process works here",
-                hint="wait for it, or choose another folder with --out",
+                f"{run.path}: another virest process is using this folder",
+                hint="wait for it to finish, or choose another folder with --out",
             ) from None
         with suppress(OSError):
             if os.stat(run.lock).st_ino == os.fstat(handle).st_ino:
                 break
-        os.close(handle)  # the holder before us took the file away as it finished
+        os.close(handle)  # the previous holder removed the file when it finished
     try:
         yield
     finally:
         if fcntl is None:
-            os.close(handle)  # Windows removes no open file
+            os.close(handle)  # Windows cannot remove an open file
         with suppress(OSError):
             run.lock.unlink()
         if fcntl is not None:
@@ -275,7 +275,7 @@ def _locked(run: RunFolder) -> Iterator[None]:
 
 
 def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
-    """Bring the folder to the state from which segments can be written, whatever a killed run left."""
+    """Prepare the folder for writing segments, whatever a killed run has left."""
     try:
         if mode == "overwrite":
             _remove_segments(run)
@@ -291,14 +291,14 @@ def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
 
 
 def _remove_own(run: RunFolder) -> None:
-    """Remove what a run made, except its state, and nothing else."""
+    """Remove the files of a run, except its state, and no others."""
     for folder in run.folders:
         own = [file for file in folder.iterdir() if OWN_FILES.fullmatch(file.name) and file != run.state]
         remove_files([file for file in own if is_remote(file) or not file.is_dir()])
 
 
 def _remove_failure(run: RunFolder) -> None:
-    """Take away the account of an attempt that failed; run.json stands for what comes of this one."""
+    """Remove the run.json of a failed attempt."""
     try:
         for file in (run.run_json, run.parameters):
             if file.exists():
@@ -308,7 +308,7 @@ def _remove_failure(run: RunFolder) -> None:
 
 
 def _clear_scaffolding(run: RunFolder) -> None:
-    """Take away what only an unfinished run needs."""
+    """Remove the files that only an unfinished run needs."""
     try:
         _remove_segments(run)
         remove_parts(run)
@@ -324,7 +324,7 @@ def _remove_segments(run: RunFolder) -> None:
 
 
 def remove_parts(run: RunFolder) -> None:
-    """Remove the half-written files of writers that were killed; a store has none."""
+    """Remove half-written files of killed writers; object storage has none."""
     if is_remote(run.path):
         return
     for folder in (*run.folders, run.segments):
@@ -334,7 +334,7 @@ def remove_parts(run: RunFolder) -> None:
 
 
 def _leave(run: RunFolder) -> None:
-    """Tidy up after a failure: no parts; and where nothing was finished, nothing at all."""
+    """Clean up after a failure: remove half-written files, and everything if no segment is finished."""
     with suppress(OSError):
         remove_parts(run)
         if run.run_json.exists() or (run.segments.is_dir() and any(run.segments.iterdir())):
@@ -348,7 +348,7 @@ def _leave(run: RunFolder) -> None:
 
 
 def remove_stray_pictures(run: RunFolder, keep: Iterable[int]) -> None:
-    """Remove pictures of segments that were not finished."""
+    """Remove the frames and masks of unfinished segments."""
     kept = {run.picture(frame).name for frame in keep}
     folders = (place for place in (run.frames, run.masks) if place.is_dir())
     names = (file for place in folders for file in place.iterdir() if OWN_FILES.fullmatch(file.name))
@@ -361,12 +361,12 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def parse_lines(data: bytes) -> list[dict[str, Any]]:
-    """The records of JSON lines. Raises ValueError for what is none."""
+    """The records of JSON lines. Raises ValueError for invalid JSON."""
     return [json.loads(line) for line in data.decode("utf-8").splitlines() if line]
 
 
 def finished_segments(run: RunFolder, segments: Iterable[tuple[int, ...]]) -> set[tuple[int, ...]]:
-    """Those of the segments, each given by its frames, whose log is whole and whose pictures are there."""
+    """The segments, each given by its frames, whose log is complete and whose pictures exist."""
     try:
         logs = {file.name for file in run.segments.iterdir()}
         pictures = {f"frames/{file.name}" for file in run.frames.iterdir()} if logs else set()
@@ -380,16 +380,16 @@ def finished_segments(run: RunFolder, segments: Iterable[tuple[int, ...]]) -> se
 def _is_finished(frames: tuple[int, ...], data: bytes, pictures: set[str]) -> bool:
     try:
         lines = parse_lines(data)
-        said = [line["output"] for line in lines if line["output"]]
-        return tuple(line["frame"] for line in lines) == frames and pictures.issuperset(said)
+        outputs = [line["output"] for line in lines if line["output"]]
+        return tuple(line["frame"] for line in lines) == frames and pictures.issuperset(outputs)
     except (ValueError, KeyError, TypeError):
         return False
 
 
 def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any], change: Change | None = None) -> None:
-    """Join the segments' lines in frame order, write run.json last, and take away the scaffolding.
+    """Join the segments' lines in frame order, write run.json last, and remove the temporary files.
 
-    change: what happened to a line's pictures after the segments were done.
+    change: updates a line for changes to its picture after the segments were finished.
     """
     try:
         if change is None:
@@ -405,10 +405,10 @@ def finish_run(run: RunFolder, logs: Iterable[Path], account: dict[str, Any], ch
 
 
 def write_failure(run: RunFolder, account: dict[str, Any]) -> bool:
-    """Write the account of a capture that could not be processed; False where a run stands there, which is kept.
+    """Write run.json for a capture that could not be processed; False, without writing, if the folder holds a run.
 
-    run.json comes first and says all.  parameters.jsonl, without a line, is for those who read the lines of many runs.
-    Raises OutputError where the account cannot be written.
+    run.json is written first and is sufficient.  An empty parameters.jsonl lets tools read the lines of many runs
+    alike.  Raises OutputError if run.json cannot be written.
     """
     fresh = False
     try:
@@ -433,7 +433,7 @@ def _write_account(run: RunFolder, account: dict[str, Any]) -> None:
 
 
 def _join(path: Path, logs: Iterable[Path]) -> None:
-    """Copy the logs one after the other into one file, without holding them all; an address takes it in one piece."""
+    """Concatenate the logs into one file without loading them all; remote storage receives it in one request."""
     if is_remote(path):
         write_whole(path, b"".join(read_each(logs)))
         return

@@ -1,4 +1,4 @@
-"""Write the sample captures of ``make sample`` anew: small, upright like the phone's, with a few frames of truth."""
+"""Generate the sample captures of ``make sample``: small, upright as from a phone, with truth for a few frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from virest.app.console import emit
 from virest.app.simulate import simulate_command
 
 KEPT_TRUTH = (0, 5, 10)
-"""Frames whose truth is kept; all of them would be large."""
+"""Frames whose truth images are kept, to limit the size."""
 SAMPLES: dict[str, dict[str, Any]] = {
     "leaves": {
         "scene": "leaves",
@@ -27,7 +27,7 @@ SAMPLES: dict[str, dict[str, Any]] = {
 
 
 def write_samples(folder: Path) -> list[Path]:
-    """Write each sample capture below ``folder``, replacing the one that is there."""
+    """Write each sample capture below ``folder``, replacing an existing one."""
     written = []
     for name, options in SAMPLES.items():
         out = folder / name

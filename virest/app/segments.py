@@ -1,6 +1,6 @@
-"""A few neighbouring frames as one piece of work: how a run is cut, and what becomes of a piece.
+"""Segments: a few consecutive frames as one task; how a run is cut into segments, and how a segment is processed.
 
-The cuts depend on the movie and on the chosen frames only, never on the number of jobs; so the bytes do not either.
+The cuts depend only on the movie and the selected frames, so the output bytes do not depend on the number of jobs.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ MIN_SEGMENT_FRAMES, USUAL_SEGMENT_FRAMES, MAX_SEGMENT_FRAMES = 5, 10, 30
 IMU_MARGIN_S = 1.0
 
 EDGE_PX = 0.5
-"""A pixel reaches this far around its centre: as `valid_px` counts."""
+"""Half-width of a pixel around its centre, as for `valid_px`."""
 
 
 @dataclass(frozen=True, slots=True)
-class PictureWishes:
-    """Which pictures a run writes beside the restored frames, and which it leaves out."""
+class PictureOptions:
+    """Which pictures a run writes in addition to the restored frames, and which it omits."""
 
     masks: bool = False
-    """Where a restored frame holds recorded data."""
+    """Write masks of the recorded data in restored frames."""
     skip_copied: bool = False
-    """No picture of frames that are only copied."""
+    """Write no picture of frames that are only copied."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A few neighbouring frames and everything that a worker needs for them."""
+    """A few consecutive frames and everything that a worker needs to restore them."""
 
     capture_name: str
     movie: Path
@@ -64,19 +64,19 @@ class Segment:
     plan: RestorationPlan
     run: RunFolder
     around: tuple[Frame, ...] = ()
-    """Neighbours in the movie that are decoded for these frames' sake and not restored here."""
-    pictures: PictureWishes = PictureWishes()
+    """Neighbouring frames that are decoded for joint restoration but not restored in this segment."""
+    pictures: PictureOptions = PictureOptions()
 
     @property
     def log_path(self) -> Path:
-        """Where the lines of this segment go."""
+        """Path of this segment's log."""
         return self.run.segment_log(self.frames[0].index, self.frames[-1].index)
 
 
 def cut_frames(frames: Sequence[Frame], keyframes: Iterable[int]) -> list[tuple[Frame, ...]]:
-    """Cut frames into runs of about ten, at frames that the decoder can start from where there are some.
+    """Cut frames into runs of about ten, at key frames if possible.
 
-    Far from a key frame runs are longer, since a worker decodes everything from the key frame on.
+    Far from a key frame runs are longer, since a worker must decode everything from the key frame on.
     """
     starts = np.array(sorted({0, *keyframes}))
     parts: list[list[Frame]] = []
@@ -91,9 +91,9 @@ def cut_frames(frames: Sequence[Frame], keyframes: Iterable[int]) -> list[tuple[
 
 
 def cut_imu(imu: ImuSamples, frames: Sequence[Frame], plan: RestorationPlan) -> ImuSamples:
-    """The samples that cover these frames' exposures, with a second to spare on both sides.
+    """The samples that cover these frames' exposures, with a margin of 1 s on both sides.
 
-    A stabiliser's place depends on the motion before; its samples begin early enough for the cut not to matter.
+    The state of a stabiliser depends on earlier motion; its samples start early enough for the cut not to matter.
     """
     profile = plan.profile
     rate, offset_s = 1.0 + profile.clock_skew, profile.time_offset_s or 0.0
@@ -110,10 +110,10 @@ def make_segment(
     index: MovieIndex,
     plan: RestorationPlan,
     run: RunFolder,
-    pictures: PictureWishes = PictureWishes(),
+    pictures: PictureOptions = PictureOptions(),
 ) -> Segment:
-    """One segment as a worker takes it."""
-    place, movie = RunFolder(run.path.absolute()), capture.movie.absolute()  # a worker may stand in another folder
+    """One segment, ready for a worker."""
+    place, movie = RunFolder(run.path.absolute()), capture.movie.absolute()  # a worker's current folder may differ
     around = _around(frames, capture, plan)
     every = sorted((*frames, *around), key=lambda frame: frame.index)
     imu = cut_imu(capture.imu, every, plan)
@@ -121,7 +121,7 @@ def make_segment(
 
 
 def _around(frames: tuple[Frame, ...], capture: Capture, plan: RestorationPlan) -> tuple[Frame, ...]:
-    """The usable neighbours in the movie of frames that are restored, as far as the plan looks."""
+    """The usable neighbours, within the plan's reach, of the frames to restore."""
     own = {frame.index for frame in frames}
     restored = [frame.index for frame in frames if frame.skip_reason is None]
     wanted = {n + k for n in restored for k in range(-plan.reach, plan.reach + 1)} - own
@@ -132,9 +132,9 @@ def _around(frames: tuple[Frame, ...], capture: Capture, plan: RestorationPlan) 
 
 
 def run_segment(segment: Segment) -> dict[str, int]:
-    """Restore a segment's frames, write their pictures and, last, the segment's log. Returns counts by status.
+    """Restore a segment's frames, write their pictures and then the segment's log. Returns counts by status.
 
-    Doing it again gives the same files. A frame that fails gets its line, and the others go on. Raises OutputError.
+    Repeating it gives the same files. A failed frame gets a line too, and the others continue. Raises OutputError.
     """
     prepare_worker()
     lines: dict[int, dict[str, Any]] = {}
@@ -145,7 +145,7 @@ def run_segment(segment: Segment) -> dict[str, int]:
 
 
 def fail_segment(segment: Segment, reason: str) -> dict[str, int]:
-    """Write the log of a segment that could not be worked on: its frames failed, those left out stay left out."""
+    """Write the log of a segment that could not be processed: its frames failed, skipped ones stay skipped."""
     failed = (_without_picture(f, "failed", reason) for f in segment.frames if f.skip_reason is None)
     lines = {r.frame.index: _write_frame(segment, r, 0.0) for r in chain(_skipped(segment), failed)}
     return _write_log(segment, lines)
@@ -173,7 +173,7 @@ def _without_picture(frame: Frame, status: str, reason: str) -> RestoredFrame:
 def _decoded(
     segment: Segment, seconds: dict[int, float], steps: dict[int, float]
 ) -> Iterator[tuple[Frame, Picture | None]]:
-    """The segment's usable frames and their neighbours in order, each with its picture, or None where it has none."""
+    """The segment's usable frames and their neighbours in order, each with its picture, or None if undecodable."""
     usable = [frame for frame in segment.frames if frame.skip_reason is None]
     wanted = deque(sorted((*usable, *segment.around), key=lambda frame: frame.index))
     if not usable:
@@ -222,7 +222,7 @@ def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[Restored
             break
         except OutputError:
             raise
-        except Exception as error:  # one frame's fault must not take the others along
+        except Exception as error:  # an error in one frame must not affect the others
             failed = next((frame for frame, _ in fed if frame.index in due), None)
             if failed is None or is_unreachable(error):
                 raise
@@ -232,17 +232,17 @@ def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[Restored
             source = chain([one for one in fed if one[0] is not failed], source)
             fed.clear()
     lost = [frame for frame, _ in fed if frame.index in due]
-    yield from (_without_picture(frame, "failed", "no result came from the restoration") for frame in lost)
+    yield from (_without_picture(frame, "failed", "the restoration returned no result") for frame in lost)
     yield from (_without_picture(frame, "failed", "the frame cannot be decoded") for frame in undecodable)
 
 
 def reason_of(error: Exception) -> str:
-    """What a frame's line says of a failure."""
-    return str(error) if isinstance(error, VirestError) else f"{type(error).__name__}: {error} (a fault of virest)"
+    """The text of a failure in a frame's line."""
+    return str(error) if isinstance(error, VirestError) else f"{type(error).__name__}: {error} (a bug in virest)"
 
 
 def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> dict[str, Any]:
-    """Write the frame's picture, if there is one, and give its line."""
+    """Write the frame's picture, if any, and return its line."""
     if segment.pictures.skip_copied and restored.status == "copied":
         restored = replace(restored, picture=None)
     path = segment.run.picture(restored.frame.index)
@@ -262,7 +262,7 @@ def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> 
 
 
 def recorded_mask(picture: Picture, source_px: NDArray[np.float32] | None) -> Picture:
-    """(height, width): 255 where a pixel was read inside the recorded picture, 0 where its edge is repeated."""
+    """(height, width): 255 for pixels read inside the recorded frame, 0 where its edge is replicated."""
     height, width = picture.shape[:2]
     if source_px is None:
         return np.full((height, width), 255, np.uint8)

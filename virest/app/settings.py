@@ -1,4 +1,4 @@
-"""The settings of a run: a preset, over it the file of ``--settings``, over that the options."""
+"""The settings of a run: the preset, overridden by the file of ``--settings``, then by options."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _field_type(name: str, kind: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def settings_model() -> type[BaseModel]:
-    """The file's form: one optional key for each field of RestorationSettings, and the form's version."""
+    """The file's schema: one optional key for each field of RestorationSettings, and the schema version."""
     hints = get_type_hints(RestorationSettings)
     keys: dict[str, Any] = {name: (_field_type(name, kind) | None, None) for name, kind in hints.items()}
     keys["virest_settings"] = (Literal[1], 1)
@@ -60,7 +60,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def compose_settings(file: Path | None, **options: Any) -> RestorationSettings:
-    """Preset, then file, then options; an option of None is not set."""
+    """Settings from the preset, overridden by the file, then by options; an option of None is not set."""
     content = read_settings(file) if file else {}
     chosen = {name: value for name, value in options.items() if value is not None}
     if "neighbours" in chosen:

@@ -1,4 +1,4 @@
-"""``virest simulate OUT``: write a capture with known truth."""
+"""``virest simulate OUT``: write a capture with known ground truth."""
 
 from __future__ import annotations
 
@@ -66,21 +66,18 @@ def simulate_command(
 ) -> dict[str, Any]:
     """Simulate a recording and write it to ``out``; returns a summary for ``--json``.
 
-    exposure_ms: one exposure, or several that the frames take in turn; the ISO compensates for a change.
-    auto_exposure_ev: exposure × ISO, and the brightness with them, walk smoothly over this range about exposure_ms;
-    with auto_exposure_steps they climb a staircase of that many exposures.  rate_rad_s: 0 is a camera that does not
-    turn;
-    where it does not sway either (no depth_m, or sway_m 0), the pictures are still.  direction: right_to_left for an
-    upright picture and top_to_bottom for one on its side, unless given.  pan_rad_s: a steady turn about the camera's
-    vertical axis.  near_m: distance of things that hang before the scene.  moving_px_s: speed of things that move
-    across it.  depth_m: distance of the scene's plane, None
-    for infinity.
-    effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), hidden from everything but ``truth/``.
-    hidden: effects that have no name, for tests.
-    reference: ``frame-middle`` writes truth/frame_middle beside truth/frames.  truth_frames: whether truth/frames is
-    written.  profile: use this camera as the nominal one; width, height, focal_px, distortion, readout_ms, direction
-    and response are then taken from it.
-    isp: the phone's own processing; truth/ shows its global curves, the capture's profile nothing of it.
+    exposure_ms: one exposure, or several that frames cycle through; the ISO compensates for changes.
+    auto_exposure_ev: exposure × ISO, and the brightness with it, vary smoothly over this range about exposure_ms;
+    with auto_exposure_steps they rise in that many steps.  rate_rad_s: 0 for a camera that does not rotate; if it does
+    not sway either (no depth_m, or sway_m 0), all frames are static.  direction: by default right_to_left for portrait
+    and top_to_bottom for landscape.  pan_rad_s: constant yaw rate.  near_m: distance of objects in front of the scene.
+    moving_px_s: speed of objects that move across it.  depth_m: distance of the scene's plane, None for infinity.
+    effects: ``NAME`` or ``NAME=VALUE`` (contract, section 4), stated only in ``truth/``.
+    hidden: effects without a name, for tests.
+    reference: ``frame-middle`` also writes truth/frame_middle.  truth_frames: whether to write truth/frames.
+    profile: use this camera as the nominal one; it defines width, height, focal_px, distortion, readout_ms, direction
+    and response.
+    isp: the phone's own processing; truth/ includes its global curves, the capture's profile nothing of it.
     """
     if reference not in ("exposure-start", "frame-middle"):
         raise SettingsError(f"reference '{reference}' is not known", hint="use exposure-start or frame-middle")
@@ -143,7 +140,7 @@ def simulate_command(
 
 
 def _of_new_capture(profile: CameraProfile) -> CameraProfile:
-    """The profile with the fields that hold for a capture to come: not another's, and the focus where it will rest."""
+    """The profile with the fields that apply to a new capture: none of another capture, and a constant focus."""
     others = [field for field in profile.fields if field.belongs_to_one_capture]
     for field in others:
         log.warning(
@@ -162,12 +159,12 @@ def _of_new_capture(profile: CameraProfile) -> CameraProfile:
 
 def _auto_exposure(range_ev: float | None, steps: int | None) -> AutoExposure | None:
     if range_ev is None and steps is not None:
-        raise SettingsError(f"{steps} exposures over no range", hint="give the range in EV too")
+        raise SettingsError(f"{steps} exposure steps without a range", hint="also give the range in EV")
     return None if range_ev is None else AutoExposure(range_ev, steps)
 
 
 def _exposed(session: Session) -> dict[str, Any]:
-    """What auto-exposure did: shortest and longest logged exposure, lowest and highest ISO."""
+    """The result of auto-exposure: shortest and longest logged exposure, lowest and highest ISO."""
     if session.settings.auto_exposure is None:
         return {}
     exposures = session.exposures
@@ -185,7 +182,7 @@ def parse_response(text: str) -> ResponseCurve:
     try:
         values = [float(n) for n in numbers.split(",")] if numbers else []
     except ValueError:
-        raise SettingsError(f"response '{text}' is not a curve", hint="write gamma:2.2, for instance") from None
+        raise SettingsError(f"response '{text}' is not a curve", hint="write gamma:2.2, for example") from None
     if kind in ("srgb", "linear") and not values:
         return ResponseCurve(kind)
     if kind == "gamma" and len(values) <= 1:
@@ -197,7 +194,7 @@ def parse_response(text: str) -> ResponseCurve:
 
 
 def _blur_px(session: Session) -> float:
-    """Median over the frames of the picture's motion at its centre during one exposure, in pixels."""
+    """Median over the frames of the image motion at the centre during one exposure, in pixels."""
     lens = session.true.intrinsics
     assert lens is not None
     lengths = []

@@ -1,7 +1,7 @@
-"""The captures that ``virest evaluate slam`` makes where none are given: a camera that walks past a scene.
+"""The captures that ``virest evaluate slam`` simulates by default: a camera that moves past a scene.
 
-The profile that goes with each leaves open what a phone does not know of itself: the distance of what it looks at, and
-the offset between the clocks.  Readout times are measured ones; exposures, speeds and the rest are chosen.
+Their profiles omit what a phone does not know: the scene distance and the clock offset.  Readout times are measured
+ones; exposures, speeds and the rest are chosen.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _BITS_PER_PX = 0.6
 
 @dataclass(frozen=True, slots=True)
 class SlamCapture:
-    """One capture to be made."""
+    """One capture to simulate."""
 
     name: str
     note: str
-    """Where its numbers are from, for the table."""
+    """Source of its numbers, for the table."""
     scene: str = "leaves"
     width: int = 640
     height: int = 480
@@ -43,19 +43,19 @@ class SlamCapture:
     rate_rad_s: float = 1.0
     sway_m: float = 0.02
     walk_m: tuple[float, float, float] = (0.5, 0.05, 0.10)
-    """From side to side, and out and back along y and z."""
+    """Travel along x, and back-and-forth amplitude along y and z."""
     depth_m: float = 1.5
     tilt_deg: tuple[float, float] = (14.0, -22.0)
     near_m: float | None = None
-    """Distance of things that hang before the scene's plane; None: nothing does."""
+    """Distance of objects in front of the scene's plane; None: no objects."""
     offset_ms: float = 8.0
-    """Hidden: the profile leaves it open."""
+    """Hidden clock offset; unknown in the profile."""
     imu_rate_hz: float = 200.0
     seed: int = 31
 
     @property
     def field_of_view_deg(self) -> float:
-        """Along the long side of the picture."""
+        """Field of view along the long side of the frame."""
         long = max(self.width, self.height)
         angle = 2 * np.arctan(0.5 * long / self.focal_px) if self.distortion[0] != "fisheye" else long / self.focal_px
         return float(np.rad2deg(angle))
@@ -92,7 +92,7 @@ SEQUENCES = (
         seed=36,
     ),
 )
-"""As many as in Table 4 of Ye et al. 2026."""
+"""The same number as in Table 4 of Ye et al. 2026."""
 
 DEVICES = (
     SlamCapture(
@@ -129,7 +129,7 @@ DEVICES = (
         "phone in a dim room", "chosen", readout_ms=18.0, exposure_ms=22.0, rate_rad_s=0.8, seed=48
     ),
 )  # fmt: skip
-"""As many as in Table 5 of Ye et al. 2026."""
+"""The same number as in Table 5 of Ye et al. 2026."""
 DEVICE_SOURCES = (
     "[1] measured with a LED panel, [2] by panning past an edge: doc/rolling-shutter-table.md of JzHuai0108/kalibr",
     "[3] logged by the phone, [4] measured from, or recorded in, a published capture",
@@ -137,14 +137,14 @@ DEVICE_SOURCES = (
 
 
 def smaller(plan: SlamCapture, frames: int) -> SlamCapture:
-    """The same capture with fewer frames, and as much shorter a walk."""
+    """The same capture with fewer frames and a proportionally shorter path."""
     part = frames / plan.frames
     x, y, z = plan.walk_m
     return dataclasses.replace(plan, frames=frames, walk_m=(x * part, y * part, z * part))
 
 
 def make_capture(plan: SlamCapture, folder: Path) -> Path:
-    """Simulate a capture with its truth: a sharp global-shutter picture of each frame, and the path."""
+    """Simulate a capture with its truth: a sharp global-shutter image of each frame, and the trajectory."""
     true = nominal_camera(
         plan.width,
         plan.height,

@@ -1,7 +1,7 @@
-"""The three picture sequences of one capture as SLAM tools read them, and what a tool finds in them.
+"""The three image sequences of one capture in EuRoC's layout, and the trajectories that a SLAM tool estimates.
 
-``global``: the sharp global-shutter pictures of truth/frames; ``rolling``: the movie's frames as they are;
-``restored``: what ``virest process`` makes of them.  Each is a folder in EuRoC's layout with the same stamps.
+``global``: the sharp global-shutter images of truth/frames; ``rolling``: the movie's frames as recorded;
+``restored``: the frames restored by ``virest process``.  All have the same timestamps.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SlamSequences:
     folder: Path
     """Holds a folder of each kind."""
     kinds: tuple[str, ...]
-    """Those of KINDS that there are; a capture without truth pictures has no ``global``."""
+    """The available KINDS; a capture without truth images has no ``global``."""
     lens: Intrinsics
     fps: float
     stamps_ns: tuple[int, ...]
@@ -67,7 +67,7 @@ class SlamSequences:
     truth: CameraPath
 
     def pictures(self, kind: str) -> Path:
-        """Where the pictures of a kind are."""
+        """Folder of one kind's images."""
         return self.folder / kind / "mav0" / "cam0" / "data"
 
 
@@ -75,15 +75,15 @@ class SlamSequences:
 
 
 def write_sequences(capture_path: Path, out: Path, settings: RestorationSettings) -> SlamSequences:
-    """Have a capture processed, and write the frames that came out, as recorded and as they truly were.
+    """Process a capture, and write the restored frames with their recorded and truth versions.
 
-    Raises CaptureError where there is no truth, or too little to track.
+    Raises CaptureError if there is no truth, or too few frames.
     """
     truth = read_true_path(capture_path / "truth" / "trajectory.csv")
     capture = read_capture(capture_path)
     profile = resolve_profile(capture)[0]
     if (lens := profile.intrinsics) is None:
-        raise CaptureError(f"{capture.name}: no focal length is known", hint="give fx_px in camera.yaml")
+        raise CaptureError(f"{capture.name}: no focal length is known", hint="set fx_px in camera.yaml")
     options = ProcessOptions(out / "run", settings, command="virest evaluate slam", mode="new")
     workers = Workers(1)
     try:
@@ -96,8 +96,8 @@ def write_sequences(capture_path: Path, out: Path, settings: RestorationSettings
     numbers = sorted(sharp or restored)
     if len(numbers) < LEAST_FRAMES:
         raise CaptureError(
-            f"{capture.name}: {len(numbers)} frames can be used, {LEAST_FRAMES} are needed",
-            hint="give a longer capture",
+            f"{capture.name}: only {len(numbers)} usable frames; {LEAST_FRAMES} are needed",
+            hint="use a longer capture",
         )
     stamps = {k: capture.frames[k].timestamp_ns for k in numbers}
     for kind in kinds:
@@ -116,20 +116,20 @@ def read_true_path(file: Path) -> CameraPath:
     """Read truth/trajectory.csv: time_s, position in metres, orientation w x y z, in the world."""
     if not file.is_file():
         raise CaptureError(
-            f"{file}: no such file: without the true path nothing can be scored",
-            hint="give a capture that `virest simulate` wrote, or none",
+            f"{file}: no such file; the true trajectory is needed for scoring",
+            hint="give a capture written by `virest simulate`, or none",
         )
     try:
         table = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
     except ValueError as error:
-        raise CaptureError(f"{file}: {error}", hint="time_s,px_m,py_m,pz_m,qw,qx,qy,qz are expected") from error
+        raise CaptureError(f"{file}: {error}", hint="expected columns: time_s,px_m,py_m,pz_m,qw,qx,qy,qz") from error
     if table.shape[1] != 8 or len(table) < 2 or (np.diff(table[:, 0]) <= 0).any():
         raise CaptureError(f"{file}: is not a trajectory", hint="time_s,px_m,py_m,pz_m,qw,qx,qy,qz, times rising")
     return CameraPath(table[:, 0], table[:, 1:4], table[:, 4:])
 
 
 def _frame_times(capture: Capture, truth: Path) -> dict[int, tuple[float, float]]:
-    """When each frame was truly taken: as truth/effects.json says, else by the profile (the true one where given)."""
+    """True capture time of each frame: from truth/effects.json, else by the profile (the true one if given)."""
     effects = truth / "effects.json"
     if effects.is_file():
         slots = json.loads(effects.read_text(encoding="utf-8"))["slots"]
@@ -172,12 +172,12 @@ def _write_euroc(folder: Path, pictures: Iterator[tuple[int, NDArray[np.uint8]]]
 
 
 def _seconds(sequences: SlamSequences) -> Array:
-    """Stamps in seconds from the first frame."""
+    """Timestamps in seconds from the first frame."""
     return np.array([(stamp - sequences.stamps_ns[0]) * 1e-9 for stamp in sequences.stamps_ns])
 
 
 def orb_slam_settings(profile: CameraProfile, fps: float) -> str:
-    """Settings of ORB-SLAM3 for the pictures alone, and beside its Camera1 the Camera that ORB-SLAM2 reads."""
+    """Settings for ORB-SLAM3 without IMU, with the Camera entries of ORB-SLAM2 in addition to Camera1."""
     text = format_orb_slam(profile, fps, None, ["pictures alone"], "evaluate slam")
     older = [line.replace("Camera1.", "Camera.") for line in text.splitlines() if line.startswith("Camera1.")]
     return text + "\n".join(older) + "\n"
@@ -189,7 +189,7 @@ def orb_slam_settings(profile: CameraProfile, fps: float) -> str:
 def track_with_colmap(
     sequences: SlamSequences, kind: str, seeds: list[int], settings: SfmSettings
 ) -> Iterator[dict[int, Array]]:
-    """Positions by frame (0 … frames − 1) that structure from motion finds, for each seed."""
+    """Positions by frame (0 … frames − 1) from structure from motion, for each seed."""
     work = sequences.folder / f"{kind}-colmap"
     work.mkdir()
     try:
@@ -209,9 +209,9 @@ def track_with_colmap(
 def track_with_command(
     sequences: SlamSequences, kind: str, seeds: list[int], command: list[str], timeout_s: float
 ) -> Iterator[dict[int, Array]]:
-    """Positions by frame in the trajectories that a program writes, one run for each seed; none where it failed.
+    """Positions by frame in the trajectories that a program writes, one run per seed; empty for a failed run.
 
-    A SLAM that loses track is a result and scores as lost; a program that cannot be started is an error.
+    Lost tracking is a result and scores as lost; a program that cannot be started is an error.
     """
     folder = (sequences.folder / kind).resolve()
     for seed in seeds:
@@ -228,29 +228,29 @@ def track_with_command(
 
 
 def split_command(text: str) -> list[str]:
-    """Split a command line into its arguments, and check its placeholders; no shell ever sees it."""
+    """Split a command line into arguments without a shell, and check its placeholders."""
     try:
         words = shlex.split(text)
     except ValueError as error:
-        raise SettingsError(f"--command {text!r}: {error}", hint="quote as for a shell") from None
+        raise SettingsError(f"--command {text!r}: {error}", hint="quote arguments as in a shell") from None
     used = {name for word in words for name in _PLACE.findall(word)}
     unknown, missing = used - set(PLACEHOLDERS), {"sequence", "trajectory"} - used
     if unknown or missing:
-        wrong = f"does not know {{{min(unknown)}}}" if unknown else f"has no {{{min(missing)}}}"
+        wrong = f"has an unknown {{{min(unknown)}}}" if unknown else f"has no {{{min(missing)}}}"
         known = ", ".join(f"{{{name}}}" for name in PLACEHOLDERS)
-        raise SettingsError(f"--command {wrong}", hint=f"{known} are filled in; the first two are needed")
+        raise SettingsError(f"--command {wrong}", hint=f"placeholders: {known}; the first two are required")
     return words
 
 
 def fill_command(words: list[str], places: dict[str, str]) -> list[str]:
-    """Put the values into each argument; an argument stays one argument whatever a value holds."""
+    """Fill in the placeholders of each argument; a value never splits an argument."""
     return [_PLACE.sub(lambda found: places[found[1]], word) for word in words]
 
 
 def run_command(words: list[str], log_file: Path, timeout_s: float) -> bool:
-    """Run a program without a shell, its output in a file; whether it ended well and in time.
+    """Run a program without a shell, its output in a file; returns whether it exited with 0 in time.
 
-    Raises SettingsError where it cannot be started.
+    Raises SettingsError if it cannot be started.
     """
     with log_file.open("wb") as log:
         try:
@@ -274,7 +274,7 @@ def run_command(words: list[str], log_file: Path, timeout_s: float) -> bool:
 
 
 def _read_positions(trajectory: Path, sequences: SlamSequences) -> dict[int, Array]:
-    """Positions by frame.  Tools write seconds or nanoseconds, whole or from the first: what fits is meant."""
+    """Positions by frame.  Tools write s or ns, absolute or from the first frame: the unit that fits most counts."""
     if not trajectory.is_file():
         return {}
     found = parse_tum(trajectory.read_text(encoding="utf-8", errors="replace"))

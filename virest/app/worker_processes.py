@@ -1,4 +1,4 @@
-"""The processes that work is handed to: one thread each, no Ctrl-C of their own, no life after the parent."""
+"""Worker processes: one thread each, ignoring Ctrl-C, ending with the parent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _prepared: list[int] = []
 
 
 def prepare_worker() -> None:
-    """One thread a process: the pool is the parallelism, and sums do not depend on the number of cores."""
+    """Use one thread per process: the pool is parallel, and sums do not depend on the number of cores."""
     if os.getpid() not in _prepared:
         cv2.setNumThreads(1)
         keep_freed_memory()
@@ -30,7 +30,7 @@ def prepare_worker() -> None:
 
 
 def process_pool(jobs: int, *, verbose: bool = False) -> ProcessPoolExecutor:
-    """Worker processes, which start when they are first needed."""
+    """Worker processes, started on first use."""
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
     context = multiprocessing.get_context("spawn")
@@ -38,7 +38,7 @@ def process_pool(jobs: int, *, verbose: bool = False) -> ProcessPoolExecutor:
 
 
 def submit_uninterrupted(pool: ProcessPoolExecutor, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
-    """Hand a call to a pool; processes that this starts never see the Ctrl-C meant for the parent."""
+    """Submit a call to a pool; processes started here ignore the Ctrl-C meant for the parent."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows, where workers ignore Ctrl-C once they run
         return pool.submit(function, *arguments)
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by processes started here
@@ -49,7 +49,7 @@ def submit_uninterrupted(pool: ProcessPoolExecutor, function: Callable[..., Resu
 
 
 def _start_worker(verbose: bool) -> None:
-    """Set up a worker process: no Ctrl-C of its own (the parent decides), and no life after the parent's."""
+    """Set up a worker process: ignore Ctrl-C (the parent decides), and end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     logger = logging.getLogger("virest")
@@ -66,13 +66,13 @@ def _die_with(sentinel: int) -> None:
 
 
 class SerialExecutor(Executor):
-    """Does the work at once, in this process."""
+    """Runs each call immediately in this process."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Call the function and hand back its result as a finished future."""
+        """Call the function and return its result as a finished future."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
-        except Exception as error:  # handed over with the future, as an executor does
+        except Exception as error:  # passed on in the future, as executors do
             future.set_exception(error)
         return future

@@ -1,4 +1,4 @@
-"""Curves over time, a band of states and blur arrows as the shapes of an SVG: numbers only, the templates draw them."""
+"""Geometry of SVG time plots, state bands and blur arrows; the templates draw them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 360.0, 176.0
-"""Of a chart, in units that are about a pixel of a phone: the letters stay readable at that width."""
+"""Size of a chart in units of about one phone pixel, so that labels stay readable at that width."""
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 10.0, 10.0, 34.0
 MAX_COLUMNS = 300
-"""Longer series are drawn by their least and greatest value in each of this many columns."""
+"""Longer series are drawn by their minimum and maximum in this many columns."""
 TICKS = 4
 ABSURD = 1e12
-"""Of any quantity in its unit: such values, and infinite ones, are not drawn."""
+"""Absolute values above this, and infinite ones, are not drawn."""
 MAX_ARROWS = 80
 ARROW_SCALES = (1, 2, 3, 5, 8, 12, 20)
 ARROW_REACH = 0.9
-"""The longest arrow, as a part of the distance between arrows."""
+"""The longest arrow, as a fraction of the distance between arrows."""
 HEAD_RAD, HEAD_PART, HEAD_MAX = 0.45, 0.4, 0.016
 """Half the opening of an arrow's head, its length as a part of the arrow, and at most of the picture's diagonal."""
 
@@ -31,7 +31,7 @@ Values = Sequence[float | None]
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A mark on an axis."""
+    """A tick on an axis."""
 
     place: float
     label: str
@@ -43,24 +43,24 @@ class Line:
 
     name: str
     path: str
-    """The ``d`` of an SVG path; broken where there is no value."""
+    """The ``d`` of an SVG path, interrupted at missing values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Curves over time, ready to be drawn."""
+    """A time plot, ready for drawing."""
 
     title: str
     unit: str
     summary: str
-    """The chart in words: least, middle and greatest value of each series."""
+    """The chart in words: range and median of each series."""
     lines: tuple[Line, ...]
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
     marks: tuple[float, ...]
-    """Where the frames are that the page shows."""
+    """Positions of the frames shown on the page."""
     zero: float | None
-    """Height of the zero line, where it lies inside."""
+    """Height of the zero line, if inside the chart."""
     width: float = WIDTH
     height: float = HEIGHT
     left: float = LEFT
@@ -78,11 +78,11 @@ class Arrow:
 
 @dataclass(frozen=True, slots=True)
 class ArrowField:
-    """The blur of one frame, drawn over it."""
+    """The blur of one frame, as an overlay."""
 
     arrows: tuple[Arrow, ...]
     scale: int
-    """How many times longer than the blur the arrows are."""
+    """Magnification of the arrows relative to the blur."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +97,9 @@ class Stretch:
 def time_chart(
     title: str, unit: str, time_s: Array, series: Sequence[tuple[str, Values]], marks_s: Sequence[float]
 ) -> Chart | None:
-    """Curves over time; None where no series has a value.
+    """A time plot; None if no series has a value.
 
-    time_s: (n,) rising.  series: (name, n values, None for unknown).  marks_s: times to be marked.
+    time_s: (n,) ascending.  series: (name, n values, None for unknown).  marks_s: times to mark.
     """
     columns = [(name, np.array([np.nan if v is None else v for v in values], float)) for name, values in series]
     columns = [(name, np.where(np.abs(values) < ABSURD, values, np.nan)) for name, values in columns]
@@ -132,7 +132,7 @@ def time_chart(
 
 
 def nice_ticks(low: float, high: float) -> list[float]:
-    """Multiples of 1, 2 or 5 times a power of ten that enclose low to high, some TICKS of them."""
+    """About TICKS multiples of 1, 2 or 5 times a power of ten that enclose low to high."""
     span = high - low if high - low > 1e-12 * max(abs(low), abs(high), 1e-12) else max(abs(high), 1.0)
     raw = span / TICKS
     power = 10.0 ** math.floor(math.log10(raw))
@@ -142,7 +142,7 @@ def nice_ticks(low: float, high: float) -> list[float]:
 
 
 def thinned(time_s: Array, values: Array) -> tuple[Array, Array]:
-    """Least and greatest value of each of MAX_COLUMNS equal shares, in their order; short series as they are."""
+    """Minimum and maximum of each of MAX_COLUMNS equal parts, in order; short series unchanged."""
     if len(values) <= 2 * MAX_COLUMNS:
         return time_s, values
     kept: list[int] = []
@@ -174,7 +174,7 @@ def _in_words(name: str, values: Array, unit: str) -> str:
 
 
 def _short(value: float, among: Sequence[float]) -> str:
-    """A tick's number, with as many decimals as the steps between ticks need."""
+    """A tick's label, with as many decimals as the tick step needs."""
     step = abs(among[1] - among[0]) if len(among) > 1 else abs(value) or 1.0
     if max(abs(v) for v in among) >= 1e5 or step < 1e-4:
         return f"{value:.3g}"
@@ -183,7 +183,7 @@ def _short(value: float, among: Sequence[float]) -> str:
 
 
 def band(states: Sequence[str]) -> tuple[Stretch, ...]:
-    """Runs of equal states, one after the other along 0 to 1."""
+    """Runs of equal states, consecutive along 0 to 1."""
     cuts = [0, *(k for k in range(1, len(states)) if states[k] != states[k - 1]), len(states)]
     return tuple(Stretch(states[a], a / len(states), (b - a) / len(states)) for a, b in pairwise(cuts) if b > a)
 
@@ -191,9 +191,9 @@ def band(states: Sequence[str]) -> tuple[Stretch, ...]:
 def arrow_field(
     centres_px: Array, angle_rad: Array, length_px: Array, width: int, height: int
 ) -> ArrowField:  # fmt: skip
-    """Arrows along the blur of each tile, centred on it: angle x right, y down, the way the image points moved.
+    """Arrows along the blur of each tile, centred on it, in the direction of image motion: angle with x right, y down.
 
-    centres_px: (n, 2).  Enlarged by one of ARROW_SCALES so that the longest nearly reaches its neighbour.
+    centres_px: (n, 2).  Enlarged by one of ARROW_SCALES so that the longest arrow nearly reaches the next one.
     """
     known = (np.abs(np.column_stack([centres_px, angle_rad, length_px])) < ABSURD).all(axis=1)
     centres_px, angle_rad, length_px = centres_px[known], angle_rad[known], length_px[known]

@@ -1,4 +1,4 @@
-"""Figures that explain: blur paths over a frame, the row clock, and the axes. Drawn from the program's own records."""
+"""Explanatory figures drawn from the program's own records: blur paths over a frame, the row clock, the axes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KERNEL_IN = 1.15
 
 
 def strip_figure(pictures: Sequence[tuple[str, Picture]], title: str = "", image_format: str = "png") -> bytes:
-    """Pictures (h, w, 3) of one size side by side, each under its name, at one figure pixel per picture pixel."""
+    """Pictures (h, w, 3) of one size side by side, each labelled, at one figure pixel per picture pixel."""
     height, width = pictures[0][1].shape[:2]
     figure = canvas(width * len(pictures) / 110 + 0.2, height / 110 + 0.4)
     for axes, (name, picture) in zip(figure.subplots(1, len(pictures), squeeze=False)[0], pictures, strict=True):
@@ -38,10 +38,10 @@ def blur_figure(
     shown: Sequence[int],
     scale: float = 3.0,
 ) -> bytes:
-    """A recorded frame with its predicted blur as arrows, and beside it the kernels of a few of the arrows.
+    """A recorded frame with its predicted blur as arrows, and the kernels of a few arrows beside it.
 
-    picture: (h, w, 3).  centres_px, chords_px: (n, 2) where, and how far image points move during their own row's
-    exposure.  kernels: (n, k, k).  shown: the arrows whose kernels are drawn.  scale: of the arrows.
+    picture: (h, w, 3).  centres_px, chords_px: (n, 2) position and displacement of image points during their own row's
+    exposure.  kernels: (n, k, k).  shown: the arrows whose kernels are drawn.  scale: magnification of the arrows.
     """
     height, width = picture.shape[:2]
     tall = 5.0
@@ -65,9 +65,9 @@ def blur_figure(
 
 
 def rows_figure(row_start_s: Array, exposure_s: float, middle_s: float) -> bytes:
-    """The row clock of one frame: when each row gathers light, and the two reference times that `process` knows.
+    """The row clock of one frame: when each row is exposed, and the two reference times of `process`.
 
-    row_start_s: (h,) start of each row's exposure from the frame's stamp.  middle_s: the instant ``frame-middle``.
+    row_start_s: (h,) start of each row's exposure after the frame's timestamp.  middle_s: the instant ``frame-middle``.
     """
     figure = canvas(7.0, 3.4)
     axes = figure.subplots()
@@ -136,7 +136,7 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], title: str
 
 
 def preview_figure(recorded: Picture, restored: Picture, tiles: Sequence[TileBlur], title: str) -> bytes:
-    """Recorded, restored, and the recorded frame again under arrows along its blur."""
+    """Recorded frame, restored frame, and the recorded frame with arrows along its blur."""
     height, width = recorded.shape[:2]
     tall = 6.0 if height > width else 4.0
     figure = canvas(3 * tall * width / height + 0.3, tall + 0.7)

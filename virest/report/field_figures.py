@@ -1,6 +1,6 @@
-"""Pictures of fields: values with their deviations, or arrows over the picture, and residuals before and after.
+"""Figures of fields: values with standard deviations, or arrows over the frame, and residuals before and after.
 
-Residuals are root mean squares of the points in equal shares of the covariate, nominal model and extended one.
+Residuals are rms values of the points in bins of equal count along the covariate, for nominal and extended model.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def field_figure(
 
 
 def _draw_values(axes: Any, fields: tuple[Field, ...]) -> None:
-    """Values of each component that is not nought, with one standard deviation."""
+    """Values of each nonzero component, with one standard deviation."""
     for field in fields:
         factor, unit = UNIT_SCALES[field.kind]
         along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
@@ -113,13 +113,13 @@ def _draw_pair(figure: Any, axes: Any, field: Field) -> None:
 
 
 def _named(covariate: str) -> str:
-    """A covariate with its unit."""
+    """A covariate's name with its unit."""
     unit = UNITS.get(covariate, "rad/s" if covariate.startswith("rate") else "m/s²")
     return NAMES.get(covariate, covariate) + (f", {unit}" if unit != "1" else "")
 
 
 def _draw_arrows(figure: Any, axes: Any, field: Field) -> None:
-    """Arrows over the picture, and the length of the displacement beneath them."""
+    """Arrows over the frame, on a map of the displacement's length."""
     fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
     length = np.linalg.norm(field.at(*np.meshgrid(*fine)), axis=-1)
     shown = axes.pcolormesh(*fine, length, cmap="viridis", shading="auto", rasterized=True)
@@ -137,7 +137,7 @@ def _draw_arrows(figure: Any, axes: Any, field: Field) -> None:
 
 
 def _draw_map(figure: Any, axes: Any, field: Field) -> None:
-    """Change of the light over the picture, %."""
+    """Relative change of brightness over the frame, in %."""
     fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
     values = 100 * field.at(*np.meshgrid(*fine))[..., 0]
     most = float(np.abs(values).max())

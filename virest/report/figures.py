@@ -1,4 +1,4 @@
-"""Figures as image files in memory; matplotlib is loaded only when one is drawn, and never opens a window."""
+"""Figures as image files in memory; matplotlib is loaded only when needed, and never opens a window."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
 DPI = 110
 DARK, ON_DARK = "#1b1f22", "#e4e6e8"
-"""Ground beside photographs, and letters on it."""
-COVARIATES = {"row": "part of the readout", "time": "time, s", "radius": "radius, px", "rate": "rate, rad/s"}
-"""What residuals are drawn over, and how the axes are called."""
+"""Background of figures with photographs, and text on it."""
+COVARIATES = {"row": "fraction of the readout", "time": "time, s", "radius": "radius, px", "rate": "rate, rad/s"}
+"""Covariates of residual plots, with axis labels."""
 RESIDUALS = ("x_px", "y_px")
 BINS, MIN_IN_BIN = 24, 8
 MOST_DEVIATIONS, DEVIATION_BARS = 4.0, 16
@@ -41,7 +41,7 @@ def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -
 
 
 def literal(text: str) -> str:
-    """Text that is drawn as it stands: no formula, one line."""
+    """Text drawn literally: no math mode, one line."""
     return "".join(c if c.isprintable() else "?" for c in text).replace("$", r"\$")
 
 
@@ -103,10 +103,10 @@ def _draw_pictures(axes: Any, fit: CurveFit) -> None:
 def comparison_figure(
     rows: Sequence[tuple[str, Picture, Picture]], title: str = "", image_format: str = "png"
 ) -> bytes:
-    """Measured picture, simulated picture and their difference, a row each: (label, measured, simulated).
+    """Measured picture, simulated picture and their difference, one row per (label, measured, simulated).
 
-    Pictures (h, w) or (h, w, 3) of 8 bits.  The difference is of luma, all on one scale; its rms stands above.  The
-    ground is dark, as beside photographs, whatever the colours of the page.
+    8-bit pictures (h, w) or (h, w, 3).  Differences are of luma on one common scale; their rms is in the title.
+    The background is dark whatever the colours of the page.
     """
     figure = canvas(11.0, 0.6 + 3.0 * len(rows))
     figure.set_facecolor(DARK)
@@ -131,7 +131,7 @@ def comparison_figure(
 def residual_figure(
     before: Mapping[str, Any], after: Mapping[str, Any], title: str = "", image_format: str = "png"
 ) -> bytes:
-    """Residuals along x and y over row, time, radius and rate: medians of equal shares, and their middle 68 %.
+    """Residuals along x and y over row, time, radius and rate: medians in bins of equal count, and the central 68 %.
 
     before, after: covariate name → (n,), and ``x_px``, ``y_px`` (n,).
     """
@@ -153,9 +153,9 @@ def residual_figure(
 
 
 def deviation_figure(ratios: Mapping[str, Sequence[float]], title: str = "", image_format: str = "png") -> bytes:
-    """Histograms of errors in standard deviations, one for each name, beside the normal distribution.
+    """Histograms of errors in standard deviations, one per name, with the normal distribution.
 
-    ratios: name → errors over their deviations; those beyond ± 4 are drawn in the outermost bars.
+    ratios: name → errors divided by their standard deviations; those beyond ± 4 go to the outermost bars.
     """
     columns = min(max(len(ratios), 1), 4)
     lines = -(-max(len(ratios), 1) // columns)
@@ -177,7 +177,7 @@ def deviation_figure(ratios: Mapping[str, Sequence[float]], title: str = "", ima
 
 
 def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str = "png") -> bytes:
-    """What was tried on each rung, the best on top, and what entered; the line is where the rung began.
+    """Candidates of each rung, the best on top, with the one that entered; the line is the error before the rung.
 
     rungs: (quantity, before, {name: after}, entered or None).
     """
@@ -201,7 +201,7 @@ def _draw_rung(axes: Any, number: int, rung: RungBars) -> None:
         axes.axvline(before, color="crimson", lw=1.2, label=f"before: {before:.3g}")
         axes.legend(loc="lower right", fontsize=8)
     axes.set_xlabel(f"{literal(quantity)}, held-out frames")
-    axes.set_title(literal(f"{number}. {entered or 'nothing gains enough'}"), fontsize=10)
+    axes.set_title(literal(f"{number}. {entered or 'no candidate gains enough'}"), fontsize=10)
 
 
 def _draw_binned(axes: Any, along: Array, residual: Array, label: str, colour: str) -> None:

@@ -1,9 +1,8 @@
-"""The report: what one or several runs and diagnoses came to, as one HTML page that needs nothing but itself.
+"""The report: the results of one or several runs and diagnoses as one self-contained HTML page.
 
-Pictures travel inside the page, curves are drawn by it, and its content security policy forbids everything else: only
-this page's own style and script, known by their hashes, and pictures of the page.  All text is escaped by the
-template engine; signs that cannot be printed (control characters, marks that turn the direction of writing) are shown
-by their code.
+Pictures are embedded, and plots are inline SVG.  The content security policy allows only the page's own style and
+script, by their hashes, and embedded pictures.  The template engine escapes all text; unprintable characters (control
+characters, marks of writing direction) are shown by their code.
 """
 
 from __future__ import annotations
@@ -37,30 +36,30 @@ from virest.report.words import (
 
 TEMPLATES = "templates"
 RENDITIONS = ((1280, 88), (1280, 78), (1024, 76), (800, 74), (640, 72), (480, 70), (360, 64), (240, 60), (160, 50))
-"""Longest side in pixels and WebP quality: the first that keeps to the bytes allowed is taken."""
+"""Longest side in pixels and WebP quality: the first that fits the byte limit is used."""
 FIGURE_SIDE_PX, FIGURE_QUALITY = 1700, 82
 FIRST_FIGURES = ("residuals", "pictures")
-"""Figures of a diagnosis that are open to view; the others are behind a fold."""
+"""Figures of a diagnosis that are shown at once; the others are collapsed."""
 STATES = ("restored", "copied", "skipped", "failed")
 STATE_WORDS = {
     "restored": "restored",
     "copied": "copied unchanged",
-    "skipped": "left out",
+    "skipped": "skipped",
     "failed": "failed",
     "straightened": "straightened, not deblurred",
     "remark": "restored, with a remark",
 }
 LEFT_ALONE = ("failed", "skipped", "copied", "straightened", "remark")
-"""What the table of reasons tells, in its order."""
+"""States listed in the table of reasons, in this order."""
 Picture = NDArray[np.uint8]
 
 
-# ── what the page is made from ───────────────────────────────────────────────────────────────────────────────────
+# ── data of the page ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFacts:
-    """What the page tells of one frame; None where a value is not known."""
+    """The facts of one frame; None for unknown values."""
 
     frame: int
     timestamp_ns: int
@@ -69,34 +68,34 @@ class FrameFacts:
     warnings: tuple[str, ...] = ()
     exposure_s: float | None = None
     blur_px: float | None = None
-    """At the picture's centre."""
+    """Blur at the frame's centre."""
     longest_blur_px: float | None = None
-    """Of all tiles."""
+    """Longest blur over all tiles."""
     rate_rad_s: tuple[float, ...] | None = None
     shift_px: float | None = None
-    """How far the rolling shutter bent the picture."""
+    """Largest displacement by the rolling shutter."""
     depth_m: float | None = None
     speed_m_s: float | None = None
     gain_db: float | None = None
+    """Predicted gain of deblurring."""
     neighbours_gain_db: float | None = None
-    """What restoring the frame with its neighbours adds, by the spectra."""
-    """What deblurring was expected to gain."""
+    """Additional gain from joint restoration with neighbours, predicted by the spectra."""
     noise_levels: float | None = None
     deblurred: bool = False
     straightened: bool = False
     valid_px: tuple[int, int, int, int] | None = None
-    """x0, y0, x1, y1 of the real data in the restored picture; beyond them the edge is repeated."""
+    """x0, y0, x1, y1 of the recorded data in the restored frame; outside, the edge is replicated."""
 
     @property
     def done(self) -> str:
-        """What became of the frame, in words."""
+        """The frame's result, in words."""
         steps = [name for name, was in (("deblurred", self.deblurred), ("straightened", self.straightened)) if was]
         return " and ".join(steps) if self.state == "restored" and steps else STATE_WORDS[self.state]
 
 
 @dataclass(frozen=True, slots=True)
 class Embedded:
-    """A picture inside the page."""
+    """An embedded picture."""
 
     uri: str
     """A data URI."""
@@ -113,12 +112,12 @@ class ShownFrame:
     after: Embedded | None
     arrows: ArrowField
     width: int
-    """Of the movie, px; the arrows' unit."""
+    """Frame size of the movie in px; the arrows' unit."""
     height: int
 
     @property
     def repeats_edge(self) -> bool:
-        """Whether a part of the restored picture is no data."""
+        """Whether part of the restored frame replicates the edge."""
         return self.facts.valid_px is not None and tuple(self.facts.valid_px) != (0, 0, self.width, self.height)
 
 
@@ -131,7 +130,7 @@ class RunRecord:
     frames: Sequence[FrameFacts]
     shown: Sequence[ShownFrame]
     notes: tuple[str, ...] = ()
-    """What the page could not show, and why."""
+    """Notes on what the page could not show, and why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,14 +140,14 @@ class DiagnosisRecord:
     facts: Mapped
     """The content of diagnosis.json."""
     figures: Sequence[tuple[str, Embedded]] = ()
-    """Name without its ending, and the picture."""
+    """Name without suffix, and the picture."""
     profile: str = ""
     """The text of extended.yaml."""
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
-    """All that is known of one capture."""
+    """The results of one capture."""
 
     name: str
     run: RunRecord | None = None
@@ -159,7 +158,7 @@ class CaptureRecord:
 
 
 def embed_pictures(pictures: Sequence[Picture | None], max_bytes: int) -> list[Embedded | None]:
-    """RGB pictures as WebP data URIs, all by the same rendition: the first one that fits into max_bytes together."""
+    """RGB pictures as WebP data URIs, all in the first rendition whose total size fits max_bytes."""
     for side_px, quality in RENDITIONS:
         coded = [None if picture is None else _webp(picture, side_px, quality) for picture in pictures]
         if sum(len(item.uri) for item in coded if item) <= max_bytes:
@@ -168,7 +167,7 @@ def embed_pictures(pictures: Sequence[Picture | None], max_bytes: int) -> list[E
 
 
 def embed_figure(picture: Picture) -> Embedded:
-    """A figure as a WebP data URI, its letters readable."""
+    """A figure as a WebP data URI, large enough for readable labels."""
     return _webp(picture, FIGURE_SIDE_PX, FIGURE_QUALITY)
 
 
@@ -191,7 +190,7 @@ def show_frame(
     size: tuple[int, int],
     max_bytes: int,
 ) -> ShownFrame:
-    """Make a frame ready for the page.
+    """Prepare a frame for the page.
 
     tiles: (x, y, angle_rad, length_px) each.  size: (width, height) of the movie.  max_bytes: of both pictures.
     """
@@ -202,9 +201,9 @@ def show_frame(
 
 
 def choose_frames(frames: Sequence[FrameFacts], count: int) -> list[FrameFacts]:
-    """Frames worth a look: of as many equal parts of the run, the one with the longest blur of each.
+    """Frames to show: the frame with the longest blur in each of ``count`` equal parts of the run.
 
-    Restored frames first; where there are none, those that were copied or skipped.
+    Restored frames; if there are none, copied ones, then skipped or failed ones.
     """
     for states in (("restored",), ("copied",), ("skipped", "failed")):
         there = [facts for facts in frames if facts.state in states]
@@ -232,7 +231,7 @@ def report_page(captures: Sequence[CaptureRecord], version: str) -> str:
 
 
 def content_policy(style: str, script: str) -> str:
-    """Nothing from anywhere: the page's own style and script by their hashes, and pictures that it holds itself."""
+    """A policy that allows only the page's own style and script, by hash, and embedded pictures."""
     own = {name: _sha256(text) for name, text in (("style", style), ("script", script))}
     return (
         f"default-src 'none'; img-src data:; style-src {own['style']}; script-src {own['script']}; "
@@ -257,14 +256,14 @@ def _environment() -> jinja2.Environment:
 
 
 def _source(name: str) -> str:
-    """A file that goes into the page as it stands."""
+    """A file that is included in the page unchanged."""
     environment = _environment()
     assert environment.loader is not None
     return environment.loader.get_source(environment, name)[0].strip()
 
 
 def shown(value: Any) -> Any:
-    """Text as it is shown: white space as one blank, whatever else cannot be printed by its code."""
+    """Text for display: tabs and line breaks as blanks, other unprintable characters by their code."""
     if value is None:
         return "–"
     if not isinstance(value, str) or isinstance(value, Markup):
@@ -302,7 +301,7 @@ def _run_view(run: RunRecord) -> dict[str, Any]:
 
 
 def run_verdict(counts: Mapping[str, int], verdict: str, frames: Sequence[FrameFacts]) -> Verdict:
-    """The run in words."""
+    """The run's result in words."""
     total, restored = sum(counts[state] for state in STATES), counts["restored"]
     deblurred = counts.get("deblurred", sum(facts.deblurred for facts in frames))
     rest = ", ".join(f"{counts[s]} {STATE_WORDS[s]}" for s in ("copied", "skipped", "failed") if counts[s])
@@ -324,7 +323,7 @@ def _frames(count: int) -> str:
 
 
 def count_words(counts: Mapping[str, int]) -> str:
-    """What became of how many frames, in a line: those that were deblurred first, then those only straightened."""
+    """Frame counts by result in one line: deblurred first, then only straightened."""
     deblurred = counts.get("deblurred", 0)
     parts = {"deblurred": deblurred, "only straightened": counts.get("restored", 0) - deblurred}
     parts |= {STATE_WORDS[state]: counts.get(state, 0) for state in STATES[1:]}
@@ -332,15 +331,15 @@ def count_words(counts: Mapping[str, int]) -> str:
 
 
 def _motion_words(frames: Sequence[FrameFacts]) -> str:
-    """How blurred and bent the recorded pictures are."""
+    """Blur and rolling-shutter distortion of the recorded frames, in a sentence."""
     blur = [f.blur_px for f in frames if f.blur_px is not None]
     longest = [f.longest_blur_px for f in frames if f.longest_blur_px is not None]
     shift = [f.shift_px for f in frames if f.shift_px is not None]
     words = []
     if blur and longest:
-        words.append(f"blurred by {np.median(blur):.1f} px in their middle (median), {max(longest):.1f} px at most")
+        words.append(f"blurred by {np.median(blur):.1f} px at the centre (median), {max(longest):.1f} px at most")
     if shift and max(shift) > 0:
-        words.append(f"bent by the rolling shutter by up to {max(shift):.1f} px")
+        words.append(f"distorted by the rolling shutter by up to {max(shift):.1f} px")
     return f"The recorded frames are {' and '.join(words)}." if words else ""
 
 
@@ -354,7 +353,7 @@ def _shares(counts: Mapping[str, int]) -> tuple[Stretch, ...]:
 
 
 def steady_words(frames: Sequence[FrameFacts]) -> list[str]:
-    """A sentence for the exposure where it is the same for all frames, and needs no curve."""
+    """A sentence instead of a plot if all frames have the same exposure."""
     exposures = {facts.exposure_s for facts in frames}
     if len(exposures) != 1 or None in exposures:
         return []
@@ -362,7 +361,7 @@ def steady_words(frames: Sequence[FrameFacts]) -> list[str]:
 
 
 def time_charts(frames: Sequence[FrameFacts], marked: Sequence[int]) -> list[Chart]:
-    """The parameters over the time since the first frame, as far as they are known."""
+    """Plots of the known parameters over the time since the first frame."""
     if not frames:
         return []
     stamps = np.array([f.timestamp_ns for f in frames], np.int64)
@@ -384,10 +383,10 @@ def time_charts(frames: Sequence[FrameFacts], marked: Sequence[int]) -> list[Cha
     wanted = [
         ("Blur", "px", [("longest", column(lambda f: f.longest_blur_px)), ("centre", column(lambda f: f.blur_px))]),
         ("Rotation of the camera", "rad/s", [(name, column(axis(k))) for k, name in enumerate("xyz")]),
-        ("Bent by the rolling shutter", "px", [("largest shift", column(lambda f: f.shift_px))]),
+        ("Rolling-shutter distortion", "px", [("largest shift", column(lambda f: f.shift_px))]),
         ("Exposure", "ms", [] if steady_words(frames) else [("", column(exposure_ms))]),
-        ("Expected gain of deblurring", "dB", [("", column(lambda f: f.gain_db))]),
-        ("Gain by neighbouring frames, by the spectra", "dB", [("", column(joint_gain_db))]),
+        ("Predicted gain of deblurring", "dB", [("", column(lambda f: f.gain_db))]),
+        ("Predicted gain from neighbouring frames", "dB", [("", column(joint_gain_db))]),
         ("Noise", "grey levels", [("", column(lambda f: f.noise_levels))]),
         ("Scene depth", "m", [("", column(lambda f: f.depth_m))]),
         ("Speed of the camera", "m/s", [("", column(lambda f: f.speed_m_s))]),
@@ -396,26 +395,26 @@ def time_charts(frames: Sequence[FrameFacts], marked: Sequence[int]) -> list[Cha
     return [chart for chart in charts if chart is not None]
 
 
-# ── what was left alone ──────────────────────────────────────────────────────────────────────────────────────────
+# ── frames not fully restored ────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Frames with which the same was done for the same reason."""
+    """Frames with the same result for the same reason."""
 
     state: str
     text: str
     varies: bool
-    """The numbers in the text are those of the first such frame."""
+    """Whether the numbers in the text differ between frames; those of the first frame are shown."""
     count: int
     ranges: str
-    """As ``3–9, 12``."""
+    """Frame indices, such as ``3–9, 12``."""
 
 
 def left_alone(frames: Sequence[FrameFacts]) -> list[Reason]:
-    """Frames that were not (fully) restored and remarks on those that were, grouped by what was done and why.
+    """Frames not fully restored, and remarks on restored ones, grouped by result and reason.
 
-    Reasons that differ in their numbers only are one.
+    Reasons that differ only in numbers are merged.
     """
     groups: dict[tuple[str, str], list[tuple[int, str]]] = {}
     for facts in frames:
@@ -431,11 +430,11 @@ def left_alone(frames: Sequence[FrameFacts]) -> list[Reason]:
 
 
 def ranges(numbers: Sequence[int]) -> str:
-    """Rising numbers as ranges: ``3–9, 12``."""
+    """Numbers as ranges: ``3–9, 12``."""
     if not len(numbers):
         return ""
-    rising = np.unique(np.asarray(numbers))
-    runs = np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1)
+    ascending = np.unique(np.asarray(numbers))
+    runs = np.split(ascending, np.flatnonzero(np.diff(ascending) > 1) + 1)
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 

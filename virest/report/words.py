@@ -1,4 +1,4 @@
-"""Numbers and verdicts as people read them: a value with its unit and deviation, a cause in plain words."""
+"""Numbers and verdicts as text: a value with unit and standard deviation, a cause in plain words."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from virest.effects.table import EFFECTS
 
 DIAGNOSIS_WORDS = {
     "consistent": ("good", "The camera model fits this capture"),
-    "explained": ("fair", "The camera model is off, and what is wrong with it was found"),
-    "unexplained": ("poor", "The camera model is off, and no known effect explains all of it"),
+    "explained": ("fair", "The camera model is wrong, and the causes were found"),
+    "unexplained": ("poor", "The camera model is wrong, and no known effect explains all of the error"),
 }
 CAUSE_WORDS = {name: effect.in_words for name, effect in EFFECTS.items()}
 QUANTITY_WORDS = {
     "geometry_rms_px": "points, px",
     "photometric_rms": "brightness, grey levels",
     "blur_rms_px": "blur, px",
-    "edge_profile_rms": "edges, part of the step",
+    "edge_profile_rms": "edges, fraction of the step",
 }
 FIGURE_WORDS = {
-    "residuals": "What is left between tracked and predicted points, over row, time, radius and rate",
-    "ladder": "What was tried on each rung of the ladder, the best on top",
+    "residuals": "Residuals (tracked − predicted points) over row, time, radius and rate",
+    "ladder": "Candidates tried on each rung of the ladder, the best on top",
     "pictures": "A high-motion frame beside its simulation",
 }
 UNITS = {
@@ -43,12 +43,12 @@ PARAMETER_WORDS = {
     "time_offset_s": "Time offset",
     "readout_time_s": "Readout time",
     "readout_direction": "Readout direction",
-    "timestamp": "Stamps mean",
+    "timestamp": "Timestamps mark",
     "exposure_scale": "Exposure scale",
     "clock_skew": "Clock skew",
     "gyro_bias_rad_s": "Gyroscope bias",
     "gyro_scale": "Gyroscope scale",
-    "gyro_lowpass_hz": "Gyroscope's low pass",
+    "gyro_lowpass_hz": "Gyroscope low pass",
     "fx_px": "Focal length",
     "fy_px": "Focal length, vertical",
     "pixel_aspect": "fy / fx",
@@ -64,9 +64,9 @@ CAMERA_KEYS = (
     ("response", "kind"),
     ("scene", "depth_m"),
 )
-"""Places of a profile that the page shows in any case."""
+"""Profile entries that the page always shows."""
 DEFAULTS = {"gyro_bias_rad_s": [0.0, 0.0, 0.0], "clock_skew": 0.0, "exposure_scale": 1.0}
-"""Values that a profile has without stating them: nobody can tell who gave them."""
+"""Default values of a profile; whether they were given or assumed is unknown."""
 SHOWN_COMPONENTS = 4
 
 Mapped = Mapping[str, Any]
@@ -74,7 +74,7 @@ Mapped = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What it came to: how good (``good``, ``fair``, ``poor``), in few words, and in a sentence."""
+    """An assessment: its level (``good``, ``fair``, ``poor``), a headline, and a sentence."""
 
     level: str
     headline: str
@@ -89,18 +89,18 @@ def _listed(value: Any) -> list[Any] | None:
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A number for people, or the word that stands in its place."""
+    """A number as text, or a word such as ``unknown``."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "not known"
+        return "unknown"
     if isinstance(value, bool | str):
         return str(value).replace("inf", "infinity") if value in ("inf", "-inf") else str(value)
     return f"{float(value):.{digits}g}".replace("-", "−") if isinstance(value, int | float) else str(value)
 
 
 def with_deviation(name: str, value: Any, std: Any = None) -> str:
-    """A value with its unit and standard deviation, both to two digits of that: ``14.91 ± 0.05 ms``.
+    """A value with unit and standard deviation, rounded to two digits of the latter: ``14.91 ± 0.05 ms``.
 
-    The unit is read off the name's ending; seconds are shown as milliseconds.
+    The unit follows from the name's ending; seconds are shown as milliseconds.
     """
     values, spread = _listed(value), _listed(std)
     if values is not None:
@@ -127,7 +127,7 @@ def _rounded(value: float, std: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class CameraValue:
-    """A value of the camera that the run used."""
+    """A camera parameter that the run used."""
 
     title: str
     text: str
@@ -136,7 +136,7 @@ class CameraValue:
 
 
 def camera_values(profile: Mapped, profile_source: str) -> list[CameraValue]:
-    """The values that matter, estimated ones with their deviation and how they were found."""
+    """The main camera parameters; estimated ones with standard deviation and method."""
     estimates = profile.get("estimates")
     estimates = estimates if isinstance(estimates, Mapping) else {}
     plain = {keys[-1] if keys[0] != "response" else "response": _inside(profile, keys) for keys in CAMERA_KEYS}
@@ -154,7 +154,7 @@ def _camera_value(name: str, value: Any, estimate: Any, profile_source: str) -> 
     title = PARAMETER_WORDS.get(name, name)
     if not isinstance(estimate, Mapping):
         given = f"given by {profile_source}" if value != DEFAULTS.get(name) else f"{profile_source}, or the default"
-        source = "not known" if value is None else given
+        source = "unknown" if value is None else given
         return CameraValue(title, with_deviation(name, value).replace("_", " "), source, False)
     text = with_deviation(name, estimate.get("value"), estimate.get("std"))
     return CameraValue(title, text, str(estimate.get("source") or "estimated"), True)
@@ -170,14 +170,15 @@ def diagnosis_verdict(verdict: str, causes: Sequence[Mapped], nominal: Mapped) -
     words = [f"Found: {named}." if named else ""]
     if nominal.get("geometry_rms_px") is not None:
         words.append(
-            f"Tracked points were off by {residual_words(nominal['geometry_rms_px'], nominal.get('geometry_noise_px'))}"
+            "Residual of tracked points: "
+            f"{residual_words(nominal['geometry_rms_px'], nominal.get('geometry_noise_px'))}"
             f" ({number(nominal.get('tracks'), 9)} tracks in {number(nominal.get('frames'), 9)} frames)."
         )
     return Verdict(level, headline, " ".join(filter(None, words)))
 
 
 def residual_words(residual_px: Any, noise_px: Any) -> str:
-    """A residual beside tracking noise, which is measured on its own and may come out larger."""
+    """A residual with the tracking noise, which is measured separately and may be larger."""
     shown, noise = f"{number(residual_px, 3)} px", f"{number(noise_px, 3)} px"
     known = all(isinstance(value, int | float) for value in (residual_px, noise_px))
     if known and residual_px < noise_px:
@@ -205,7 +206,7 @@ def cause_view(cause: Mapped) -> dict[str, Any]:
         "before": number(before, 3),
         "after": number(after, 3),
         "left": _part(after, before),
-        "gain": f"{gain:.0%}" if isinstance(gain, int | float) else "not known",
+        "gain": f"{gain:.0%}" if isinstance(gain, int | float) else "unknown",
         "rivals": [
             f"{str(rival.get('name')).replace('_', ' ')} ({number(rival.get('held_out_after'), 3)})"
             for rival in cause.get("rivals") or ()
@@ -214,24 +215,24 @@ def cause_view(cause: Mapped) -> dict[str, Any]:
 
 
 def _part(after: Any, before: Any) -> float | None:
-    """How much of the error is left, 0 to 1, for a bar."""
+    """The remaining fraction of the error, 0 to 1, for a bar."""
     if not all(isinstance(v, int | float) and math.isfinite(v) for v in (after, before)) or not before > 0:
         return None
     return round(min(max(after / before, 0.0), 1.0), 4)
 
 
 def remaining_words(unexplained: Mapped, verdict: str) -> str:
-    """What no cause explains, in a sentence."""
+    """The residual that no cause explains, in a sentence."""
     along = str(unexplained.get("strongest_along") or "nothing in particular")
     value = unexplained.get("p_value")
     p_value = "p unknown" if value is None else f"p = {number(value, 2)}"
     if verdict == "unexplained":
-        return f"What remains is more than chance ({p_value}), strongest along {along}."
+        return f"The remaining residual is significant ({p_value}), strongest along {along}."
     return f"No significant residual ({p_value}, strongest along {along})."
 
 
 def gain_words(gain: Mapped) -> list[tuple[str, str]]:
-    """What the causes do for restored frames, one line a measure."""
+    """What the causes gain on restored frames, one line per measure."""
     lines = []
     if gain.get("sharpness_after") is not None:
         shares = [number(gain.get(f"sharpness_{name}"), 3) for name in ("recorded", "before", "after")]
@@ -245,10 +246,10 @@ def gain_words(gain: Mapped) -> list[tuple[str, str]]:
 
 
 def figure_words(name: str) -> str:
-    """What a figure of a diagnosis shows, by its file's name."""
+    """The caption of a diagnosis figure, by its file name."""
     if re.fullmatch(r"field_\d\d", name):
-        return f"Field {int(name[-2:])}: its value over what it depends on, and the residuals before and after"
+        return f"Field {int(name[-2:])}: its value over its covariates, and the residuals before and after"
     numbered = re.fullmatch(r"\d\d_([a-z_]+)", name)
     if numbered:
-        return f"The rung on which {numbered[1].replace('_', ' ')} entered, and what else was tried there"
+        return f"The rung on which {numbered[1].replace('_', ' ')} entered, with the other candidates"
     return FIGURE_WORDS.get(name, name)

@@ -72,7 +72,7 @@ LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "av", "scikit-image", "
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the chosen sections; figures of each are kept as soon as it is done."""
+    """Run the chosen sections; write the figures of each as soon as it is finished."""
     options = _parse(arguments)
     if options.compare:
         old, new = map(read_report, options.compare)
@@ -97,18 +97,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m virest.app.bench", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", action="append", choices=tuple(SECTIONS), help="this section; may be repeated")
-    size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="a few frames: a look, no measurement")
-    size.add_argument("--full", action="store_true", help="memory up to 3000 frames")
-    parser.add_argument("--preset", action="append", choices=PRESETS, help="of honesty; may be repeated [all]")
-    parser.add_argument("--kind", action="append", choices=tuple(KIND_TITLES), help="of quality; may be repeated [all]")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and runs here, use captures again")
-    parser.add_argument("--seeds", type=int, default=100, help="captures of --only calibration [100]")
-    parser.add_argument("--out", type=Path, default=Path("bench-out"), help="folder of bench.json [bench-out]")
-    parser.add_argument("--compare", nargs=2, type=Path, metavar=("OLD", "NEW"), help="measure nothing, compare these")
     parser.add_argument(
-        "--noise", type=float, default=NOISE, help=f"relative change that is none, for --compare [{NOISE}]"
+        "--only", action="append", choices=tuple(SECTIONS), help="run only this section; may be repeated"
+    )
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="a few frames only: a quick check, not a measurement")
+    size.add_argument("--full", action="store_true", help="measure memory up to 3000 frames")
+    parser.add_argument(
+        "--preset", action="append", choices=PRESETS, help="preset for the section honesty; may be repeated [all]"
+    )
+    parser.add_argument(
+        "--kind",
+        action="append",
+        choices=tuple(KIND_TITLES),
+        help="kind of capture for the section quality; may be repeated [all]",
+    )
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and runs here, and reuse captures")
+    parser.add_argument("--seeds", type=int, default=100, help="number of captures for --only calibration [100]")
+    parser.add_argument("--out", type=Path, default=Path("bench-out"), help="folder for bench.json [bench-out]")
+    parser.add_argument(
+        "--compare", nargs=2, type=Path, metavar=("OLD", "NEW"), help="compare these reports instead of measuring"
+    )
+    parser.add_argument(
+        "--noise", type=float, default=NOISE, help=f"relative change that counts as noise, for --compare [{NOISE}]"
     )
     return parser.parse_args(arguments)
 
@@ -128,7 +139,7 @@ def _version(library: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit that is checked out where the program lies, and whether files differ from it."""
+    """The checked-out commit of the program, and whether files differ from it."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,4 +1,4 @@
-"""Captures with one thing broken each, diagnosed and calibrated: a verdict or a one-line error, never a traceback."""
+"""Diagnose and calibrate captures with one defect each: expected are a verdict or a one-line error, no traceback."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from virest.errors import VirestError
 
 LOGS = ("gyro_accel.csv", "movie_metadata.csv", "frame_timestamps.txt")
 FILLINGS = {"null": "null", "zero": "0", "huge": "1e9", "first": None}
-"""What a column is filled with; None: its first value."""
+"""Values that replace a column; None: its first value."""
 CUT_PARTS = {"its first tenth": (0.1, 1.0), "its second half": (0.0, 0.5), "its middle": None}
 Way = Callable[[Path], None]
 
 
 def broken_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Break simulated captures (and the real ones that are there) in every way, and count how each command ends.
+    """Apply every defect to simulated (and available real) captures, and count how each command ends.
 
-    With --full the measured captures too.
+    Real captures are used only with --full.
     """
     sources = [
         simulated(work, "broken-source", width=240, height=320, frames=24, seed=3, rate_rad_s=1.0, exposure_ms=8),
@@ -41,17 +41,20 @@ def broken_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     faults = [row for row in rows if "fault" in (row["diagnose"], row["calibrate"])]
     header = ["capture", "broken", "diagnose", "calibrate"]
     text = table(header, [[row[key] for key in header] for row in rows])
-    return {"rows": rows, "faults": len(faults)}, f"One thing broken each\n{text}\n{len(faults)} faults in {len(rows)}"
+    return {
+        "rows": rows,
+        "faults": len(faults),
+    }, f"Captures with one defect each\n{text}\n{len(faults)} tracebacks in {len(rows)}"
 
 
 def _measured() -> list[Path]:
-    """Measured captures that are there (the folder named by VIREST_REALDATA)."""
+    """Available real captures (in the folder named by VIREST_REALDATA)."""
     root = Path(os.environ.get("VIREST_REALDATA") or "/nonexistent")
     return sorted(folder.parent for folder in root.glob("*/movie.mp4"))
 
 
 def ended(work: Path, source: Path, way: Way) -> dict[str, str]:
-    """How diagnose and calibrate end on a copy of a capture that was broken: a verdict, ``refused`` or ``fault``."""
+    """How diagnose and calibrate end on a broken copy of a capture: a verdict, ``refused`` or ``fault``."""
     folder = work / f"broken-{source.name}"
     shutil.copytree(source, folder, ignore=shutil.ignore_patterns("truth*"))
     try:
@@ -71,13 +74,13 @@ def _end(call: Callable[[], str]) -> str:
         return call()
     except VirestError:
         return "refused"
-    except Exception:  # a fault is what this looks for
+    except Exception:  # unexpected exceptions are what this test counts
         traceback.print_exc()
         return "fault"
 
 
 def ways(source: Path) -> Iterator[tuple[str, Way]]:
-    """Name of what is broken, and how to break it, for the files that a capture has."""
+    """Name of each defect and the function that applies it, for the files of a capture."""
     for log in (source / name for name in LOGS):
         if not log.exists():
             continue

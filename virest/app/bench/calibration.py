@@ -1,7 +1,7 @@
-"""Whether deviations hold: calibrate simulated captures whose truth is known, and compare errors with deviations.
+"""Whether standard deviations are right: calibrate simulated captures and compare errors with standard deviations.
 
-Each seed draws what is hidden, and how the capture is taken: motion, travel, blur, exposures, noise, bit rate, scene,
-lens, layout.  Seeds below FIRST_SEED are for those who look for constants; this command judges by others.
+Each seed draws the hidden values and the conditions: motion, travel, blur, exposures, noise, bit rate, scene, lens,
+layout.  Seeds below FIRST_SEED are reserved for choosing constants; this command uses others.
 
 For each value the table shows median |error| / deviation (0.67 where deviations hold), the part of errors within two
 deviations (0.95), the mean error in deviations, which a bias moves from 0, and a histogram.  "share" is the part of
@@ -44,12 +44,12 @@ SCENES = ("leaves", "text", "board", "photographs")
 FIRST_SEED = 2001
 FIGURE = "calibration.png"
 USUAL_MEDIAN = 0.6745
-"""Of |x| for a standard normal x."""
+"""Median of |x| for a standard normal x."""
 BINS = np.array([-np.inf, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, np.inf])
 
 
 def calibration_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Calibrate one capture a seed; draws the histograms into the report's folder, where there is one."""
+    """Calibrate one capture per seed; draw the histograms into the report's folder, if given."""
     seeds = QUICK_SEEDS if scale.quick else scale.seeds
     rows = [row for k in range(seeds) for row in calibrated_rows(work, FIRST_SEED + k)]
     names = list(dict.fromkeys(row["value"] for row in rows))
@@ -65,7 +65,7 @@ def calibration_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def drawn_capture(seed: int) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]:
-    """How the seed's capture is taken, the effects that it hides, and what is calibrated beside the usual."""
+    """The seed's capture options, its hidden effects, and the extra parameters to calibrate."""
     rng = np.random.default_rng([seed, 93])
     width, height = (360, 480) if rng.integers(2) else (480, 360)
     exposure_ms, vary, travels = float(rng.uniform(2, 14)), bool(rng.integers(2)), rng.uniform() < 0.2
@@ -89,7 +89,7 @@ def drawn_capture(seed: int) -> tuple[dict[str, Any], tuple[str, ...], tuple[str
 
 
 def calibrated_rows(work: Path, seed: int) -> list[Row]:
-    """Errors and deviations of all values of one capture; none where the calibration refuses it."""
+    """Errors and standard deviations of all values of one capture; none if the calibration refuses it."""
     taken, hidden, extra = drawn_capture(seed)
     folder = work / f"calibration_{seed}"
     simulate_command(folder, frames=FRAMES, seed=seed, effects=hidden, **taken)
@@ -108,7 +108,7 @@ def calibrated_rows(work: Path, seed: int) -> list[Row]:
 
 
 def errors_of(found: GeometryCalibration, truth: CameraProfile) -> list[Row]:
-    """Error and deviation of each number of what was determined."""
+    """Error and standard deviation of each determined number."""
     rows = []
     for value in found.values:
         true = _true_value(value, found.profile, truth)
@@ -164,7 +164,7 @@ def _true_value(value: CalibratedValue, found: CameraProfile, truth: CameraProfi
 
 
 def summed(rows: Sequence[Row]) -> dict[str, Any]:
-    """What one value's errors in deviations amount to, and the share of noise that its errors ask for."""
+    """Statistics of one value's errors in standard deviations, and the shared noise that its errors imply."""
     known = np.array([row["error_in_std"] for row in rows])
     name = _TERMS[rows[0]["value"]][0]
     in_use = STILL_SHARED.get(name, STILL_SHARED_OTHER)
@@ -180,7 +180,7 @@ def summed(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _factor_asked(rows: Sequence[Row]) -> float:
-    """By what factor the shared part would have to be multiplied for the median |error| / deviation to be usual."""
+    """Factor on the shared part of the noise that would bring the median |error| / deviation to its normal value."""
     error, std, shared = (np.array([row[key] for row in rows]) for key in ("error", "std", "shared_std"))
     rest = np.maximum(std**2 - shared**2, 0.0)
     factors = np.linspace(0.0, 4.0, 401)

@@ -1,10 +1,10 @@
-"""How far coding draws points to the motion of the blocks above and to the left (:mod:`virest.inference.coded_motion`).
+"""How far video coding pulls points to the motion of the blocks above and left (:mod:`virest.inference.coded_motion`).
 
 $ python -m virest.app.bench --only coding --quick
 
-Captures of which nothing is wrong, of four motions and contents, each read downwards, upwards, to the right and to the
-left and coded at three rates: by how much the time offset and the principal point that their points ask for are off,
-each fitted alone, and what errors of a step, over the square of its noise, those ask for: by rows, at one instant.
+Captures without any model error, with four motions and contents, are read in all four directions and coded at three bit
+rates.  Measured, each fitted alone: the errors of the time offset and of the principal point from their points, and the
+coding errors of a step, divided by the square of its noise, that these imply: by rows, and at one instant.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FIRST_SEED, FRAMES, MOST_POINTS = 9101, 84, 7000
 
 
 def coding_section(work: Path, scale: Scale) -> tuple[Row, str]:
-    """Measure captures of all scenes, read and coded in all ways; quick: of one."""
+    """Measure captures of all scenes with every readout direction and bit rate; quick: of one scene."""
     scenes = list(enumerate(SCENES))[:: len(SCENES) if scale.quick else 1]
     rows = [_row(work, *one) for one in product(scenes, READOUT_DIRECTIONS, BITS_PER_PX)]
     return {"captures": rows}, _text(rows)
@@ -88,17 +88,17 @@ def _text(rows: list[Row]) -> str:
              *(_asked(some, kind) for kind in ("by_rows", "left", "above"))]
         )  # fmt: skip
     header = ["read", "bits/px", "noise px", "offset µs", "cx px", "cy px",
-              "by rows: asked 1/px, rms", "at once, left", "at once, above"]  # fmt: skip
+              "by rows: implied 1/px, rms", "at once, left", "at once, above"]  # fmt: skip
     lines.append(["all", "", "", "", "", "", "", _asked(rows, "left"), _asked(rows, "above")])
     for name, read in (("columns", "left_to_right right_to_left"), ("rows", "top_to_bottom bottom_to_top")):
         lines.append(
             [name, "", "", "", "", "", _asked([row for row in rows if row["read"] in read], "by_rows"), "", ""]
         )
     in_use = f"in use: by rows {BY_ROWS_PER_PX}, at once {AT_ONCE_PER_PX} (left, above)"
-    return f"CODING: points drawn to the motion of the blocks above and to the left; {in_use}\n{table(header, lines)}"
+    return f"CODING: points pulled to the motion of the blocks above and to the left; {in_use}\n{table(header, lines)}"
 
 
 def _asked(rows: list[Row], kind: str) -> str:
-    """Mean and root mean square of what captures ask for."""
+    """Mean and rms of the coding errors that captures imply."""
     asked = np.array([row[kind] for row in rows])
     return f"{asked.mean():+.1f} {np.sqrt(np.mean(asked**2)):.1f}"

@@ -1,4 +1,4 @@
-"""The commands that a person waits for: ``--help``, ``inspect``, ``calibrate`` and ``diagnose``.
+"""The time of interactive commands: ``--help``, ``inspect``, ``calibrate`` and ``diagnose``.
 
 $ python -m virest.app.bench --only commands --quick
 """
@@ -15,9 +15,9 @@ from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, Timing, looped_capture, simulated, timed
 
 HELP_TRIES, INSPECT_TRIES = 5, 2
-"""The quickest counts; one start before fills the system's caches."""
+"""Number of runs, of which the fastest counts; one run before fills the system's caches."""
 INSPECTED_FRAMES = 18_000
-"""Ten minutes at 30 frames a second."""
+"""10 min at 30 frames/s."""
 FITTED_FRAMES, FPS = 960, 30.0
 SIZE, QUICK_SIZE, PHONE_SIZE = (640, 480), (320, 240), (720, 1280)
 HIDDEN = (
@@ -28,21 +28,21 @@ HIDDEN = (
     "response_curve=1.3",
     "vignetting=0.5",
 )
-"""In the captures of a phone's size; not with --quick, for they take some ten minutes to simulate."""
+"""Effects hidden in the full-size captures; not with --quick, since these take about 10 min to simulate."""
 HELP_S, INSPECT_S = 0.3, 5.0
-"""What is asked of the first two; the others are to be quicker than the capture is long."""
+"""Limits of the first two commands; for the others the limit is the capture's duration."""
 Facts = dict[str, Any]
 
 
 def commands_section(work: Path, scale: Scale) -> tuple[Facts, str]:
-    """Time each as a process of its own, from its start to its end."""
+    """Time each command as a separate process, from start to end."""
     rows = [_help(), _inspect(work), *_fits(work, QUICK_SIZE if scale.quick else SIZE)]
     rows += [] if scale.quick else _fits(work, PHONE_SIZE, HIDDEN)
     return {"commands": rows}, commands_text(rows)
 
 
 def _virest(*arguments: str) -> list[str]:
-    """Give the installed script's command line, as people call it."""
+    """The command line of the installed script."""
     script = Path(sys.executable).with_name("virest")
     return [*([str(script)] if script.is_file() else [sys.executable, "-m", "virest"]), *arguments]
 
@@ -54,7 +54,7 @@ def _help() -> Facts:
 
 
 def _inspect(work: Path) -> Facts:
-    """Of ten minutes of 720x1280, half a gigabyte."""
+    """Time of inspect on 10 min of 720x1280, 0.5 GB."""
     capture = looped_capture(work, INSPECTED_FRAMES)
     tries = [timed(_virest("inspect", str(capture))) for _ in range(INSPECT_TRIES)]
     shutil.rmtree(capture)
@@ -62,7 +62,7 @@ def _inspect(work: Path) -> Facts:
 
 
 def _fits(work: Path, size: tuple[int, int], hidden: tuple[str, ...] = ()) -> list[Facts]:
-    """Calibrate and diagnose one capture that was simulated as a whole, without loops."""
+    """Calibrate and diagnose one capture that is simulated in full, not looped."""
     width, height = size
     options: dict[str, Any] = {"exposure_ms": 8.0, "rate_rad_s": 1.0, "noise_levels": 1.5, "seed": 31}
     options |= {"width": width, "height": height, "frames": FITTED_FRAMES, "effects": list(hidden)}
@@ -87,7 +87,7 @@ def _fits(work: Path, size: tuple[int, int], hidden: tuple[str, ...] = ()) -> li
 
 
 def record(name: str, title: str, tries: list[Timing], asked_s: float) -> Facts:
-    """What the quickest of some tries took, and which part of what is allowed."""
+    """The time of the fastest run, and its fraction of the limit."""
     best = min(tries, key=lambda timing: timing.wall_s)
     return {
         "command": name,
@@ -103,7 +103,7 @@ def record(name: str, title: str, tries: list[Timing], asked_s: float) -> Facts:
 
 
 def commands_text(rows: list[Facts]) -> str:
-    """One line a command."""
+    """One line per command."""
     lines = []
     for row in rows:
         if row["exit_code"]:

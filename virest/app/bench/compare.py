@@ -1,4 +1,4 @@
-"""Two bench.json side by side: every figure that both have, new over old, and which changes are more than noise.
+"""Compare two bench.json: every figure in both, new over old, and which changes exceed the noise.
 
 $ python -m virest.app.bench --compare OLD.json NEW.json
 """
@@ -30,14 +30,14 @@ NAMES = (
     "hidden",
     "seed",
 )
-"""Keys that name a record of a list; others are told apart by ``frame`` or ``frames`` where they are numbers."""
+"""Keys that identify a record of a list; others are identified by a numeric ``frame`` or ``frames``."""
 NOISE = 0.15
 """Relative change below which two timings on one quiet machine may be the same."""
 MEMORY_NOISE = 0.05
 NOISE_DB = 0.05
-"""Decibels do not depend on the machine's load, and a ratio of gains means nothing near zero."""
+"""Absolute, since gains in dB do not depend on the machine's load, and a ratio of gains is meaningless near zero."""
 BUSY_CORES = 0.25
-"""Beyond this the wall clock says little."""
+"""Above this, wall-clock times are unreliable."""
 MORE_IS_BETTER = ("frames_per_s", "_db", "share_of_floor", "share_of_floor_by_cpu", "share_of_floor_by_stages",
                   "frames_per_s_by_cpu", "scaling", "scaling_by_cpu",
                   "right", "good_done", "cores_that_fill_the_link")  # fmt: skip
@@ -45,44 +45,44 @@ LESS_IS_BETTER = ("_s", "_mb", "s_per_frame", "cpu_s_per_frame", "part_of_asked"
                   "wall_exponent", "estimate_share", "estimate_share_with_planning", "grown", "dollars",
                   "core_hours", "straightened_median_px", "straightened_p90_px", "promise_off", "worse_share",
                   "promised_and_worse")  # fmt: skip
-"""The last part of a figure's path that says anything; with an underscore in front, its end."""
+"""Last meaningful part of a figure's path; with a leading underscore, its ending."""
 NO_FIGURES = ("load", "others_cores", "busiest_others_cores", "asked_s", "exit_code")
-"""Of the machine or of the question, told elsewhere."""
+"""Facts about the machine or the settings, which are reported elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One figure that both reports have."""
+    """One figure in both reports."""
 
     name: str
     """Path, such as ``speed.presets[fast].frames_per_s``."""
     old: float
     new: float
     mark: str
-    """``better``, ``worse``, ``changed`` (no direction is the better one), or empty within the noise."""
+    """``better``, ``worse``, ``changed`` (neither direction is better), or empty within the noise."""
 
     @property
     def ratio(self) -> float | None:
-        """New over old; None where the old one is 0."""
+        """New over old; None if the old value is 0."""
         return self.new / self.old if self.old else None
 
 
 def read_report(path: Path) -> Report:
-    """Read one bench.json; raises ValueError where it is none."""
+    """Read one bench.json; raises ValueError for other files."""
     report = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(report, dict) or "virest_bench" not in report:
-        raise ValueError(f"{path}: no report of this bench")
+        raise ValueError(f"{path}: not a report of this benchmark")
     return report
 
 
 def compared(old: Report, new: Report, noise: float = NOISE) -> list[Change]:
-    """All figures of both, in the new report's order."""
+    """All common figures, in the new report's order."""
     before, after = dict(figures(old)), dict(figures(new))
     return [Change(n, before[n], v, _mark(n, before[n], v, noise)) for n, v in after.items() if n in before]
 
 
 def compare_text(old: Report, new: Report, noise: float = NOISE) -> str:
-    """Differences of machines and versions, then every figure, then what only one report has."""
+    """Differences of machines and versions, then every figure, then the sections of only one report."""
     changes = compared(old, new, noise)
     rows = [[c.name, f"{c.old:.6g}", f"{c.new:.6g}", _ratio_text(c), c.mark] for c in changes]
     flagged = sum(bool(change.mark) for change in changes)
@@ -95,7 +95,7 @@ def compare_text(old: Report, new: Report, noise: float = NOISE) -> str:
 
 
 def differences(old: Report, new: Report) -> list[str]:
-    """One line for each thing that makes the two reports less comparable; the load always."""
+    """One line for each difference that makes the reports less comparable."""
     before, after = ({**r.get("versions", {}), "scale": r.get("scale")} for r in (old, new))
     lines = [
         f"{key}: {before.get(key)} -> {after.get(key)}"
@@ -103,15 +103,15 @@ def differences(old: Report, new: Report) -> list[str]:
         if before.get(key) != after.get(key) or key == "load"
     ]
     if before["scale"] != after["scale"]:
-        lines.append("the scales differ: frames and sizes are not the same, so neither are the figures")
+        lines.append("the scales differ: numbers of frames and sizes are not the same, so figures are not comparable")
     for word, report in (("old", old), ("new", new)):
-        lines += [f"{word} {name}: others kept {cores:.1f} cores busy, look at figures by CPU time"
+        lines += [f"{word} {name}: other processes kept {cores:.1f} cores busy; compare figures by CPU time"
                   for name, cores in _busy_sections(report)]  # fmt: skip
     return [*lines, ""] if lines else []
 
 
 def _busy_sections(report: Report) -> Iterator[tuple[str, float]]:
-    """Sections during which others used more than BUSY_CORES, and how many."""
+    """Sections during which other processes used more than BUSY_CORES, with their number of cores."""
     for section, facts in report.items():
         cores = max(_others_cores(facts), default=0.0)
         if cores > BUSY_CORES:
@@ -119,7 +119,7 @@ def _busy_sections(report: Report) -> Iterator[tuple[str, float]]:
 
 
 def _others_cores(value: Any) -> Iterator[float]:
-    """Every ``others_cores`` of a section, however deep."""
+    """Every ``others_cores`` in a section, at any depth."""
     if isinstance(value, dict):
         yield from (float(cores) for key, cores in value.items() if key == "others_cores")
     for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
@@ -127,7 +127,7 @@ def _others_cores(value: Any) -> Iterator[float]:
 
 
 def _only_one(old: Report, new: Report) -> list[str]:
-    """Sections that cannot be compared."""
+    """Sections in only one of the reports."""
     sections = [
         {key for key, value in report.items() if isinstance(value, dict)} - {"versions"} for report in (old, new)
     ]
@@ -161,7 +161,7 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, float]]:
 
 
 def _identity(record: Any, position: int) -> str:
-    """What tells a record from its neighbours, so that lists may grow or change their order; else its place."""
+    """The identity of a record, so that lists may grow or change order; else its position."""
     if not isinstance(record, dict):
         return str(position)
     words = [str(record[key]) for key in NAMES if isinstance(record.get(key), str | int | None) and key in record]
@@ -183,9 +183,9 @@ def _mark(name: str, old: float, new: float, noise: float) -> str:
 
 
 def better_direction(name: str) -> int:
-    """1 where more is better, -1 where less is, 0 where neither: by the unit that a figure's own name carries.
+    """1 if more is better, -1 if less is better, 0 if neither, by the unit in the figure's name.
 
-    Decides by the last part of the path that says anything, so that ``gain_db.fast`` is in decibels.
+    The last meaningful part of the path decides, so that ``gain_db.fast`` is in decibels.
     """
     for part in reversed(name.split(".")):
         plain = part.partition("[")[0]

@@ -1,4 +1,4 @@
-"""What ten thousand captures of five minutes cost, from the CPU times that the section ``speed`` measured.
+"""The cost of 10,000 captures of 5 min, from the CPU times of the section ``speed``.
 
 $ python -m virest.app.bench --only speed --only cost
 """
@@ -16,19 +16,19 @@ from virest.app.bench.workload import Scale, looped_capture, run_process
 
 CAPTURES, MINUTES, FPS = 10_000, 5, 30
 DOLLARS_PER_CORE_HOUR = 0.04
-"""Assumed: a rented core with 4 GB, on demand; spot prices are a third."""
+"""Assumption: a rented core with 4 GB, on demand; spot prices are 1/3."""
 DOLLARS_PER_TB_MONTH = 23.0
-"""Assumed: an object store."""
+"""Assumption: object storage."""
 LINK_GBIT_S = 10.0
-"""Assumed: what the storage takes in."""
+"""Assumption: bandwidth of writing to the storage."""
 SAMPLE_FRAMES = 30
 
 
 def cost_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Extrapolate CPU hours, bytes and dollars; say which part saturates first."""
+    """Extrapolate CPU hours, bytes and dollars, and the number of cores that saturate the storage link."""
     presets = _measured(work.parent / "bench.json")
     if not presets:
-        return {}, "COST: needs the frames a second of --only speed, in the same bench.json"
+        return {}, "COST: needs the frame rates of --only speed, in the same bench.json"
     picture_bytes, movie_bytes = _bytes_per_frame(work)
     frames = CAPTURES * MINUTES * 60 * FPS
     rows = [_cost(preset, rate / JOBS, frames, picture_bytes) for preset, rate in presets.items()]
@@ -37,7 +37,7 @@ def cost_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def _measured(path: Path) -> dict[str, float]:
-    """Frames a second of each preset with JOBS processes, by CPU time: core hours are paid, waiting is not."""
+    """Frames per second of each preset with JOBS processes, by CPU time, since core hours are paid."""
     if not path.is_file():
         return {}
     report = json.loads(path.read_text(encoding="utf-8"))
@@ -46,7 +46,7 @@ def _measured(path: Path) -> dict[str, float]:
 
 
 def _bytes_per_frame(work: Path) -> tuple[float, float]:
-    """Bytes of a frame's PNG, and of its part of the movie."""
+    """Bytes per frame of the PNGs and of the movie."""
     capture, out = looped_capture(work, SAMPLE_FRAMES), work / "cost"
     run = run_process(capture, out, "--preset", "fast", "--jobs", str(JOBS))
     sizes = [(run.folder / line["output"]).stat().st_size for line in run.lines if line["output"]]
@@ -55,7 +55,7 @@ def _bytes_per_frame(work: Path) -> tuple[float, float]:
 
 
 def _cost(preset: str, per_core_s: float, frames: int, picture_bytes: float) -> dict[str, Any]:
-    """CPU hours and dollars, and how many cores fill the storage's link with pictures."""
+    """CPU hours and dollars, and the number of cores that saturate the storage link."""
     hours = frames / per_core_s / 3600
     return {
         "preset": preset,

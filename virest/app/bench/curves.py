@@ -1,7 +1,7 @@
-"""What the exposure curve is worth: the same frames restored with the right curve, none, and wrong ones.
+"""The value of the exposure curve: the same frames restored with the right curve, none, and wrong ones.
 
-Everything but the curve is known and the same, so PSNR against truth differs by the curve alone.  The last table asks
-the same of clipped light: with the curve's word on what is clipped, without, and where nothing was clipped at all.
+Everything but the curve is known and equal, so PSNR against truth differs only by the curve.  The last table measures
+the value of masking clipped pixels: with the curve's clipping mask, without it, and in a capture without clipping.
 """
 
 from __future__ import annotations
@@ -25,41 +25,41 @@ from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS, RestorationSettings
 
 FINE_BITS = 1.0
-"""Bits per pixel: what the codec takes away is no matter of the curve."""
+"""Bits per pixel; high, so that coding loss does not mask the effect of the curve."""
 BASE: dict[str, Any] = {"width": 640, "height": 480, "exposure_ms": 16.0, "rate_rad_s": 1.4, "noise_levels": 1.0,
                         "bitrate_bits_per_px": FINE_BITS}  # fmt: skip
 SEEDS = (11, 12, 13)
 GAMMA, LINEAR, SRGB = ResponseCurve("gamma", gamma=2.2), ResponseCurve("linear"), ResponseCurve("srgb")
 BENT = ResponseCurve("five_segment", b=(0.065, 0.048), c=(0.4, 0.6), y_max=1.0)
-"""Of dead leaves, toe and shoulder together hold about a fifth of the pixels."""
+"""With dead leaves, toe and shoulder together hold about 1/5 of the pixels."""
 OTHER_KNOTS = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
 CURVES: dict[str, tuple[ResponseCurve, dict[str, ResponseCurve]]] = {
     "gamma 2.2": (GAMMA, {"none (linear)": LINEAR, "gamma 1.2": ResponseCurve("gamma", gamma=1.2),
                           "gamma 1 / 2.2": ResponseCurve("gamma", gamma=1 / 2.2)}),
     "toe and shoulder": (BENT, {"none (linear)": LINEAR, "other knots": OTHER_KNOTS, "srgb": SRGB}),
 }  # fmt: skip
-"""The camera's curve, and what else a restoration is told."""
+"""The camera's curve, and the other curves that the restoration uses."""
 CODED_PX = 8
-"""A codec's block, over which it spreads what it gets wrong."""
+"""Block size of the codec, over which it spreads its errors."""
 Mask = NDArray[np.bool_]
 
 
 class UnmaskedCurve(ResponseCurve):
-    """The same curve, which takes clipped greys for measured ones."""
+    """The same curve, treating clipped grey levels as measured ones."""
 
     __slots__ = ()
 
     def censored_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
-        """No grey is censored."""
+        """No grey level is censored."""
         return np.zeros(256, bool)
 
     def clipped_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
-        """No grey is clipped."""
+        """No grey level is clipped."""
         return np.zeros(256, bool)
 
 
 def unmasked(curve: ResponseCurve) -> UnmaskedCurve:
-    """The curve without its word on what is clipped."""
+    """The curve without its clipping mask."""
     return UnmaskedCurve(**{f.name: getattr(curve, f.name) for f in fields(curve)})
 
 
@@ -75,7 +75,7 @@ def curves_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def curve_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) -> list[dict[str, Any]]:
-    """PSNR of every frame with the camera's own curve and with others, one record a curve."""
+    """PSNR of every frame with the camera's own curve and with others, one record per curve."""
     true, others = CURVES[name]
     captures = [_capture(work, f"{name}-{seed}", response=true, seed=seed, frames=frames) for seed in seeds]
     told = {"right": true, **others}
@@ -115,9 +115,9 @@ def _psnrs_db(capture: Path, curve: ResponseCurve, deblur: str | None = None) ->
 
 
 def restored(capture: Path, curve: ResponseCurve, deblur: str | None = None) -> list[RestoredFrame]:
-    """All frames of a capture with preset balanced, by somebody who takes ``curve`` for the camera's.
+    """All frames of a capture restored with preset balanced and ``curve`` as the camera's curve.
 
-    Each frame by itself: beside clipped light frames do without their neighbours, and the masks alone are compared.
+    Each frame is restored alone: near clipped highlights neighbours are not used, and only the masks are compared.
     """
     recorded = read_capture(capture)
     settings: RestorationSettings = replace(PRESETS["balanced"], neighbours=0)
@@ -128,7 +128,7 @@ def restored(capture: Path, curve: ResponseCurve, deblur: str | None = None) -> 
 
 
 def inside(result: RestoredFrame, shape: tuple[int, ...]) -> Mask:
-    """(h, w) where a frame holds real data, less a margin."""
+    """(h, w) mask of a frame's recorded data, less a margin."""
     x0, y0, x1, y1 = result.valid_px
     mask = np.zeros(shape[:2], bool)
     mask[y0 + MARGIN_PX : y1 - MARGIN_PX, x0 + MARGIN_PX : x1 - MARGIN_PX] = True
@@ -146,13 +146,13 @@ def masked_psnr_db(picture: Picture | None, truth: Picture, mask: Mask) -> float
 
 
 CLIPPING = ("sunlit", "lamps")
-"""Leaves in light that clips CLIPPED_SHARE of the pixels; leaves with lamps and glints 2 to 12 times too bright,
-on some 3 % of the area."""
+"""Leaves exposed so that CLIPPED_SHARE of the pixels clips; leaves with lights and glints 2 to 12 times too bright on
+about 3 % of the area."""
 CLIPPED_SHARE = 0.03
 
 
 def clipping_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) -> list[dict[str, Any]]:
-    """PSNR near clipped light and elsewhere: with the mask, without, and of the capture in which nothing clips."""
+    """PSNR near clipped highlights and elsewhere: with the mask, without, and for the capture without clipping."""
     pairs = [_clipping_pair(work, name, seed, frames) for seed in seeds]
     readers: dict[str, Callable[[Path, Path, float], list[RestoredFrame]]] = {
         "with the mask": lambda clipped, _less, _gain: restored(clipped, GAMMA),
@@ -191,7 +191,7 @@ def _exposed_up(results: list[RestoredFrame], gain: float) -> list[RestoredFrame
 
 
 def _near_and_far(results: list[RestoredFrame], clipped: Path) -> list[list[float]]:
-    """Of each frame: PSNR within a blur path of clipped light, farther away, of all; and the clipped share."""
+    """For each frame: PSNR within a blur path of clipped highlights, farther away, and overall; the clipped share."""
     found: list[list[float]] = []
     for result in results:
         truth = truth_frame(clipped, result.frame.index)
@@ -209,7 +209,7 @@ def _near_and_far(results: list[RestoredFrame], clipped: Path) -> list[list[floa
 
 
 def _curves_text(rows: list[dict[str, Any]]) -> str:
-    head = ["camera's curve", "told", "PSNR", "gain", "right is better by", "least"]
+    head = ["camera's curve", "used", "PSNR", "gain", "right is better by", "least"]
     cells = [
         [row["camera"], row["told"], f"{row['psnr_db']:.2f}", f"{row['gain_db']:+.2f}",
          f"{row['right_minus_this_db']:+.2f}", f"{row['least_right_minus_this_db']:+.2f}"]

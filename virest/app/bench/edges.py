@@ -1,4 +1,4 @@
-"""What edges show: a phone's sharpening, or that nobody sharpened (:mod:`unsharp_mask`), and defocus.
+"""What edges reveal: the phone's sharpening or its absence (:mod:`unsharp_mask`), and defocus.
 
 $ python -m virest.app.bench --only edges --quick
 """
@@ -27,9 +27,9 @@ Row = dict[str, Any]
 SCENES = ("leaves", "text", "board", "bright", "photographs")
 SIZES = ((320, 240), (640, 480))
 MOTIONS = ((0.4, 6.0), (0.6, 8.0), (1.2, 12.0))
-"""Turn rate in rad/s and exposure in ms."""
+"""Rotation rate in rad/s and exposure in ms."""
 MASKS = ((0.0, 1.0), (0.4, 1.0), (0.7, 1.0), (1.0, 1.5))
-"""Amount and radius; the first is none."""
+"""Amount and radius; the first entry is no sharpening."""
 FRAMES, FIRST_SEED = 6, 7000
 DEFOCUS_PX, SOFT_SCENES = (2.0, 2.5, 3.0, 3.5), ("leaves", "text", "board", "photographs")
 SOFT_FRAMES, FIRST_SOFT_SEED = 60, 7200
@@ -70,7 +70,7 @@ def _row(
 
 
 def _soft_row(work: Path, number: int, hidden: tuple[float, str]) -> Row:
-    """Fit the defocus of one capture, of which nothing else is wrong, to its edges."""
+    """Fit the defocus of one capture, its only model error, to its edges."""
     sigma_px, scene = hidden
     rng = np.random.default_rng([FIRST_SOFT_SEED, number])
     capture = simulated(
@@ -96,13 +96,13 @@ def _soft_text(rows: list[Row]) -> str:
     ]
     off = np.array([row["told_px"] / row["sigma_px"] - 1 for row in told])
     return (
-        f"DEFOCUS, px: told less hidden is {np.mean(off):+.3f} of it in the mean, rms {np.sqrt(np.mean(off**2)):.3f},\n"
-        f"in {len(told)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "told"], lines)
+        f"DEFOCUS, px: relative error {np.mean(off):+.3f} in the mean, rms {np.sqrt(np.mean(off**2)):.3f},\n"
+        f"in {len(told)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "estimated"], lines)
     )
 
 
 def _overshoot(capture: Path) -> Overshoot | None:
-    """Of the least blurred frames, as planning looks at them."""
+    """Overshoot in the least blurred frames, as planning measures it."""
     source = open_source(capture)
     trajectory = integrate_gyro(source.capture.imu, source.profile)
     lens = moving_lens(trajectory, source.profile)
@@ -122,7 +122,7 @@ def _text(groups: list[list[Row]]) -> str:
         "all edges",
         "sharpest",
         "most",
-        f"seen (p < {FALSE_ALARM:g})",
+        f"detected (p < {FALSE_ALARM:g})",
         "amount",
         "radius px",
         "undone",
@@ -147,8 +147,8 @@ def _text(groups: list[list[Row]]) -> str:
             ]
         )
     return (
-        "EDGES: overshoot beside flat plateaus, as part of the step, mean ± its deviation from capture to capture;\n"
-        "what of a phone's sharpening is seen, fitted to the sharpest edges, and undone of all captures' amount\n"
+        "EDGES: overshoot beside flat plateaus, as a fraction of the step, mean ± deviation between captures;\n"
+        "how often a phone's sharpening is detected, the mask fitted to the sharpest edges, and the amount undone\n"
         + table(header, lines)
     )
 

@@ -1,6 +1,6 @@
-"""Hide an effect that no catalogue names, diagnose, and try what was found: in pictures, and on another capture.
+"""Hide an effect outside the catalogue, diagnose, and apply the result: to frames, and to another capture.
 
-The diagnosis reads the capture's folder only.  Sizes of both signs, weak and strong, come from the case's seed.
+The diagnosis reads only the capture's folder.  Sign and size (weak, strong) of the effect come from the case's seed.
 """
 
 from __future__ import annotations
@@ -36,40 +36,40 @@ Array = NDArray[np.float64]
 Row = dict[str, Any]
 Draw = Callable[[np.random.Generator, float], "Strangeness"]
 SIZE, SMALL, FPS = (640, 480), (480, 360), 30.0
-"""Of captures with an unknown effect, and of those without."""
+"""First seeds of captures with an unknown effect, and of captures without."""
 FRAMES, FRAMES_OF_OTHER = 96, 50
 FIRST_SEED, FIRST_NULL = 7100, 8100
 SEEDS = {"quick": 1, "usual": 2, "full": 6}
 NULLS = {"quick": 4, "usual": 16, "full": 50}
 SCENES = ("leaves", "text", "board", "bright", "photographs")
 SOLVED = 0.8
-"""Part of the excess residual that a right field takes away."""
+"""Fraction of the excess residual that a correct field must remove."""
 PRESET, LOOKED_AT, HARM_DB = "balanced", "8:96:16", 0.1
-"""How pictures are restored with what was found and without it, which of them, and what counts as a loss."""
+"""Settings and frames of the restorations with and without the result, and the loss in dB that counts as harm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Strangeness:
-    """What is strange about a phone, and what a diagnosis should say of it."""
+    """The unknown effect of a phone, and the diagnosis that is expected."""
 
     hidden: Hidden = NOTHING
     tangential: tuple[float, float] = (0.0, 0.0)
     """p1 and p2 of the lens."""
     effects: tuple[str, ...] = ()
-    """Effects of the catalogue, with their values."""
+    """Catalogue effects with their values."""
     expected: tuple[frozenset[tuple[str, str]], ...] = ()
-    """Per field: kinds and covariates that are right."""
+    """Per field: the acceptable kinds and covariates."""
     lasting: bool = True
-    """Whether another capture of the phone has it too."""
+    """Whether other captures of the phone have it too."""
     nameless: bool = False
-    """Whether neither a cause nor a form describes it: then nothing named is right."""
+    """Whether no cause and no form describes it: then only an unnamed result is right."""
 
 
 def _either(*pairs: tuple[str, str]) -> frozenset[tuple[str, str]]:
     return frozenset(pairs)
 
 
-# ── what is hidden ───────────────────────────────────────────────────────────────────────────────────────────────
+# ── hidden effects ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _sign(rng: np.random.Generator) -> float:
@@ -77,7 +77,7 @@ def _sign(rng: np.random.Generator) -> float:
 
 
 def _uneven(rng: np.random.Generator, size: float) -> Strangeness:
-    """Rows late by a parabola, a wave, or in two blocks with a pause between them."""
+    """Row delays: a parabola, a wave, or two blocks with a pause between them."""
     late_s, kind = _sign(rng) * size * 1.1e-3 * rng.uniform(0.8, 1.25), int(rng.integers(3))
     pause = float(rng.uniform(0.3, 0.7))
 
@@ -119,7 +119,7 @@ def _gap(rng: np.random.Generator, size: float) -> Strangeness:
 
 
 def _breathing(rng: np.random.Generator, size: float) -> Strangeness:
-    """The focus goes to and fro, and the focal length with it."""
+    """The focus oscillates, and the focal length with it."""
     per_dioptre = _sign(rng) * 0.006 * size * rng.uniform(0.8, 1.25)
     far, near = rng.uniform(0.2, 0.8), rng.uniform(2.0, 3.5)
     there_s, back_s = rng.uniform(0.6, 1.1), rng.uniform(1.9, 2.5)
@@ -151,14 +151,14 @@ def _lens_switch(rng: np.random.Generator, size: float) -> Strangeness:
 
 
 def _wandering(rng: np.random.Generator, size: float) -> Strangeness:
-    """Stamps whose clock wanders to and fro."""
+    """Timestamps of a clock that drifts back and forth."""
     late_s, hz, phase = 1.5e-3 * size * rng.uniform(0.8, 1.25), rng.uniform(0.35, 0.7), rng.uniform(0, 2 * np.pi)
     hidden = Hidden(clock_s=lambda stamp_s: late_s * np.sin(2 * np.pi * hz * stamp_s + phase))
     return Strangeness(hidden, expected=(_either(("delay", "time")),), lasting=False)
 
 
 def _shading(rng: np.random.Generator, size: float) -> Strangeness:
-    """A vignette off centre, or something before one side of the lens."""
+    """An off-centre vignette, or an object in front of one side of the lens."""
     part, turn, kind = 0.05 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
     way = np.cos(turn), np.sin(turn)
 
@@ -170,7 +170,7 @@ def _shading(rng: np.random.Generator, size: float) -> Strangeness:
 
 
 def _passing(rng: np.random.Generator, size: float) -> Strangeness:
-    """A soft shadow that comes over one side for a while, or a band of it that moves through; no form describes it."""
+    """A soft shadow that covers one side for a while, or a moving shadow band; no form describes it."""
     part, turn, kind = 0.1 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
     way, at_s, lasting_s = (np.cos(turn), np.sin(turn)), rng.uniform(1.0, 2.0), rng.uniform(0.5, 0.9)
 
@@ -183,14 +183,14 @@ def _passing(rng: np.random.Generator, size: float) -> Strangeness:
 
 
 def _hunting(rng: np.random.Generator, size: float) -> Strangeness:
-    """A focus that hunts to and fro, without a log."""
+    """An autofocus that hunts, without a log."""
     part, hz, phase = 0.003 * size * rng.uniform(0.8, 1.25), rng.uniform(1.0, 1.8), rng.uniform(0, 2 * np.pi)
     hidden = Hidden(focal_scale=lambda t: 1 + part * np.sin(2 * np.pi * hz * np.asarray(t) + phase))
     return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
 
 
 def _sticking(rng: np.random.Generator, size: float) -> Strangeness:
-    """Rates below a threshold read as nought, and others are too small by it."""
+    """A dead zone of the gyroscope: rates below a threshold read as 0, others are too small by it."""
     threshold = 0.008 * size * rng.uniform(0.8, 1.25)
 
     def stuck(_time: Array, reading: Array, _force: Array) -> Array:
@@ -200,7 +200,7 @@ def _sticking(rng: np.random.Generator, size: float) -> Strangeness:
 
 
 def _changing_readout(rng: np.random.Generator, size: float) -> Strangeness:
-    """A readout that lasts longer from some time on."""
+    """A readout that becomes slower at some time."""
     longer_s, at_s = _sign(rng) * 1.2e-3 * size * rng.uniform(0.8, 1.25), rng.uniform(0.9, 2.0)
     hidden = Hidden(row_delay_at=lambda t, fraction: longer_s * fraction / (1 + np.exp(-(t - at_s) / 0.1)))
     return Strangeness(hidden, expected=(_either(("delay", "row, time")),), lasting=False)
@@ -222,7 +222,7 @@ def _soft_corners(rng: np.random.Generator, size: float) -> Strangeness:
 
 
 def _soft_moments(rng: np.random.Generator, size: float) -> Strangeness:
-    """A focus that is lost for half a second."""
+    """Focus lost for 0.5 s."""
     sigma_px, at_s, lasting_s = 1.0 * size * rng.uniform(0.8, 1.25), rng.uniform(0.8, 2.2), rng.uniform(0.2, 0.3)
     hidden = Hidden(blur_px=lambda t: float(sigma_px * np.exp(-(((t - at_s) / lasting_s) ** 2))))
     return Strangeness(hidden, expected=(_either(("blur", "time")),), lasting=False)
@@ -281,7 +281,7 @@ CASES = {**EFFECTS, NULL: _nothing, NAMED_ONLY: _named_only}
 
 
 def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tuple[Strangeness, list[str]]:
-    """Write a capture, unless it is there, and return what is strange about it and the named effects.
+    """Write a capture, unless it exists, and return its unknown effect and its named effects.
 
     other: a second capture of the same phone, with another motion, scene and light.
     """
@@ -329,7 +329,7 @@ def off_centre(profile: CameraProfile, tangential: tuple[float, float]) -> Camer
 
 
 def points_off_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[float], float]:
-    """Rms by which points of a capture lie off where each profile puts them, and the tracking noise."""
+    """Residual rms of a capture's points with each profile, and the tracking noise."""
     capture = source.capture
     indices = [frame.index for frame in capture.frames if frame.skip_reason is None]
     pairs = track_pairs(source.gray(indices))
@@ -340,7 +340,7 @@ def points_off_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[f
 
 
 def picture_gains_db(folder: Path, found: CameraProfile) -> list[float]:
-    """PSNR of restored frames with a profile that was found, less that with the capture's own."""
+    """PSNR of frames restored with the found profile, minus that with the capture's own."""
     write_profile(found, folder / "found.yaml")
     with_found = ("--config", str(folder / "found.yaml"))
     runs = [
@@ -389,7 +389,7 @@ def judge_case(work: Path, name: str, seed: int) -> Row:
 
 
 def is_right(strange: Strangeness, named: list[str], found: Diagnosis) -> bool:
-    """Whether each field is of an expected kind and covariate, and each cause is one that is hidden, or its rival."""
+    """Whether each field has an expected kind and covariate, and each cause is a hidden one or its rival."""
     fields = [(field.kind, ", ".join(field.covariates)) for field in found.fields]
     if len(fields) != len(strange.expected) or any(set(fields).isdisjoint(pairs) for pairs in strange.expected):
         return False
@@ -402,7 +402,7 @@ def is_right(strange: Strangeness, named: list[str], found: Diagnosis) -> bool:
 
 
 def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Each effect with some seeds, as many captures with named effects only, and nulls."""
+    """Each effect with several seeds, as many captures with only named effects, and captures without effects."""
     cases = [(name, FIRST_SEED + 10 * k + i) for k in range(SEEDS[scale.name]) for i, name in enumerate(EFFECTS)]
     cases += [(NAMED_ONLY, FIRST_SEED + 500 + k) for k in range(SEEDS[scale.name])]
     cases += [(NULL, FIRST_NULL + k) for k in range(NULLS[scale.name])]

@@ -1,7 +1,7 @@
-"""Constants that no single capture tells, fitted to captures with truth: which values fit best, and how well.
+"""Fit constants that a single capture cannot determine to captures with truth: best values and their deviations.
 
-The captures are those of the honesty table, made with other seeds, so that ``--only honesty`` judges what is fitted
-here.  Deviations are those of the captures: each is left out once (jackknife).
+The captures are those of the honesty table with other seeds, so that ``--only honesty`` tests independently what is
+fitted here.  Standard deviations are between captures: each is left out once (jackknife).
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from virest.restoration.statistics.records import Misplaced
 Array = NDArray[np.float64]
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
-"""Added to the seeds of the captures that judge."""
+"""Added to the seeds of the test captures."""
 LEFT_OVER_NAMES = ("constant", "ideal filter's", "neighbours'")
 LEFT_OVER_PRESETS = ("fast", "balanced")
 OUTLYING_DB = 0.5
-"""Errors of the promised gain beyond this count by less than their square."""
+"""Errors of the predicted gain above this are weighted by less than their square (robust loss)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """A constant of which some values are tried on all captures."""
+    """A constant with the values to try on all captures."""
 
     name: str
     module: ModuleType
@@ -57,7 +57,7 @@ SWEPT = (
 
 
 def fits_section(work: Path, scale: Scale) -> tuple[Row, str]:
-    """Fit the promise to the gains, and look which values of the other constants gain most."""
+    """Fit the predicted gain to the measured gains, and find the best values of the other constants."""
     rows: list[Row] = []
     gains: dict[str, list[Array]] = {swept.name: [] for swept in SWEPT}
     for workload in fit_workloads(scale):
@@ -106,7 +106,7 @@ def fit_left_over(rows: Sequence[Row]) -> Row:
 
 
 def best_value(values: Sequence[float], gains_db: Array) -> Row:
-    """Where the mean gain (captures, values) is greatest, by a parabola over the logarithm, and its deviation."""
+    """Value with the largest mean gain (captures, values), by a parabola over its logarithm, and its deviation."""
     found = _peak(values, gains_db.mean(axis=0))
     count = len(gains_db)
     left_out = [_peak(values, np.delete(gains_db, k, axis=0).mean(axis=0)) for k in range(count)] if count > 1 else []
@@ -119,7 +119,7 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 
 @dataclass(frozen=True, slots=True)
 class _Watched(ConfirmedGain):
-    """Keeps what it is asked about."""
+    """Records the arguments of its calls."""
 
     asked: list[tuple[float, float, float, Misplaced]] = field(default_factory=list)
 
@@ -148,7 +148,7 @@ def _against_truth(truth: TrueCapture, restored: RestoredFrame, valid_px: tuple[
 def _promises(
     truth: TrueCapture, plan: RestorationPlan, workload: Workload, straight_db: dict[int, Any]
 ) -> Iterator[Row]:
-    """What each deblurred frame's promise is made of, and its gain."""
+    """The terms of each deblurred frame's predicted gain, and its measured gain."""
     if plan.confirmed is None or plan.confirmed.share <= 0:
         return
     for preset in LEFT_OVER_PRESETS:
@@ -232,7 +232,7 @@ def _text(promise: Row, best: dict[str, Row], swept: dict[str, tuple[Sequence[fl
         for name, (values, gains) in swept.items()
     ]
     return (
-        f"FITS: {promise['frames']} frames of {promise['captures']} captures with seeds of their own; |promise-gain|\n"
+        f"FITS: {promise['frames']} frames of {promise['captures']} captures with separate seeds; |promise-gain|\n"
         f"{promise['off_db']:.2f} dB in the median with what fits best\n"
         + table(header, lines)
         + "\n"

@@ -1,4 +1,4 @@
-"""How the time of a frame grows: with the number of frames (not at all), with their pixels, and with the tiles.
+"""How the time per frame grows with the number of frames (it should not), with the pixels, and with the tiles.
 
 $ python -m virest.app.bench --only growth --quick
 """
@@ -27,7 +27,7 @@ Facts = dict[str, Any]
 
 
 def growth_section(work: Path, scale: Scale) -> tuple[Facts, str]:
-    """Measure all three on the same machine one after the other, by CPU time."""
+    """Measure all three in sequence on the same machine, by CPU time."""
     frames, few = (QUICK_FRAMES, QUICK_SIZE_FRAMES) if scale.quick else (FRAMES, SIZE_FRAMES)
     facts = {
         "preset": PRESET,
@@ -54,7 +54,7 @@ def _over_frames(work: Path, frames: int) -> Facts:
 
 
 def _over_pixels(work: Path, frames: int) -> Facts:
-    """Time of a frame of three sizes, by the difference of two runs with one process."""
+    """Time per frame for three sizes, from the difference of two runs with one process."""
     rows = []
     for width, height in SIZES:
         capture = looped_capture(work, 2 * frames, width, height)
@@ -64,7 +64,7 @@ def _over_pixels(work: Path, frames: int) -> Facts:
 
 
 def _over_tiles(work: Path, frames: int) -> Facts:
-    """Time of deblurring with tiles of several sides; tiles as asked, the program takes the quickest side near."""
+    """Time of deblurring for several tile sizes; the program uses the fastest size near the requested one."""
     width, height = SIZES[-1]
     capture = looped_capture(work, 2 * frames, width, height)
     rows = []
@@ -96,7 +96,7 @@ def fitted_exponent(sizes: Sequence[float], times: Sequence[float]) -> tuple[flo
 
 
 def _fitted(rows: list[Facts], size: str, seconds: str) -> Facts:
-    """Exponent over the rows; none where others made one of the differences of two runs negative."""
+    """Exponent over the rows; none if other processes made a difference of two runs negative."""
     if any(row[seconds] <= 0 for row in rows):
         return {"exponent": None, "std": None}
     exponent, std = fitted_exponent([row[size] for row in rows], [row[seconds] for row in rows])
@@ -119,7 +119,7 @@ def doubling_exponents(rows: list[Facts]) -> dict[str, float | None]:
 
 
 def with_steps(rows: list[Facts]) -> list[Facts]:
-    """Each run with the time of a frame beyond those of the run before; the first one has none."""
+    """Each run with the time per additional frame over the previous run; the first run has none."""
     steps: list[Facts] = [{"s_per_frame": None, "cpu_s_per_frame": None}]
     for before, after in pairwise(rows):
         more = after["frames"] - before["frames"]
@@ -151,9 +151,9 @@ def growth_text(facts: Facts) -> str:
 
 
 def exponent_text(fit: Facts) -> str:
-    """An exponent with its standard deviation, where three points give one."""
+    """An exponent with its standard deviation, if three points give one."""
     if fit["exponent"] is None:
-        return "not to be told from these runs"
+        return "not determined by these runs"
     return f"{fit['exponent']:.2f}" + (f" ± {fit['std']:.2f}" if fit.get("std") is not None else "")
 
 

@@ -1,7 +1,7 @@
-"""Promise against gain: what the log expects of deblurring each frame, and what it really gains, against truth.
+"""Predicted against measured gain of deblurring, for each frame with truth.
 
-Real gain: PSNR of the restored frame less that of ``--deblur none`` and the same warp.  A frame that is left as it
-was recorded promises nothing and gains 0.
+Measured gain: PSNR of the restored frame minus that of ``--deblur none`` with the same warp.  A frame left as recorded
+has no prediction and gains 0.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from virest.evaluation.fidelity import psnr_db
 
 Row = dict[str, Any]
 WORSE_DB = 0.1
-"""A frame that loses more than this was made worse."""
+"""A frame that loses more than this counts as made worse."""
 OBEDIENT, DEFOCUSED, PHONE = "obedient", "defocused", "phone"
 SETS = (OBEDIENT, DEFOCUSED, PHONE)
 
@@ -36,7 +36,7 @@ def honesty_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def measure_honesty(work: Path, workload: Workload, presets: Sequence[str]) -> list[Row]:
-    """One record for each frame and preset: promise (None where there is none), its deviation, gain, in dB."""
+    """One record per frame and preset: predicted gain (None if none), its standard deviation, measured gain, in dB."""
     capture = simulated(work, workload.name, **workload.options)
     arguments = workload.arguments(capture)
     base = run_process(capture, work / "none", "--deblur", "none", *arguments)
@@ -67,7 +67,7 @@ def summarise_honesty(rows: Sequence[Row]) -> list[Row]:
 
 
 def frames_text(rows: Sequence[Row], presets: Sequence[str]) -> str:
-    """Every frame of one capture, a line each: promise and gain of each preset."""
+    """One line per frame of one capture: predicted and measured gain of each preset."""
     header = ["capture", "frame", "blur px", "straight dB", *(f"{p}: promise / gain" for p in presets)]
     lines: dict[int, list[str]] = {}
     for row in rows:

@@ -1,4 +1,4 @@
-"""Peak memory of the program and of its largest worker, for short and long movies: it must not grow."""
+"""Peak memory of the program and of its largest worker for short and long movies; it must not grow."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ PRESET = "fast"
 
 @dataclass(frozen=True, slots=True)
 class Peaks:
-    """The most memory that a command was seen with."""
+    """Peak memory of a command."""
 
     together_bytes: int
     """Largest sum of the resident bytes of all its processes; shared pages count once for each."""
     main_bytes: int
-    """Peak of the process that was started."""
+    """Peak of the main process."""
     worker_bytes: int
-    """Largest peak of a process that this one started."""
+    """Largest peak of a child process."""
     wall_s: float
 
 
 def memory_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Watch runs over few and over many frames."""
+    """Monitor runs over few and over many frames."""
     counts = QUICK_FRAMES if scale.quick else FULL_FRAMES if scale.full else FRAMES
     results = []
     for frames in counts:
@@ -57,13 +57,13 @@ def memory_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def grown(runs: list[dict[str, Any]]) -> dict[str, float]:
-    """Peaks of the longest movie over those of the shortest."""
+    """Ratio of the peaks of the longest to the shortest movie."""
     first, last = runs[0], runs[-1]
     return {key: last[f"{key}_mb"] / first[f"{key}_mb"] for key in ("peak", "worker")}
 
 
 def memory_text(facts: dict[str, Any]) -> str:
-    """One line a movie."""
+    """One line per movie."""
     rows = [
         [str(r["frames"]), *(f"{r[f'{key}_mb']:.0f}" for key in ("worker", "main", "peak")), f"{r['wall_s']:.1f}"]
         for r in facts["runs"]
@@ -77,10 +77,10 @@ def memory_text(facts: dict[str, Any]) -> str:
 
 
 def peaks_of(command: list[str]) -> Peaks:
-    """Run a command and watch it and its descendants, twenty times a second.
+    """Run a command and sample its memory and its descendants' 20 times per second.
 
-    A process's own peak is the kernel's (VmHWM), so nothing between two looks is missed; the last word of each counts,
-    since before it starts its program a new process still shows its parent's.
+    A process's own peak is the kernel's (VmHWM), so peaks between samples are included; the last sample of each process
+    counts, since before exec a new process still shows its parent's peak.
     """
     began = time.perf_counter()
     together, own = 0, {}
@@ -97,7 +97,7 @@ def peaks_of(command: list[str]) -> Peaks:
 
 
 def process_tree(root: int) -> list[int]:
-    """Find a process and all its descendants, by the parents that /proc names."""
+    """A process and all its descendants, by the parents in /proc."""
     children: dict[int, list[int]] = {}
     for entry in os.listdir("/proc"):
         if entry.isdigit() and (parent := _parent(int(entry))) is not None:
@@ -118,7 +118,7 @@ def resident_bytes(pid: int) -> int:
 
 
 def peak_bytes(pid: int) -> int:
-    """Largest resident memory that a process ever had; 0 once it has ended."""
+    """Peak resident memory of a process; 0 once it has ended."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Other people's deconvolutions over a capture: scikit-image's (:mod:`virest.evaluation.baselines`) and deepinv's."""
+"""Other libraries' deconvolutions over a capture: scikit-image's (:mod:`virest.evaluation.baselines`) and deepinv's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Plane = NDArray[np.float32]
 PEERS: dict[str, tuple[Deconvolve, tuple[float, ...]]] = {
     name: (baseline.deconvolve, baseline.settings) for name, baseline in SCIKIT.items()
 }
-"""Each with the settings that are tried on every frame; the best by PSNR against truth counts."""
+"""Peers with the settings tried on every frame; the best by PSNR against truth counts."""
 
 
 def frame_motions(capture_folder: Path) -> tuple[ResponseCurve, dict[int, RowMotion]]:
@@ -35,14 +35,14 @@ def frame_motions(capture_folder: Path) -> tuple[ResponseCurve, dict[int, RowMot
 
 
 def peer_pictures(name: str, picture: Picture, motion: RowMotion, curve: ResponseCurve) -> Iterator[Picture]:
-    """Restored and straightened pictures of one peer, one for each of its settings."""
+    """Restored and straightened frames of one peer, one per setting."""
     return baseline_pictures(SCIKIT[name], picture, motion, curve)
 
 
 def peer_deblurred(
     method: Deconvolve, setting: float, picture: Picture, motion: RowMotion, curve: ResponseCurve
 ) -> Picture:
-    """One picture, each channel's linear light deconvolved with the centre's kernel."""
+    """One frame, with each channel's linear light deconvolved with the kernel of the frame centre."""
     psf = centre_psf(motion)
     return deblurred(picture, lambda plane: method(plane, psf, setting), psf, curve)
 
@@ -55,7 +55,7 @@ GET_DEEPINV = "not installed: pip install 'virest[peers]'"
 
 
 def deepinv_available() -> bool:
-    """Whether deepinv, and torch with it, is there."""
+    """Whether deepinv, and with it torch, is installed."""
     return find_spec(DEEPINV) is not None
 
 

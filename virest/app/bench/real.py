@@ -1,4 +1,4 @@
-"""Measured captures (the folder named by VIREST_REALDATA): what process, calibrate and diagnose say of them."""
+"""Real captures (in the folder named by VIREST_REALDATA): the results of process, calibrate and diagnose."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ CALIBRATED = {"lhaippp_car": (), "nexus5_162941": ("clock-skew",), "gopro_karma"
 DIAGNOSED = ("lhaippp_car", "nexus5_162941", "honor_v10", "gopro_hero7")
 PRESET, COUNTED = "fast", ("deblurred", "straightened", "copied", "skipped", "failed")
 ON_TIME = ("nexus5_162941",)
-"""Whose unknown offset is also given as 0, for the diagnosis to find."""
+"""Captures whose unknown offset is also set to 0, for the diagnosis to find."""
 Row = list[str]
 
 
 def real_section(work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
-    """Process, calibrate and diagnose the captures that are there."""
+    """Process, calibrate and diagnose the available captures."""
     root = Path(os.environ.get("VIREST_REALDATA") or "/nonexistent")
     if not root.is_dir():
         return {
@@ -49,7 +49,7 @@ def real_section(work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def _processed(folder: Path, work: Path) -> Row:
-    """What became of the frames, by run.json."""
+    """Frame counts and verdict from run.json."""
     run = run_process(folder, work / "real", "--preset", PRESET)
     account = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))
     verdict = account["verdict"].partition(":")[0]

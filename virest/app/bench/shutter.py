@@ -1,4 +1,4 @@
-"""Where straightened points lie against truth, in all four readout directions."""
+"""Errors of straightened points against truth, for all four readout directions."""
 
 from __future__ import annotations
 

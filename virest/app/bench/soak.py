@@ -1,7 +1,7 @@
-"""Two hundred captures in one run, a tenth of them broken in ten ways: all good ones done, nothing grows.
+"""200 captures in one run, 1 of 10 broken, in ten ways: all good ones must be restored, and nothing must grow.
 
-Memory and open files of the program and its workers are sampled all along; the last quarter of the run is held against
-the second, since the first one fills caches.
+Memory and open files of the program and its workers are sampled throughout; the last quarter of the run is compared
+with the second, since the first one fills caches.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SHIFT_NS = 10**15
 
 
 def soak_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Write the captures, process them in one run, and look at what became of each."""
+    """Write the captures, process them in one run, and check the result of each."""
     count = QUICK_CAPTURES if scale.quick else CAPTURES
     source = simulated(work, "soak-source", width=240, height=180, frames=FRAMES, seed=3)
     broken = dict(_write_captures(work / "soak", source, count))
@@ -52,7 +52,7 @@ def soak_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def _write_captures(folder: Path, source: Path, count: int) -> Iterator[tuple[str, str]]:
-    """Copies of one capture, every tenth broken; gives (name, way) of those."""
+    """Copy one capture, every tenth copy broken; returns (name, defect) of those."""
     folder.mkdir()
     for number in range(count):
         copy = folder / f"capture-{number:04d}"
@@ -87,7 +87,7 @@ def _empty_gyro(folder: Path) -> None:
 
 
 def _other_session(folder: Path) -> None:
-    """Move the gyroscope's times by eleven days."""
+    """Shift the gyroscope's times by 11 days."""
     path = folder / "gyro_accel.csv"
     lines = path.read_text().splitlines()
     rows = (line.partition(",") for line in lines[HEAD_LINES:])
@@ -140,7 +140,7 @@ WAYS: dict[str, Callable[[Path], None]] = {
 
 
 def _watched(command: list[str], log: Path) -> tuple[int, str, list[tuple[float, int]]]:
-    """Exit code, standard error, and (bytes, open files) of the whole tree of processes, four times a second."""
+    """Exit code, standard error, and (bytes, open files) of the whole process tree, sampled 4 times per second."""
     samples = []
     with log.open("w") as file, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file) as process:
         while process.poll() is None:
@@ -169,7 +169,7 @@ def _growth(samples: list[tuple[float, int]]) -> dict[str, Any]:
 
 
 def _judge(folders: list[Path], broken: dict[str, str], out: Path, errors: str) -> dict[str, Any]:
-    """Which good captures are done, and which broken ones are explained by their run.json, whatever the log says."""
+    """Good captures that are restored, and broken ones that are explained by their run.json."""
     accounts = {file.parent.name: json.loads(file.read_bytes()) for file in out.glob("*/run.json")}
     done = {name for name, account in accounts.items() if account["status"] == "done" and account["exit_code"] == 0}
     said = {name: _explanation(accounts.get(name)) for name in broken}
@@ -185,7 +185,7 @@ def _judge(folders: list[Path], broken: dict[str, str], out: Path, errors: str) 
 
 
 def _explanation(account: dict[str, Any] | None) -> list[str]:
-    """Why a capture was not processed, or what is wrong with it; nothing where its account is silent."""
+    """Why a capture was not processed, or what is wrong with it; empty if its run.json does not explain it."""
     if account is None:
         return []
     failed = [f"{account['counts']['failed']} frames failed"] if account["counts"]["failed"] else []

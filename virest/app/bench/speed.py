@@ -1,8 +1,8 @@
-"""Frames a second from the movie to PNGs: of presets and stages, beside the floor, other processes and other libraries.
+"""Frames per second from movie to PNGs: presets and stages, compared with the floor, parallel runs and other libraries.
 
 The program runs over N and over 2 N frames of one looped 720x1280 capture; the difference of the two wall-clock times,
-over N, is the time of a frame without starting, reading and planning.  N holds whole segments for every process.
-The floor is the same program told not to deblur: decode, warp and PNG of the same frames are left.
+divided by N, is the time per frame without start, reading and planning.  N is a whole number of segments per process.
+The floor is the same program without deblurring: decode, warp and PNG of the same frames remain.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ QUICK_FRAMES = dict.fromkeys(FRAMES, 60)
 frames are not blurred alike."""
 JOBS = 2
 PEER_TRIES = 2
-"""The quicker one counts."""
+"""Number of runs, of which the faster one counts."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 FLOOR_STAGES = ("decode", "shutter", "write")
 PEER_SETTINGS = {"wiener": 0.1, "unsupervised_wiener": 0.0, "richardson_lucy": 30}
 DEEPINV_ROW = "deepinv wiener"
 CAPTURE_S, FPS = 30.0, 30.0
-"""Length of the capture of which the share of estimation, planning included, is told."""
+"""Length of the capture for which the share of estimation, planning included, is reported."""
 LEAST_S = 1e-5
-"""A stage that takes less has nothing to do."""
+"""A stage faster than this is idle."""
 CONTENT = "dead leaves"
 """What the looped capture shows: the simulator's default scene."""
 Facts = dict[str, Any]
 
 
 def speed_section(work: Path, scale: Scale) -> tuple[Facts, str]:
-    """Time the floor and each preset with one process and with two, then each peer on one frame."""
+    """Time the floor and each preset with one and with two processes, then each peer on one frame."""
     counts = QUICK_FRAMES if scale.quick else FRAMES
     capture = looped_capture(work, 2 * max(counts.values()))
     measured = [_time_preset(work, capture, name, counts[name]) for name in ARGUMENTS]
@@ -89,7 +89,7 @@ def _time_preset(work: Path, capture: Path, name: str, frames: int) -> Facts:
 
 
 def timed_difference(work: Path, capture: Path, frames: int, *arguments: str) -> Facts:
-    """Run over N and over 2 N frames; what a frame takes by the difference."""
+    """Run over N and over 2 N frames; the time per frame from the difference."""
     return per_frame(_run(work, capture, frames, *arguments), _run(work, capture, 2 * frames, *arguments), frames)
 
 
@@ -101,10 +101,10 @@ def _run(work: Path, capture: Path, frames: int, *arguments: str) -> Run:
 
 
 def per_frame(shorter: Run, longer: Run, frames: int) -> Facts:
-    """Wall-clock and CPU seconds a frame, from runs that differ by ``frames``; stages by the longer run's log.
+    """Wall-clock and CPU seconds per frame, from runs that differ by ``frames``; stages by the longer run's log.
 
     stage_s is what the workers' clocks say; stage_cpu_s divides the measured CPU time among the stages in proportion.
-    Where others disturb, the longer run may even take less: such a difference is no rate.
+    Under load from other processes the longer run may even take less; such a difference gives no rate.
     """
     wall_s = (longer.wall_s - shorter.wall_s) / frames
     cpu_s = (longer.timing.cpu_s - shorter.timing.cpu_s) / frames
@@ -129,7 +129,7 @@ def per_frame(shorter: Run, longer: Run, frames: int) -> Facts:
 
 
 def judged(measured: list[Facts], planning_s: float) -> Facts:
-    """Floor and presets, each with its share of the floor, of estimation, and what a second process brings."""
+    """Floor and presets, each with its share of the floor and of estimation, and the gain from a second process."""
     floor = next(entry for entry in measured if entry["preset"] == FLOOR)
     entries = [{**entry, **_shares(entry, floor, planning_s)} for entry in measured]
     pure = floor["straightened"] and floor["deblurred"] == 0.0
@@ -141,8 +141,8 @@ def judged(measured: list[Facts], planning_s: float) -> Facts:
 def _shares(entry: Facts, floor: Facts, planning_s: float) -> Facts:
     """Ratios of what was measured.
 
-    Figures by CPU time are what a quiet machine allows where no process ever waits; on one that others use too, the
-    wall clock cannot show it.  While one process plans the others have nothing to do, so planning counts in full.
+    Figures by CPU time show what a quiet machine allows if no process ever waits; under other load the wall clock
+    cannot show it.  While one process plans, the others are idle, so planning counts in full.
     """
     one, stages = entry["one_process"], entry["stage_s"]
     estimate, frames = stages["estimate"] / sum(stages.values()), CAPTURE_S * FPS
@@ -161,12 +161,12 @@ def _shares(entry: Facts, floor: Facts, planning_s: float) -> Facts:
 
 
 def over(above: float, below: float) -> float | None:
-    """Quotient of two times; None where one is not positive."""
+    """Ratio of two times; None if one is not positive."""
     return above / below if above > 0 and below > 0 else None
 
 
 def _planning_cpu_s(folder: Path) -> float:
-    """CPU seconds for filling what the profile leaves open and for asking whether pictures and gyroscope agree."""
+    """CPU seconds for estimating unknown profile values and checking that frames and gyroscope agree."""
     prepare_worker()
     capture = read_capture(folder)
     profile, _ = resolve_profile(capture, None)
@@ -237,7 +237,7 @@ def _program_text(facts: Facts) -> str:
         "from runs over N and 2 N frames\n"
         f"(floor: --deblur none, {pure}; by stages: decode + shutter + write of the preset's own run;\n"
         f" by CPU: what the CPU times allow; stages: frames/s of one core by CPU time; with planning: {planned};\n"
-        " others' cores: what else kept the machine busy)\n" + table(header, rows)
+        " others' cores: load by other processes)\n" + table(header, rows)
     )
 
 
@@ -256,21 +256,21 @@ def _peers_text(facts: Facts) -> str:
 
 
 def ratio_to_peer(peer_s: float, entry: Facts) -> float | None:
-    """How many times a preset's deblurring a peer takes, by CPU time of one process; None where there was none."""
+    """A peer's CPU time over that of a preset's deblurring, with one process; None if the preset did not deblur."""
     ours_s: float = entry["one_process"]["stage_cpu_s"]["deblur"]
     return peer_s / ours_s if ours_s > LEAST_S else None
 
 
 def stage_rate(seconds: float) -> str:
-    """Frames a second of one stage on one core."""
+    """Frames per second of one stage on one core."""
     return f"{1 / seconds:.4g}" if seconds > LEAST_S else "-"
 
 
 def figure(value: float | None) -> str:
-    """A rate or a ratio for people."""
+    """A rate or a ratio as text."""
     return "-" if value is None else f"{value:.2f}"
 
 
 def percent(share: float | None) -> str:
-    """A share for people."""
+    """A share as text, in %."""
     return "-" if share is None else f"{100 * share:.1f} %"

@@ -1,4 +1,4 @@
-"""One table at the end: what is asked, what was measured, and whether that is met."""
+"""The final table: targets, measured values, and whether they are met."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ MOST_PROMISE_OFF_DB = 0.5
 LEAST_RATE = {"balanced": 8.0, "best": 0.3}
 MOST_WORKER_MB, MOST_GROWTH = 400.0, 1.05
 MOST_EXPONENT = 1.1
-"""Of the time over frames: twice as many take at most 7 % more each."""
+"""Exponent of the time over frames: with twice as many, each takes at most 7 % more."""
 
 
 YES, NO, BUSY, OPEN = "yes", "NO", "busy", "-"
-"""The last column. ``busy``: others used the machine, and neither clock tells; ``-``: nothing asked or measured."""
+"""The last column. ``busy``: not decidable because of load by other processes; ``-``: no target or no measurement."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure beside what is asked of it."""
+    """One figure with its target."""
 
     figure: str
     asked: str
@@ -36,10 +36,10 @@ class Row:
 
 
 def judge(by_wall: bool, by_cpu: bool, others_cores: float, *, ratio: bool = False) -> str:
-    """Whether a target is met, on a machine that others may have used too.
+    """Whether a target is met, on a machine that other processes may have used too.
 
-    CPU time bounds what a quiet machine can do: a target missed by it is missed.  A wall-clock time that is good enough
-    in spite of others is good enough; of a ratio of two such times nothing is known.
+    CPU time bounds what a quiet machine can do: a target missed by CPU time is missed.  A wall-clock time that meets
+    the target in spite of other load meets it; a ratio of two such times decides nothing.
     """
     if others_cores <= BUSY_CORES:
         return YES if by_wall else NO
@@ -49,12 +49,12 @@ def judge(by_wall: bool, by_cpu: bool, others_cores: float, *, ratio: bool = Fal
 
 
 def summary_rows(report: Report) -> list[Row]:
-    """All rows of the sections that were run."""
+    """The rows of all sections that were run."""
     return [row for section, build in SECTIONS.items() if report.get(section) for row in build(report[section])]
 
 
 def summary_text(report: Report) -> str:
-    """The table, empty where no section asks for anything; the load beside it, since a busy machine measures itself."""
+    """The table with the machine's load; empty if no section has a target."""
     rows = summary_rows(report)
     if not rows:
         return ""
@@ -120,7 +120,7 @@ def _stages_row(entry: Report) -> Row:
 
 
 def _peer_rows(speed: Report) -> list[Row]:
-    """How many times as long as each preset's deblurring a peer takes for the same frame."""
+    """A peer's time for one frame over that of each preset's deblurring."""
     rows = []
     for name, seconds in speed["peers_s_per_frame"].items():
         ratios = [(entry["preset"], ratio_to_peer(seconds, entry)) for entry in speed["presets"]]
@@ -176,7 +176,7 @@ def _command_row(row: Report) -> Row:
 
 
 def _honesty_rows(honesty: Report) -> list[Row]:
-    """Of each set as a whole; the gain asked for is that of the phones."""
+    """Rows for each set as a whole; the target for the gain applies to the phones."""
     rows: list[Row] = []
     for entry in honesty["summary"]:
         if entry["capture"] is not None:

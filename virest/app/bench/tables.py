@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
-    """Columns under their heads, the first to the left and all others to the right."""
+    """Columns under their heads, the first left-aligned, all others right-aligned."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
 
     def line(row: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""What is measured: simulated captures with truth, looped captures of any length, and the program run over them."""
+"""Benchmark inputs: simulated captures with truth, looped captures of any length, and runs of the program over them."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ Picture = NDArray[np.uint8]
 PRESETS = ("fast", "balanced", "best")
 TICKS_PER_S = 90_000
 LOOP_FRAMES = 15
-"""Half a second at 30 frames a second: the stamps of a loop are whole microseconds."""
+"""0.5 s at 30 frames/s: the timestamps of a loop are whole microseconds."""
 GROUP_FRAMES = 30
-"""From one key frame to the next, as phones and the simulator write them."""
+"""Frames between key frames, as phones and the simulator write them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much is measured."""
+    """The extent of the measurement."""
 
     quick: bool = False
     full: bool = False
     presets: tuple[str, ...] = PRESETS
-    """Those that ``honesty`` measures."""
+    """Presets that ``honesty`` measures."""
     kinds: tuple[str, ...] = ()
-    """Captures that ``quality`` measures, by their kind; none: all."""
+    """Kinds of capture that ``quality`` measures; empty: all."""
     seeds: int = 100
-    """Captures that calibrations are compared with truth on."""
+    """Number of captures on which calibrations are compared with truth."""
     figures: Path | None = None
-    """Folder that figures are drawn into."""
+    """Folder for figures."""
 
     @property
     def name(self) -> str:
-        """For the report."""
+        """The scale's name, for the report."""
         return "quick" if self.quick else "full" if self.full else "usual"
 
 
@@ -63,13 +63,13 @@ class Workload:
     kind: str
     """``ordinary``, ``photographs``, ``fine``, ``long``, ``bright``, ``shaken``, ``phone`` or ``defocused``."""
     blur_range_px: tuple[float, float]
-    """Frames whose blur at the centre lies in here count in the means; all count in the minimum."""
+    """Frames whose blur at the centre is in this range count in the means; all count in the minimum."""
     options: dict[str, Any] = field(default_factory=dict)
     true_profile: bool = False
-    """Processed with truth/camera.yaml: nothing about the camera is wrong."""
+    """Process with truth/camera.yaml, so that the camera model has no error."""
 
     def arguments(self, capture: Path) -> tuple[str, ...]:
-        """What ``virest process`` is told beside the preset."""
+        """Arguments of ``virest process`` in addition to the preset."""
         return ("--config", str(capture / "truth" / "camera.yaml")) if self.true_profile else ()
 
 
@@ -85,7 +85,7 @@ def _workload(
 
 
 FINE_BITS = 1.0
-"""Bits per pixel of the captures whose coder is to take little away; the recorder's own rate is 0.25."""
+"""Bits per pixel of captures with little coding loss; the recorder's own rate is 0.25."""
 ORDINARY_PX, LONG_PX = (5.0, 20.0), (15.0, 45.0)
 WORKLOADS = (
     _workload("leaves", "ordinary", ORDINARY_PX, "leaves", 16.0, 1.4, 1.5),
@@ -109,14 +109,14 @@ QUICK = ("leaves", "photographs", "long", "bright")
 def _phone(
     name: str, scene: str, exposure_ms: float, rate: float, noise: float, blur_range_px: tuple[float, float], **isp: Any
 ) -> Workload:
-    """640x480 at a phone's bit rate; the strengths are set here, so that ``--isp phone`` may change."""
+    """640x480 at a phone's bit rate; strengths are set here, independent of the defaults of ``--isp phone``."""
     plain = _workload(f"phone-{name}", "phone", blur_range_px, scene, exposure_ms, rate, noise)
     own = {"readout_ms": PHONE_READOUT_MS, "isp": PhoneIsp(**{**PHONE, **isp})}
     return dataclasses.replace(plain, options={**plain.options, **own})
 
 
 PHONE_READOUT_MS = 12.0
-"""Where the stabiliser is wrong the rows are straightened wrong: with 20 ms that, not the blur, decides the PSNR."""
+"""Readout of captures with a wrong stabiliser: at 20 ms wrong straightening, not blur, would dominate the PSNR."""
 PHONE: dict[str, Any] = {
     "tone": 0.4,
     "highlights": 0.25,
@@ -130,7 +130,7 @@ PHONE: dict[str, Any] = {
     "gyro_jitter_s": 0.0002,
     "gyro_lowpass_hz": 60.0,
 }
-"""What the phones have in common: 0.01 rad/s of gyroscope noise at 200 samples/s, before its low pass of 60 Hz."""
+"""Common to all phones: gyroscope noise of 0.01 rad/s at 200 samples/s, before its low pass of 60 Hz."""
 PHONES = (
     _phone("calm", "text", 12.0, 0.6, 1.5, (1.0, 10.0), offset_s=0.002),
     _phone("fast", "photographs", 16.0, 1.6, 2.0, ORDINARY_PX, offset_s=-0.002),
@@ -153,7 +153,7 @@ SHAKEN = (
     _shaken("noise", "photographs", 14.0, 1.6, 8.0),
     _shaken("lamps", "bright", 14.0, 1.4, 2.0),
 )
-"""Blur of 5 to 45 px, a plane near by, strong noise and lamps; restored by the gyroscope alone, with neighbours."""
+"""Blur of 5 to 45 px, a near plane, strong noise and lights; restored by the gyroscope alone, with neighbours."""
 
 
 def quality_workloads(scale: Scale) -> list[Workload]:
@@ -176,14 +176,14 @@ DEFOCUSED = (
     _defocused("defocused-fast", "photographs", 12.0, 1.4, 1.8),
     _defocused("defocused-more", "text", 8.0, 1.0, 2.8),
 )
-"""Each with its true profile: a right model that must not ruin the frames."""
+"""Each with its true profile: a correct model that must not degrade the frames."""
 SHORT = (
     _workload("short", "ordinary", (0.0, 6.0), "photographs", 8.0, 0.8, 1.5),
     _workload("short-leaves", "ordinary", (0.0, 6.0), "leaves", 9.0, 0.9, 2.0),
     _phone("short", "photographs", 9.0, 0.8, 1.5, (0.0, 6.0)),
     _phone("short-sharp", "leaves", 8.0, 0.9, 1.5, (0.0, 6.0), sharpen=0.8, offset_s=0.002),
 )
-"""Blur of 1 to 5 px, where little is to be gained and a promise is easily too high."""
+"""Blur of 1 to 5 px, where the possible gain is small and easily overestimated."""
 HONEST_QUICK = ("leaves", "phone-fast", "phone-stabilised", "defocused-calm")
 
 
@@ -198,7 +198,7 @@ def _shortened(workload: Workload, frames: int) -> Workload:
 
 
 def simulated(work: Path, name: str, **options: Any) -> Path:
-    """Simulate a capture below ``work``; one of that name that was made of the same options is used again."""
+    """Simulate a capture below ``work``; an existing one of that name with the same options is reused."""
     folder = work / "captures" / name
     made_of = folder.with_name(f".{name}.options")
     if not (folder.is_dir() and made_of.is_file() and made_of.read_text(encoding="utf-8") == repr(options)):
@@ -212,21 +212,21 @@ def simulated(work: Path, name: str, **options: Any) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What a command took."""
+    """Time of a command."""
 
     wall_s: float
-    """From the program's start to its end."""
+    """Wall-clock time from the program's start to its end."""
     cpu_s: float
-    """Of all its processes, in the program and in the kernel on its behalf."""
+    """CPU time (user and system) of all its processes."""
     others_cores: float
-    """Cores that others kept busy in that time; above some 0.1 the wall clock says little."""
+    """Cores kept busy by other processes; above about 0.1 the wall-clock time is unreliable."""
 
 
 def timed(command: list[str]) -> Timing:
-    """Run a command that must succeed, its standard output thrown away."""
+    """Run a command that must succeed; its standard output is discarded."""
     began, before_s = time.perf_counter(), _busy_s()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        _, status, usage = os.wait4(process.pid, 0)  # with all descendants that were waited for
+        _, status, usage = os.wait4(process.pid, 0)  # includes all descendants that were waited for
         process.returncode = os.waitstatus_to_exitcode(status)
     wall_s, cpu_s = time.perf_counter() - began, usage.ru_utime + usage.ru_stime
     if process.returncode:
@@ -235,7 +235,7 @@ def timed(command: list[str]) -> Timing:
 
 
 def _busy_s() -> float:
-    """Seconds that all cores together worked since the machine's start, and that its host took away."""
+    """Seconds that all cores together were busy since the machine's start, and that its host stole."""
     user, nice, system, _, _, irq, softirq, steal = map(int, Path("/proc/stat").read_text().split()[1:9])
     return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
 
@@ -247,27 +247,27 @@ class Run:
     folder: Path
     """OUT/<capture>."""
     lines: list[dict[str, Any]]
-    """Of parameters.jsonl."""
+    """The lines of parameters.jsonl."""
     timing: Timing
 
     @property
     def wall_s(self) -> float:
-        """From the program's start to its end."""
+        """Wall-clock time from the program's start to its end."""
         return self.timing.wall_s
 
     def picture(self, line: dict[str, Any]) -> Picture:
-        """Read the frame that a line names, RGB."""
+        """Read the restored frame of a line, RGB."""
         return read_png(self.folder / line["output"])
 
 
 def process_command(capture: Path, out: Path, *arguments: str) -> list[str]:
-    """Give the command line of one run over a capture, errors only on standard error."""
+    """The command line of one quiet run over a capture."""
     command = [sys.executable, "-m", "virest", "process", str(capture), "--out", str(out), "--overwrite", "-q"]
     return [*command, *arguments]
 
 
 def run_process(capture: Path, out: Path, *arguments: str) -> Run:
-    """Run ``virest process`` as a process of its own and read what it wrote."""
+    """Run ``virest process`` as a separate process and read its results."""
     timing = timed(process_command(capture, out, *arguments))
     folder = out / capture.name
     lines = [json.loads(line) for line in (folder / "parameters.jsonl").read_text(encoding="utf-8").splitlines()]
@@ -300,7 +300,7 @@ def read_png(path: Path) -> Picture:
 
 
 def looped_capture(work: Path, frames: int, width: int = 720, height: int = 1280) -> Path:
-    """Make a capture of any length: half a second of a simulated one, pictures and gyroscope repeated."""
+    """Make a capture of any length by repeating frames and gyroscope samples of 0.5 s of a simulated one."""
     size = f"{width}x{height}"
     folder = work / "captures" / f"loop{frames}-{size}"
     if folder.is_dir():
@@ -318,7 +318,7 @@ def looped_capture(work: Path, frames: int, width: int = 720, height: int = 1280
 
 
 def _loop_movie(source: Path, folder: Path, frames: int) -> None:
-    """Encode one group of pictures and repeat its packets: minutes of movie cost a copy."""
+    """Encode one group of pictures and repeat its packets, so that long movies need no encoding."""
     pictures = [picture for _, picture in recorded_frames(source)]
     count = min(frames, GROUP_FRAMES)
     group = folder / "group.mp4"
@@ -339,7 +339,7 @@ def _loop_movie(source: Path, folder: Path, frames: int) -> None:
 
 
 def _loop_table(source: Path, folder: Path, name: str, frames: int) -> None:
-    """Repeat a table of one row a frame, the stamps going on, without its last (Unix) column."""
+    """Repeat a table with one row per frame and continued timestamps, without its last (Unix) column."""
     head, *rows = [line.split(",")[:-1] for line in (source / name).read_text(encoding="ascii").splitlines()]
     start_ns = int(rows[0][0])
     lines = [",".join(head)]
@@ -350,7 +350,7 @@ def _loop_table(source: Path, folder: Path, name: str, frames: int) -> None:
 
 
 def _loop_gyro(source: Path, folder: Path, frames: int) -> None:
-    """Repeat the inertial samples of the loop's half second, from half a second before the movie to one after it."""
+    """Repeat the inertial samples of the loop's 0.5 s, from 0.5 s before the movie to 1 s after it."""
     stamp_0 = int((source / "frame_timestamps.txt").read_text(encoding="ascii").splitlines()[1].split(",")[0])
     head, *rows = [
         line.split(",")[:-1] for line in (source / "gyro_accel.csv").read_text(encoding="ascii").splitlines()

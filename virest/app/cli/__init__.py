@@ -1,4 +1,4 @@
-"""The command line. Heavy imports happen inside the commands; ``main`` is the one exit door."""
+"""The command line. Commands import heavy modules only when they run; every exit goes through ``main``."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ TERMINATED = 143
 CLOSED_PIPE = 141
 _SYSTEM_HINTS = {
     errno.ENOSPC: "free some space there",
-    errno.EDQUOT: "your quota is used up; free some space there",
+    errno.EDQUOT: "your disk quota is exhausted; free some space there",
     errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ELOOP: "a link of this path leads back to itself; choose another",
+    errno.ELOOP: "the path contains a circular link; choose another",
 }
 
 app = typer.Typer(
@@ -45,17 +45,17 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    help="Deblur and straighten phone captures with the phone's own gyroscope.",
+    help="Deblur phone captures and correct their rolling shutter with the phone's own gyroscope.",
 )
 _ClickException: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 
 class _Terminated(KeyboardInterrupt):
-    """The process was asked to end (SIGTERM, SIGHUP): leave as tidily as after Ctrl-C."""
+    """The process was asked to end (SIGTERM, SIGHUP): clean up as after Ctrl-C."""
 
 
 def _show_manual(wanted: bool) -> None:
-    """Print the manual page and leave: `--man`."""
+    """Print the manual page and exit: `--man`."""
     if wanted:
         from virest.app.man import man_page
 
@@ -74,24 +74,24 @@ def _virest(version: Version = False, manual: Manual = False) -> None:
 
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
-    "process": (process, "Deblur and straighten captures: the main job."),
-    "preview": (preview, "One frame before and after, in seconds."),
-    "inspect": (inspect, "What is in a capture, and what is wrong with it."),
+    "process": (process, "Deblur and straighten captures (the main command)."),
+    "preview": (preview, "Show one frame before and after, in seconds."),
+    "inspect": (inspect, "List what a capture holds and what is wrong with it."),
     "calibrate": (calibrate, "Fit clock, readout, axes and bias to a capture."),
     "calibrate-curve": (calibrate_curve, "Fit the exposure curve."),
-    "diagnose": (diagnose, "What the camera model gets wrong, and why."),
-    "criticise": (criticise, "What the residuals of any calibration depend on."),
-    "simulate": (simulate, "Write a capture with known truth."),
-    "import": (import_bag, "A ROS bag or MCAP file becomes a capture."),
-    "export": (export, "Frames and IMU for SLAM, COLMAP, nerfstudio, Gyroflow."),
-    "report": (report, "A run as one HTML page."),
+    "diagnose": (diagnose, "Find what the camera model gets wrong, and why."),
+    "criticise": (criticise, "Find what the residuals of any calibration depend on."),
+    "simulate": (simulate, "Write a capture with known ground truth."),
+    "import": (import_bag, "Convert a ROS bag or MCAP file to a capture."),
+    "export": (export, "Write formats for SLAM, COLMAP, nerfstudio, Gyroflow."),
+    "report": (report, "Show a run as one HTML page."),
     "doctor": (doctor, "Check the installation."),
 }
 """Each command with the line that ``virest --help`` shows."""
 for name, (command, line) in COMMANDS.items():
     app.command(name, short_help=line, cls=GroupedCommand)(command)
-app.add_typer(evaluate, name="evaluate", short_help="Measure quality against truth and other methods.")
-app.add_typer(profile, name="profile", short_help="Start a camera profile; known phones.")
+app.add_typer(evaluate, name="evaluate", short_help="Measure quality against ground truth and other methods.")
+app.add_typer(profile, name="profile", short_help="Create a camera profile; list known phones.")
 
 
 def _terminate(number: int, _frame: Any) -> NoReturn:
@@ -99,14 +99,14 @@ def _terminate(number: int, _frame: Any) -> NoReturn:
 
 
 def program() -> Any:
-    """The commands as the parser has them; arguments are shown by name, without their Python type."""
+    """The command tree for the parser; arguments are shown by name, without their Python type."""
     command = typer.main.get_command(app)
     _name_arguments(command)
     return command
 
 
 def _name_arguments(command: Any) -> None:
-    """Show arguments as manual pages do: NAME, [NAME] where it may be left out, NAME... where several are taken."""
+    """Show arguments as manual pages do: NAME, [NAME] if optional, NAME... if several are accepted."""
     for parameter in command.params:
         if parameter.param_type_name == "argument":
             name = parameter.metavar or parameter.name.upper()
@@ -118,10 +118,10 @@ def _name_arguments(command: Any) -> None:
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Run one command and turn whatever happens into an exit code."""
+    """Run one command and turn any outcome into an exit code."""
     command = program()
     words = list(sys.argv[1:] if arguments is None else arguments)
-    go_on = "; finished work is kept, --resume continues from there" if "process" in words[:1] else ""
+    resume_hint = "; finished work is kept, --resume continues from there" if "process" in words[:1] else ""
     try:
         with command.make_context("virest", list(words)) as context:
             code = command.invoke(context)
@@ -132,27 +132,27 @@ def run(arguments: list[str] | None = None) -> int:
         _report_usage(error)
         return USAGE
     except _Terminated:
-        console.CONSOLE.line(f"terminated{go_on}")
+        console.CONSOLE.line(f"terminated{resume_hint}")
         return TERMINATED
     except (KeyboardInterrupt, typer.Abort):
-        console.CONSOLE.line(f"interrupted{go_on}")
+        console.CONSOLE.line(f"interrupted{resume_hint}")
         return INTERRUPTED
     except BrokenPipeError:
         console.silence_stdout()
         return CLOSED_PIPE
     except Exception as error:
-        return console.report_error(_beyond_us(error) or error)
+        return console.report_error(_file_system_error(error) or error)
 
 
-def _beyond_us(error: Exception) -> OutputError | None:
-    """What the system says of a path that nobody looked at before: the disk is full, or the path cannot be."""
+def _file_system_error(error: Exception) -> OutputError | None:
+    """An operating-system error about a path that was not checked before: disk full, path too long, link loop."""
     if not isinstance(error, OSError) or error.errno not in _SYSTEM_HINTS:
         return None
     return OutputError(f"{error.filename or 'output'}: {error.strerror}", hint=_SYSTEM_HINTS[error.errno])
 
 
 def _report_usage(error: Any) -> None:
-    """One line for a wrong call; the help where nothing was asked for."""
+    """One line for a usage error; the help text if the command was given no arguments."""
     if type(error).__name__ == "NoArgsIsHelpError":
         console.CONSOLE.block(error.format_message() + "\n")
         return

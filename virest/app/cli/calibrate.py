@@ -1,4 +1,4 @@
-"""`virest calibrate`: fit the phone to an ordinary capture."""
+"""`virest calibrate`: fit camera and IMU parameters to an ordinary capture."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ CALIBRATED_EXTRAS = (
 
 
 def calibrate(
-    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its name from stdin.")],
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its path from stdin.")],
     config: Config = None,
     extra: Annotated[
         list[str] | None,
-        typer.Option("--with", metavar="NAME,...", help=f"Fit these too: {', '.join(CALIBRATED_EXTRAS)}."),
+        typer.Option("--with", metavar="NAME,...", help=f"Also fit these: {', '.join(CALIBRATED_EXTRAS)}."),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The calibrated profile goes here.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Write the calibrated profile here.")] = Path(
         "camera.yaml"
     ),
     kalibr: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write Kalibr's camchain-imucam.yaml and imu.yaml in here too.")
+        Path | None, typer.Option(metavar="DIR", help="Also write Kalibr's camchain-imucam.yaml and imu.yaml to DIR.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -67,7 +67,7 @@ def calibrate(
     output.require()
     paths = console.expand_dash([capture])
     if len(paths) != 1:
-        raise typer.BadParameter(f"standard input names {len(paths)} captures; a profile is calibrated from one")
+        raise typer.BadParameter(f"standard input lists {len(paths)} captures; calibrate takes one")
     plan = plan_calibration(Path(paths[0]), config, names)
     with process_map(cores()) as each, console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
         facts, text = run_calibration(plan, output, bar.update if bar else None, each)
@@ -76,7 +76,7 @@ def calibrate(
 
 
 def _parse_extras(options: list[str]) -> tuple[str, ...]:
-    """Names of ``--with``, each once; every option may hold several, separated by commas."""
+    """Names of ``--with``, each once; every option may list several, separated by commas."""
     from virest.app.calibrate import unknown_extra
 
     names = tuple(dict.fromkeys(name.strip() for option in options for name in option.split(",") if name.strip()))

@@ -1,4 +1,4 @@
-"""`virest calibrate-curve`: the exposure characteristic curve."""
+"""`virest calibrate-curve`: the camera's exposure curve."""
 
 from __future__ import annotations
 
@@ -14,25 +14,31 @@ CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
 
 
 def calibrate_curve(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Folder of bracketed stills, or a capture of a static scene.")
+    ],
     exposures: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Exposure times: columns file,exposure_s. [EXIF]")
+        Path | None, typer.Option(metavar="CSV", help="Exposure times, columns file,exposure_s. [from EXIF]")
     ] = None,
     kind: Annotated[
         str | None,
-        typer.Option(metavar="KIND", callback=one_of(CURVE_KINDS), help=f"{', '.join(CURVE_KINDS)}. [auto]"),
+        typer.Option(
+            metavar="KIND", callback=one_of(CURVE_KINDS), help=f"Curve model: {', '.join(CURVE_KINDS)}. [auto]"
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The response block goes here.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Write the response block here.")] = Path(
         "curve.yaml"
     ),
-    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Curve, data, residuals: png, svg or pdf.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Plot curve, data and residuals to this png, svg or pdf.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Fit the exposure characteristic curve to pictures of one still scene at several exposures.
+    """Fit the exposure curve (exposure to grey level) to pictures of a static scene at several exposures.
 
     \b
     $ virest calibrate-curve bracket --plot curve.png

@@ -1,4 +1,4 @@
-"""`virest criticise`: what a calibration's residuals say."""
+"""`virest criticise`: find structure in the residuals of a calibration."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
 
 def criticise(
     residuals: Annotated[
-        Path, typer.Argument(metavar="RESIDUALS", help="CSV: x, y, dx, dy in pixels, one row for each point.")
+        Path, typer.Argument(metavar="RESIDUALS", help="CSV with columns x, y, dx, dy in pixels, one row per point.")
     ],
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Find what the residuals of any calibration depend on, and say what may be behind it.
+    """Find what the residuals of any calibration depend on, and name likely causes.
 
-    Columns x, y are the point, dx, dy measured minus predicted, in pixels. Optional: row (fraction of the readout),
-    time (s), frame, vx, vy (speed of the point, px/s), and any other covariate under its own name.
+    Columns x, y give the point; dx, dy are measured minus predicted, in pixels. Optional columns: row (fraction of the
+    readout), time (s), frame, vx, vy (velocity of the point, px/s), and any other covariate under its own name.
 
     \b
     $ virest criticise residuals.csv
     residuals.csv: 2400 residuals (2400 used), 0.202 px rms per coordinate
-    asked along x, y, row, frame
+    tested covariates: x, y, row, frame
     field: shifts of up to 0.677 px depend on the position in the picture, ...
-    left: 0.152 px without structure
+    remaining: 0.152 px without structure
     $ virest criticise residuals.csv --json | jq '.fields[].sentence'
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)

@@ -1,4 +1,4 @@
-"""`virest diagnose`: what the model gets wrong."""
+"""`virest diagnose`: what the camera model gets wrong on a capture."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, cores,
 def diagnose(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
     config: Config = None,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="The capture's folder in here takes the results.")
-    ] = Path("virest-out"),
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Write the results to DIR/<capture>.")] = Path(
+        "virest-out"
+    ),
     check: Annotated[bool, typer.Option("--check", help="Exit with 10 unless the verdict is consistent.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing diagnosis.")] = False,
     json: Json = False,
@@ -24,7 +24,7 @@ def diagnose(
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Say what the camera model gets wrong on a capture, why, what to add, and what that gains.
+    """Find what the camera model gets wrong on a capture, name the causes, and measure what fixing them gains.
 
     \b
     $ virest diagnose trip

@@ -1,4 +1,4 @@
-"""`virest doctor`: is everything here, and what would be slow."""
+"""`virest doctor`: check the installation and what would slow it down."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
 
 
 def doctor(json: Json = False, quiet: Quiet = False, verbose: Verbose = False, version: Version = False) -> int:
-    """Check the installation: versions, cores, memory, codecs, extras, and what would be slow, with the reason.
+    """Check the installation: versions, cores, memory, codecs, extras, and what would slow processing down.
 
     \b
     $ virest doctor
     ...
-    everything that virest needs is here
+    all requirements are installed
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     from virest.app.doctor import examine

@@ -28,23 +28,23 @@ evaluate = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    help="How good is it: against truth, and against other methods given the same advantages.",
+    help="Measure quality against ground truth, and against other methods given the same inputs.",
 )
 TrueCaptures = Annotated[
     list[str] | None,
-    typer.Argument(metavar="CAPTURE", help="Captures with truth/; - reads names from stdin. [simulated]"),
+    typer.Argument(metavar="CAPTURE", help="Captures with truth/; - reads their paths from stdin. [simulated]"),
 ]
-Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B[:STEP]", help="Judge only these frames. [all]")]
-Maps = Annotated[Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write difference maps in here.")]
+Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B[:STEP]", help="Evaluate only these frames. [all]")]
+Maps = Annotated[Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write difference maps to DIR.")]
 
 
-@evaluate.command(short_help="Case A: angles and pictures of straightened boards.")
+@evaluate.command(short_help="Case A: corner angles and images of straightened boards.")
 def shutter(
     captures: TrueCaptures = None,
     config: Config = None,
     frames: Frames = None,
     board: Annotated[
-        str, typer.Option(metavar="KIND", callback=one_of(BOARDS), help="auto, chessboard or aprilgrid.")
+        str, typer.Option(metavar="KIND", callback=one_of(BOARDS), help="Board: auto, chessboard or aprilgrid.")
     ] = "auto",
     out: Maps = None,
     quick: Annotated[bool, typer.Option("--quick", help="Two simulated captures, four frames each.")] = False,
@@ -53,7 +53,7 @@ def shutter(
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Angles at a board's corners and pictures against truth, straightened by several methods (Case A).
+    """Straighten boards by several methods; compare corner angles and images with ground truth (Case A).
 
     \b
     $ virest evaluate shutter
@@ -84,18 +84,23 @@ def shutter(
     return 0
 
 
-@evaluate.command(short_help="Case B: fidelity and matches of deblurred pictures.")
+@evaluate.command(short_help="Case B: fidelity and feature matches of deblurred frames.")
 def deblur(
     captures: TrueCaptures = None,
     config: Config = None,
     frames: Frames = None,
     restored: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Judge these pictures, against --reference.")
+        Path | None, typer.Option(metavar="DIR", help="Evaluate these pictures against --reference.")
     ] = None,
-    reference: Annotated[Path | None, typer.Option(metavar="DIR", help="Their references, by the same names.")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Reference pictures with the same names.")
+    ] = None,
     out: Maps = None,
     over_time: Annotated[
-        bool, typer.Option("--over-time", help="Frames with their neighbours, against merging aligned frames.")
+        bool,
+        typer.Option(
+            "--over-time", help="Compare joint restoration with neighbouring frames to merging aligned frames."
+        ),
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Two simulated captures, two or three frames each.")] = False,
     json: Json = False,
@@ -103,7 +108,7 @@ def deblur(
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """MSE, PSNR, SSIM and matched points of pictures deblurred by several methods, against truth (Case B).
+    """Deblur by several methods; compare MSE, PSNR, SSIM and feature matches with ground truth (Case B).
 
     \b
     $ virest evaluate deblur
@@ -121,7 +126,7 @@ def deblur(
     if captures and not paths:
         return 0
     if (restored is None) != (reference is None):
-        raise typer.BadParameter("--restored and --reference belong together")
+        raise typer.BadParameter("--restored and --reference need each other; give both")
     if restored is not None and paths:
         raise typer.BadParameter("give captures, or --restored and --reference, not both")
     _require_captures(paths, {"--config": config, "--frames": frames})
@@ -139,8 +144,8 @@ def deblur(
 evaluate.command("slam", short_help="Case C: trajectories from restored frames.")(slam)
 
 
-def _require_captures(paths: list[str], wishes: dict[str, Any]) -> None:
-    """Refuse options that would do nothing."""
-    for name, wish in wishes.items():
-        if wish is not None and not paths:
-            raise typer.BadParameter(f"{name} goes with a CAPTURE")
+def _require_captures(paths: list[str], given: dict[str, Any]) -> None:
+    """Refuse options that would have no effect."""
+    for name, value in given.items():
+        if value is not None and not paths:
+            raise typer.BadParameter(f"{name} needs a CAPTURE")

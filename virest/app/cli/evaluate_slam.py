@@ -1,4 +1,4 @@
-"""`virest evaluate slam`: what restored frames are worth to a SLAM."""
+"""`virest evaluate slam`: what restored frames bring to SLAM."""
 
 from __future__ import annotations
 
@@ -15,21 +15,25 @@ from virest.restoration.settings import PRESETS
 def slam(
     captures: Annotated[
         list[str] | None,
-        typer.Argument(metavar="CAPTURE", help="Capture folders with truth/; - reads names from stdin. [simulated]"),
+        typer.Argument(
+            metavar="CAPTURE", help="Capture folders with truth/; - reads their paths from stdin. [simulated]"
+        ),
     ] = None,
     command: Annotated[
         str | None,
         typer.Option(
             metavar="CMD",
-            help="Run this SLAM in COLMAP's place: {sequence} {trajectory}, and {settings} {times} {seed} if wanted.",
+            help="Run this SLAM instead of COLMAP; needs {sequence} {trajectory}, knows {settings} {times} {seed}.",
         ),
     ] = None,
-    seeds: Annotated[int | None, typer.Option(metavar="N", min=1, help="Runs of each. [3]")] = None,
-    devices: Annotated[bool, typer.Option("--devices", help="Eight simulated phones too.")] = False,
+    seeds: Annotated[int | None, typer.Option(metavar="N", min=1, help="Runs per sequence. [3]")] = None,
+    devices: Annotated[bool, typer.Option("--devices", help="Also evaluate eight simulated phones.")] = False,
     preset: Annotated[
-        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Of the restoration.")
+        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Preset of the restoration.")
     ] = "balanced",
-    timeout_s: Annotated[float, typer.Option("--timeout", metavar="S", min=0.1, help="Of one run of CMD.")] = 600.0,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", metavar="S", min=0.1, help="Time limit of one run of CMD, in seconds.")
+    ] = 600.0,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Keep sequences, trajectories and results here.")
     ] = None,
@@ -48,7 +52,7 @@ def slam(
     print           29.5            6 ...
     shaken        20.733           12 ...
     ...
-    of the error that the rolling shutter adds, restored frames take away 99.6 % (median), 95.7 % at the least
+    restored frames remove 99.6 % (median; least 95.7 %) of the error that the rolling shutter adds
     ...
     $ virest evaluate slam walk --command 'mono_euroc_tum ORBvoc.txt {settings} {sequence} {times} {trajectory}'
     """  # noqa: D301
@@ -57,7 +61,7 @@ def slam(
     if captures and not paths:
         return 0
     if paths and devices:
-        raise typer.BadParameter("--devices are simulated; give no CAPTURE with it")
+        raise typer.BadParameter("--devices simulates its captures; give no CAPTURE with it")
     one_thread_each()
     from virest.app.evaluate_slam import SlamOptions, run_slam
 

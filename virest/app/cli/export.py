@@ -1,4 +1,4 @@
-"""`virest export`: a capture in the folders that SLAM tools read."""
+"""`virest export`: a capture in the formats that SLAM and reconstruction tools read."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ FORMATS, STAMPS = ("euroc", "tum", "nerfstudio", "colmap", "gyroflow"), ("logged
 
 
 def export(
-    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its name from stdin.")],
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its path from stdin.")],
     format: Annotated[
-        str, typer.Option("--format", metavar="NAME", callback=one_of(FORMATS), help=f"{', '.join(FORMATS)}.")
+        str, typer.Option("--format", metavar="NAME", callback=one_of(FORMATS), help=f"Format: {', '.join(FORMATS)}.")
     ] = "euroc",
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="The export goes into DIR/<capture>.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Write the export to DIR/<capture>.")] = Path(
         "virest-export"
     ),
     restored: Annotated[
         Path | None,
-        typer.Option("--restored", metavar="RUN_DIR", help="Frames of this finished run of virest process."),
+        typer.Option("--restored", metavar="RUN_DIR", help="Export the frames of this finished process run."),
     ] = None,
     config: Config = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's indices.")
+        str | None,
+        typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
     ] = None,
     stamps: Annotated[
         str,
@@ -35,31 +36,31 @@ def export(
             "--stamps",
             metavar="NAME",
             callback=one_of(STAMPS),
-            help="logged, or instant: moved to the instant that a picture stands for.",
+            help="Timestamps: logged, or instant (when the frame's content was seen).",
         ),
     ] = "logged",
     poses: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Camera trajectory (TUM), for nerfstudio and colmap.")
+        Path | None, typer.Option(metavar="FILE", help="Camera trajectory (TUM format) for nerfstudio and colmap.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an export that exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing export.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Write frames (raw or restored) and IMU as SLAM tools read them, without ROS, with calibration files.
+    """Write frames (recorded or restored), IMU and calibration in the formats of SLAM tools; ROS is not needed.
 
     \b
     $ virest export sample_data/text --format euroc --restored virest-out/text
-    text: 4 restored frames over 0.10 s and 320 inertial rows as euroc
-    a frame shows the instant 0.00 ms after its stamp
+    text: 4 restored frames over 0.10 s and 320 IMU samples in euroc format
+    a frame shows the instant 0.00 ms after its timestamp
     wrote virest-export/text
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     chosen = parse_frames(frames)
     paths = console.expand_dash([capture])
     if len(paths) != 1:
-        raise typer.BadParameter(f"standard input names {len(paths)} captures; one is exported at a time")
+        raise typer.BadParameter(f"standard input lists {len(paths)} captures; export takes one")
     from virest.app.export import ExportOptions, plan_export, run_export
 
     options = ExportOptions(out, format, restored, config, chosen, stamps, overwrite, poses)

@@ -1,4 +1,4 @@
-"""`virest import`: a bag becomes a capture folder."""
+"""`virest import`: convert a bag to a capture folder."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
 
 def import_bag(
     bag: Annotated[Path, typer.Argument(metavar="BAG", help="A .bag or .mcap file, or the folder of a ROS 2 bag.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The capture folder to write.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Write this capture folder.")],
     image: Annotated[
-        str | None, typer.Option(metavar="TOPIC", help="Image topic. [the one with most messages]")
+        str | None, typer.Option(metavar="TOPIC", help="Image topic. [the one with the most messages]")
     ] = None,
-    imu: Annotated[str | None, typer.Option(metavar="TOPIC", help="IMU topic. [the one with most messages]")] = None,
+    imu: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="IMU topic. [the one with the most messages]")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier import.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Unpack a ROS bag or MCAP file into a capture folder, without ROS: pictures, IMU, and the lens from CameraInfo.
+    """Convert a ROS bag or MCAP file to a capture folder: images, IMU, and the lens from CameraInfo; no ROS needed.
 
     \b
     $ virest import walk.mcap walk

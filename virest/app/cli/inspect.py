@@ -1,4 +1,4 @@
-"""`virest inspect`: what is in a capture."""
+"""`virest inspect`: what a capture holds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def inspect(
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Say what is in a capture and what is wrong with it, before any work.
+    """List what a capture holds and what is wrong with it, before any processing.
 
     \b
     $ virest inspect sample_data/text
@@ -50,6 +50,6 @@ def inspect(
 
 
 def _first_error(facts: dict[str, Any]) -> str:
-    """What makes a capture unusable, of all that was noted."""
+    """The first note that makes a capture unusable."""
     errors = [note["text"] for note in facts["notes"] if note["severity"] == "error"]
     return errors[0] if errors else f"{facts['capture']}: cannot be used"

@@ -1,4 +1,4 @@
-"""What commands share: options and their types, parsers, one way to print results and to show progress."""
+"""What all commands share: options and their types, parsers, printing of results and progress."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ log = logging.getLogger(__name__)
 
 PARTLY_FAILED = 9
 MOST_NEIGHBOURS = 8
-"""Frames on each side: beyond that even 30 frames/s show another picture."""
+"""Frames on each side: farther away even a capture at 30 frames/s shows a different scene."""
 
 
 def show_version(wanted: bool) -> None:
-    """Print the version and leave: `--version`."""
+    """Print the version and exit: `--version`."""
     if wanted:
         console.emit(f"virest {__version__}")
         raise typer.Exit
@@ -60,13 +60,13 @@ class GroupedCommand(typer.core.TyperCommand):
 
 Captures = Annotated[
     list[str],
-    typer.Argument(metavar="CAPTURE", help="Capture folders, or the movies in them; - reads names from stdin."),
+    typer.Argument(metavar="CAPTURE", help="Capture folders, or the movies in them; - reads their paths from stdin."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Machine-readable results on standard output, nothing else.")]
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Errors only.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say more; tracebacks for errors.")]
+Json = Annotated[bool, typer.Option("--json", help="Print results as JSON on standard output, and nothing else there.")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print more detail, and tracebacks for errors.")]
 Version = Annotated[
-    bool, typer.Option("--version", help="Print the version and leave.", is_eager=True, callback=show_version)
+    bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=show_version)
 ]
 Config = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="Camera profile, or a Kalibr camchain.")]
 
@@ -89,15 +89,15 @@ def parse_frames(text: str | None) -> slice:
 
 
 def capture_paths(captures: list[str]) -> list[str]:
-    """Names of captures, with those of standard input in the place of `-`."""
+    """Paths of captures, with `-` replaced by those on standard input."""
     paths = console.expand_dash(captures)
     if not paths:
-        log.warning("no capture: standard input names none")
+        log.warning("no capture: standard input is empty")
     return paths
 
 
 def parse_neighbours(text: str | None) -> int | None:
-    """How many neighbours on each side; None for ``auto``, which is the preset's number."""
+    """Number of neighbouring frames on each side; None for ``auto``: the preset decides."""
     if text is None or text.strip() == "auto":
         return None
     if not re.fullmatch(r"\s*\d{1,2}\s*", text, re.ASCII) or int(text) > MOST_NEIGHBOURS:
@@ -106,7 +106,7 @@ def parse_neighbours(text: str | None) -> int | None:
 
 
 def parse_shard(text: str | None) -> tuple[int, int]:
-    """The i-th of N parts, ``i/N`` with i from 1 to N."""
+    """The i-th of N parts, written ``i/N`` with i from 1 to N."""
     if text is None:
         return 1, 1
     found = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text, re.ASCII)
@@ -117,13 +117,13 @@ def parse_shard(text: str | None) -> tuple[int, int]:
 
 
 def batch_code(codes: list[int]) -> int:
-    """One capture gives its own code; a batch with any failure PARTLY_FAILED."""
+    """The capture's own code for one capture; PARTLY_FAILED for a batch with any failure."""
     failures = [code for code in codes if code]
     return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
 
 
 def emit_facts(facts: dict[str, Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
-    """Print a command's result: text for people (none with ``quiet``), one JSON object for machines."""
+    """Print a command's result: as text (not with ``quiet``), or as one JSON object."""
     from virest.app.outputs import json_line
 
     if as_json or not quiet:
@@ -131,7 +131,7 @@ def emit_facts(facts: dict[str, Any], text: str, *, as_json: bool, quiet: bool =
 
 
 def on_bar(bar: Any) -> Callable[[str, float], None] | None:
-    """Show the part that is done and the stage on a bar of 100."""
+    """Show the stage and the finished fraction on a bar of 100 steps."""
     if bar is None:
         return None
 
@@ -146,11 +146,11 @@ def on_bar(bar: Any) -> Callable[[str, float], None] | None:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def one_thread_each() -> None:
-    """One thread in each process's linear algebra: the same sums on every machine, and no more threads than cores."""
+    """Limit linear algebra to one thread per process: sums do not depend on the machine, threads never exceed cores."""
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"

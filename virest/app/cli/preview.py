@@ -1,4 +1,4 @@
-"""`virest preview`: one frame in seconds."""
+"""`virest preview`: one frame before and after."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from virest.restoration.settings import PRESETS
 def preview(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder, or the movie in it.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="The picture (PNG). [CAPTURE-preview.png]")
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Write the picture (PNG) here. [CAPTURE-preview.png]"),
     ] = None,
     config: Config = None,
-    frame: Annotated[int | None, typer.Option(metavar="N", help="This frame. [the one with the most blur]")] = None,
+    frame: Annotated[int | None, typer.Option(metavar="N", help="Frame to show. [the most blurred]")] = None,
     preset: Annotated[
-        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Quality against speed.")
+        str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Quality or speed.")
     ] = "balanced",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Show one frame as recorded, as restored, and with arrows along its blur: one picture in seconds.
+    """Show one frame as recorded, as restored, and with arrows along its blur, in seconds.
 
     \b
     $ virest preview sample_data/text

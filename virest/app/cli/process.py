@@ -1,4 +1,4 @@
-"""`virest process`: the main job."""
+"""`virest process`: the main command."""
 
 from __future__ import annotations
 
@@ -32,61 +32,76 @@ from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHU
 def process(
     captures: Captures,
     out: Annotated[
-        str, typer.Option("--out", "-o", metavar="DIR", help="One folder a capture goes in here; an s3:// address too.")
+        str, typer.Option("--out", "-o", metavar="DIR", help="Write one folder per capture here; s3:// works too.")
     ] = "virest-out",
     config: Config = None,
-    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings, as configs/balanced.yaml.")] = None,
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Settings file, such as configs/balanced.yaml.")
+    ] = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's indices.")
+        str | None,
+        typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="[balanced]")
+        str | None,
+        typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Quality or speed. [balanced]"),
     ] = None,
     deblur: Annotated[
         str | None,
-        typer.Option(metavar="METHOD", callback=one_of(DEBLUR_METHODS), help=f"One of {', '.join(DEBLUR_METHODS)}."),
+        typer.Option(
+            metavar="METHOD", callback=one_of(DEBLUR_METHODS), help=f"Deblurring: {', '.join(DEBLUR_METHODS)}."
+        ),
     ] = None,
     shutter: Annotated[
         str | None,
-        typer.Option(metavar="|".join(SHUTTER_METHODS), callback=one_of(SHUTTER_METHODS), help="[rowwise]"),
+        typer.Option(
+            metavar="|".join(SHUTTER_METHODS),
+            callback=one_of(SHUTTER_METHODS),
+            help="Rolling-shutter correction. [rowwise]",
+        ),
     ] = None,
     reference: Annotated[
         str | None,
         typer.Option(
-            metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Time of the picture. [exposure-start]"
+            metavar="|".join(REFERENCES),
+            callback=one_of(REFERENCES),
+            help="Instant that a restored frame shows. [exposure-start]",
         ),
     ] = None,
     neighbours: Annotated[
         str | None,
-        typer.Option(metavar="N|auto", help="Frames before and after that help to restore each. [auto: the preset's]"),
+        typer.Option(metavar="N|auto", help="Frames on each side used to restore each frame. [auto: by preset]"),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes. [the cores]")] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler does the work.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue what was interrupted or failed.")] = False,
+    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Number of processes. [one per core]")] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted or failed run.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
     keep_start_up: Annotated[
-        bool, typer.Option("--keep-start-up", help="Process the frames of the recorder's start-up too.")
+        bool, typer.Option("--keep-start-up", help="Also process the frames of the recorder's start-up.")
     ] = False,
     video: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Write a film (MP4); {capture} stands for the capture's name.")
+        str | None,
+        typer.Option(metavar="FILE", help="Write a video (MP4); {capture} is replaced by the capture's name."),
     ] = None,
     side_by_side: Annotated[
-        bool, typer.Option("--side-by-side", help="The film shows recorded beside restored frames.")
+        bool, typer.Option("--side-by-side", help="Show recorded beside restored frames in the video.")
     ] = False,
-    no_frames: Annotated[bool, typer.Option("--no-frames", help="Keep no PNGs; needs --video.")] = False,
-    mask: Annotated[bool, typer.Option("--mask", help="Write masks/: 255 recorded data, 0 repeated edge.")] = False,
+    no_frames: Annotated[bool, typer.Option("--no-frames", help="Keep no PNG files; needs --video.")] = False,
+    mask: Annotated[bool, typer.Option("--mask", help="Write masks/: 255 recorded data, 0 replicated edge.")] = False,
     crop: Annotated[
-        bool, typer.Option("--crop", help="Cut all frames to the area that holds recorded data in each of them.")
+        bool, typer.Option("--crop", help="Crop all frames to the area with recorded data in every frame.")
     ] = False,
     undistort: Annotated[
-        bool, typer.Option("--undistort", help="Undo the lens's distortion too: pictures of a pinhole camera.")
+        bool, typer.Option("--undistort", help="Undo the lens's distortion too: frames of a pinhole camera.")
     ] = False,
     skip_copied: Annotated[
         bool, typer.Option("--skip-copied", help="Write no PNG for frames that are only copied.")
     ] = False,
-    shard: Annotated[str | None, typer.Option(metavar="i/N", help="Only the i-th of N parts of the captures.")] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="i/N", help="Process only the i-th of N parts of the captures.")
+    ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print frames, predicted gain, time and bytes; write nothing.")
+        bool, typer.Option("--dry-run", help="Print frames, predicted gain, time and size; write nothing.")
     ] = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -121,11 +136,11 @@ def process(
     if not paths:
         return 0
     if video is not None and len(paths) > 1 and "{capture}" not in video:
-        raise typer.BadParameter("--video: several captures need {capture} in the film's name")
+        raise typer.BadParameter("--video: several captures need {capture} in the file name")
     one_thread_each()
-    from virest.app.finish import FinishWishes
+    from virest.app.finish import FinishOptions
     from virest.app.process import ProcessOptions, process_captures
-    from virest.app.segments import PictureWishes
+    from virest.app.segments import PictureOptions
     from virest.app.settings import compose_settings
     from virest.capture.location import locate
 
@@ -148,8 +163,8 @@ def process(
         scheduler,
         "resume" if resume else "overwrite" if overwrite else "new",
         shlex.join(["virest", *sys.argv[1:]]),
-        PictureWishes(mask, skip_copied),
-        FinishWishes(video, side_by_side, not no_frames, crop),
+        PictureOptions(mask, skip_copied),
+        FinishOptions(video, side_by_side, not no_frames, crop),
         json,
         quiet,
         verbose,

@@ -1,4 +1,4 @@
-"""`virest profile`: start a camera profile; known phones."""
+"""`virest profile`: create a camera profile; list known phones."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from virest.app import console
 from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
 
 profile = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Start a camera profile; readout times of known phones."
+    no_args_is_help=True, rich_markup_mode=None, help="Create a camera profile; list the readout times of known phones."
 )
 
 
-@profile.command("new", short_help="Write a camera profile to start from.")
+@profile.command("new", short_help="Create a camera profile.")
 def new(
     capture: Annotated[
-        str | None, typer.Argument(metavar="CAPTURE", help="Take what this capture's recorder logged.")
+        str | None, typer.Argument(metavar="CAPTURE", help="Use what this capture's recorder logged.")
     ] = None,
     device: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Readout time from the table of known phones.")
+        str | None, typer.Option(metavar="NAME", help="Take the readout time from the table of known phones.")
     ] = None,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Frame size, where no capture is given.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Frame size, if no capture is given.")] = None,
     focal_px: Annotated[float | None, typer.Option(metavar="PX", min=1.0, help="Focal length in pixels.")] = None,
     fov_deg: Annotated[
-        float | None, typer.Option(metavar="DEG", help="Field of view along the long side, for the focal length.")
+        float | None, typer.Option(metavar="DEG", help="Field of view along the long side; sets the focal length.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The profile goes here.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Write the profile here.")] = Path(
         "camera.yaml"
     ),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
@@ -37,7 +37,7 @@ def new(
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Write a camera profile with all that is known, commented; what is not known is null.
+    """Write a commented camera profile with all known values; unknown ones are null.
 
     \b
     $ virest profile new sample_data/text
@@ -51,15 +51,15 @@ def new(
     from virest.app.new_profile import NewProfile, parse_size, run_new_profile
 
     folder = None if capture is None else Path(console.folder_of(capture))
-    wishes = NewProfile(folder, device, None if size is None else parse_size(size), focal_px, fov_deg, out, overwrite)
-    facts, text = run_new_profile(wishes)
+    request = NewProfile(folder, device, None if size is None else parse_size(size), focal_px, fov_deg, out, overwrite)
+    facts, text = run_new_profile(request)
     emit_facts(facts, text, as_json=json, quiet=quiet)
     return 0
 
 
-@profile.command("devices", short_help="Readout times of known phones.")
+@profile.command("devices", short_help="List the readout times of known phones.")
 def devices(
-    text: Annotated[str, typer.Argument(metavar="TEXT", help="Only devices whose name holds these words.")] = "",
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="Only devices whose name contains this text.")] = "",
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,

@@ -1,4 +1,4 @@
-"""`virest report`: a run or a diagnosis as one page."""
+"""`virest report`: a run or a diagnosis as one HTML page."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ def report(
     run_dir: Annotated[
         Path,
         typer.Argument(
-            metavar="RUN_DIR", help="OUT/<capture> of a run or diagnosis, or OUT itself: then all captures in it."
+            metavar="RUN_DIR", help="OUT/<capture> of a run or diagnosis, or OUT itself for all its captures."
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="The page. [RUN_DIR/report.html]")
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write the page here. [RUN_DIR/report.html]")
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(metavar="N", min=1, max=200, help="Frames shown of each capture. [6]")
+        int | None, typer.Option(metavar="N", min=1, max=200, help="Frames to show per capture. [6]")
     ] = None,
     capture: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where the capture is now, or the folder that holds the captures."),
+        typer.Option(metavar="DIR", help="Where the capture is now, or the folder that contains the captures."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing page.")] = False,
     json: Json = False,
@@ -34,7 +34,7 @@ def report(
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Show a run or a diagnosis as one HTML page that needs no network: before and after, curves, verdict.
+    """Show a run or a diagnosis as one self-contained HTML page: before and after, plots, verdict.
 
     \b
     $ virest process sample_data/text --frames 0:4 --preset fast --quiet

@@ -1,4 +1,4 @@
-"""`virest simulate`: captures with known truth."""
+"""`virest simulate`: captures with known ground truth."""
 
 from __future__ import annotations
 
@@ -44,59 +44,74 @@ LIKE_OPTIONS = (
     "verbose",
     "version",
 )
-"""What `simulate --like` heeds; all else is the capture's."""
+"""Options that `simulate --like` uses; everything else comes from the capture."""
 
 
 def simulate(
     context: typer.Context,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the capture to write.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Write the capture to this folder.")],
     like: Annotated[
         Path | None,
-        typer.Option(metavar="CAPTURE", help="Re-create this capture: its camera, times, exposures and motion."),
+        typer.Option(metavar="CAPTURE", help="Re-create this capture: its camera, timestamps, exposures and motion."),
     ] = None,
-    scene: Annotated[str, typer.Option(metavar="KIND", help="leaves, bright, board, text or photographs.")] = "leaves",
-    width: Annotated[int, typer.Option(metavar="PX")] = 720,
-    height: Annotated[int, typer.Option(metavar="PX")] = 1280,
+    scene: Annotated[
+        str, typer.Option(metavar="KIND", help="Scene: leaves, bright, board, text or photographs.")
+    ] = "leaves",
+    width: Annotated[int, typer.Option(metavar="PX", help="Frame width.")] = 720,
+    height: Annotated[int, typer.Option(metavar="PX", help="Frame height.")] = 1280,
     frames: Annotated[
-        str | None, typer.Option(metavar="N", help="How many. With --like A:B, these of its frames. [12; all]")
+        str | None, typer.Option(metavar="N", help="Number of frames; with --like also A:B of its frames. [12; all]")
     ] = None,
-    fps: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
-    exposure_ms: Annotated[str, typer.Option(metavar="MS[,MS...]", help="Exposure; several are taken in turn.")] = "10",
+    fps: Annotated[float, typer.Option(metavar="HZ", help="Frames per second.")] = 30.0,
+    exposure_ms: Annotated[
+        str, typer.Option(metavar="MS[,MS...]", help="Exposure time; frames cycle through several.")
+    ] = "10",
     auto_exposure: Annotated[
         str | None,
         typer.Option(
             metavar="EV[:STEPS]",
-            help="Exposure x ISO and the brightness change by EV: a smooth walk, or STEPS exposures. [they stay]",
+            help="Vary exposure x ISO and brightness over EV, smoothly or in STEPS steps. [constant]",
         ),
     ] = None,
-    readout_ms: Annotated[float, typer.Option(metavar="MS", help="First row to one past the last.")] = 20.0,
+    readout_ms: Annotated[
+        float, typer.Option(metavar="MS", help="Readout time, from the first row to one past the last.")
+    ] = 20.0,
     direction: Annotated[
         str | None,
-        typer.Option(metavar="DIRECTION", callback=one_of(DIRECTIONS), help=f"Readout: {', '.join(DIRECTIONS)}."),
+        typer.Option(
+            metavar="DIRECTION", callback=one_of(DIRECTIONS), help=f"Readout direction: {', '.join(DIRECTIONS)}."
+        ),
     ] = None,
     focal_px: Annotated[float | None, typer.Option(metavar="PX", help="Focal length.")] = None,
-    rate: Annotated[float, typer.Option(metavar="RAD_S", help="How fast the hand turns; 0: not at all.")] = 1.0,
-    pan: Annotated[float, typer.Option(metavar="RAD_S", help="A steady turn to the side on top of it.")] = 0.0,
-    noise: Annotated[float, typer.Option(metavar="LEVELS", help="Noise of the picture, grey levels.")] = 1.5,
+    rate: Annotated[float, typer.Option(metavar="RAD_S", help="Rotation rate of the hand; 0: none.")] = 1.0,
+    pan: Annotated[float, typer.Option(metavar="RAD_S", help="Constant yaw rate in addition to --rate.")] = 0.0,
+    noise: Annotated[float, typer.Option(metavar="LEVELS", help="Image noise in grey levels.")] = 1.5,
     response: Annotated[
-        str, typer.Option(metavar="CURVE", help="srgb, linear, gamma:2.2, five_segment[:xb,yb,xc,yc,y_max].")
+        str, typer.Option(metavar="CURVE", help="Response: srgb, linear, gamma:2.2, five_segment[:xb,yb,xc,yc,y_max].")
     ] = "srgb",
     depth_m: Annotated[float | None, typer.Option(metavar="M", help="Distance of the scene. [infinity]")] = None,
     near_m: Annotated[
-        float | None, typer.Option(metavar="M", help="Things hang before the scene, this far away. [none]")
+        float | None, typer.Option(metavar="M", help="Distance of objects in front of the scene. [none]")
     ] = None,
     moving: Annotated[
-        float, typer.Option(metavar="PX_S", help="Things move across the scene at this speed; 0: none.")
+        float, typer.Option(metavar="PX_S", help="Speed of objects moving across the scene; 0: none.")
     ] = 0.0,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Take the camera from this profile.")] = None,
     effect: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME[=VALUE]", help="Hide this effect in the capture; may be repeated."),
+        typer.Option(
+            metavar="NAME[=VALUE]", help="Apply this effect without stating it in camera.yaml; may be repeated."
+        ),
     ] = None,
     reference: Annotated[
-        str, typer.Option(metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Of the truth pictures.")
+        str,
+        typer.Option(
+            metavar="|".join(REFERENCES), callback=one_of(REFERENCES), help="Instant that the truth frames show."
+        ),
     ] = REFERENCES[0],
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="The same seed gives the same capture.")] = 0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Random seed; the same seed gives the same capture.")
+    ] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a simulated capture.")] = False,
     isp: Isp = None,
     tone: Tone = None,
@@ -116,7 +131,7 @@ def simulate(
     verbose: Verbose = False,
     version: Version = False,
 ) -> int:
-    """Write a capture with known truth: movie, logs, camera.yaml, and truth/ with sharp frames and the motion.
+    """Write a capture with known ground truth: movie, logs, camera.yaml, and truth/ with sharp frames and motion.
 
     \b
     $ virest simulate leaves --width 360 --height 640 --frames 20 --rate 1.5 --effect time_offset=0.012
@@ -135,9 +150,9 @@ def simulate(
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     if like is not None:
-        _require_only(context, LIKE_OPTIONS, "--like takes it from the capture")
-        wishes = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
-        facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **wishes)
+        _require_only(context, LIKE_OPTIONS, "has no effect with --like, which takes it from the capture")
+        options = {"noise_levels": noise, "effects": effect or [], "reference": reference, "seed": seed}
+        facts = _simulate_like(out, like, config, frames, quiet, overwrite=overwrite, **options)
         emit_facts(facts, _describe_simulation(facts), as_json=json, quiet=quiet)
         return 0
     count = _parse_count(frames, 12)
@@ -171,16 +186,16 @@ def simulate(
 
 
 def _simulate_like(
-    out: Path, like: Path, config: Path | None, frames: str | None, quiet: bool, **wishes: Any
+    out: Path, like: Path, config: Path | None, frames: str | None, quiet: bool, **options: Any
 ) -> dict[str, Any]:
-    """Re-create a capture; a bare N of ``--frames`` means its first N."""
+    """Re-create a capture; a single number N in ``--frames`` means its first N frames."""
     chosen = parse_frames(frames if frames is None or ":" in frames else f":{frames}")
     one_thread_each()
     from virest.app.recreate import count_frames, simulate_like
 
     with console.progress_bar(count_frames(like, chosen), "simulate", quiet=quiet) as bar:
         step = (lambda _done, _total: bar.update(1)) if bar else None
-        return simulate_like(out, like, config=config, frames=chosen, progress=step, **wishes)
+        return simulate_like(out, like, config=config, frames=chosen, progress=step, **options)
 
 
 def _describe_simulation(facts: dict[str, Any]) -> str:
@@ -199,7 +214,7 @@ def _seconds(milliseconds: float | None) -> float | None:
 
 
 def _require_only(context: typer.Context, allowed: tuple[str, ...], why: str) -> None:
-    """Refuse options that were typed and would do nothing."""
+    """Refuse options that were given but would have no effect."""
     for name in context.params:
         source = context.get_parameter_source(name)
         if name not in allowed and source is not None and source.name == "COMMANDLINE":
@@ -223,10 +238,10 @@ def _parse_exposures(text: str) -> list[float]:
 
 
 def _parse_auto_exposure(text: str | None) -> tuple[float | None, int | None]:
-    """Parse a range in EV, and the number of exposures where a staircase is asked for: ``4`` or ``6:9``."""
+    """Parse a range in EV, and the number of steps for a staircase: ``4`` or ``6:9``."""
     if text is None:
         return None, None
     found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(?::\s*([0-9]{1,6})\s*)?", text, re.ASCII)
     if found is None:
-        raise typer.BadParameter(f"{text!r} is no range of exposures; write 4 (a smooth walk), or 6:9 (nine steps)")
+        raise typer.BadParameter(f"{text!r} is not an exposure range; write 4 (smooth change) or 6:9 (nine steps)")
     return float(found[1]), None if found[2] is None else int(found[2])

@@ -13,7 +13,7 @@ for (const viewer of document.querySelectorAll("[data-viewer]")) {
     if (!range) return;
     const stage = frame.querySelector("[data-stage]");
     const compare = frame.querySelector("[data-compare]");
-    // The divider runs over the part of the picture that is seen, which is all of it unless it is shown at full size.
+    // The divider spans the visible part of the picture: all of it, except at full size.
     const width = compare.clientWidth;
     const seen = Math.min(stage.clientWidth, width);
     const cut = Math.min(stage.scrollLeft, width - seen) + (range.value / 100) * seen;
@@ -31,7 +31,7 @@ for (const viewer of document.querySelectorAll("[data-viewer]")) {
     const shown = frames.find((frame) => !frame.hidden)?.querySelector("[data-cut]");
     if (shown && !flicker) cut = shown.value;
     const range = frames[chosen].querySelector("[data-cut]");
-    if (range && !flicker) range.value = cut;  // the divider stays where the reader put it
+    if (range && !flicker) range.value = cut;  // keep the divider where the reader put it
     frames.forEach((frame, k) => { frame.hidden = k !== chosen; });
     buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(k === chosen)));
     draw(frames[chosen]);
