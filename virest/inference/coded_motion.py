@@ -23,10 +23,11 @@ from virest.image_formation.row_clock import RowClock
 from virest.motion.scene_motion import Motion
 
 Array = NDArray[np.float64]
-AT_ONCE_PER_PX, BY_ROWS_PER_PX = (0.8, 1.0), (1.2, 2.3)
+AT_ONCE_PER_PX, BY_ROWS_PER_PX = (0.5, 1.0), (1.2, 2.3)
 """Usual error of a step from the blocks to the left and above, over the square of the step's noise, both in px: where
 steps differ at one instant, and where they differ because rows are read at other times.
-``python -m virest.app.bench --only coding`` prints both."""
+``python -m virest.app.bench --only coding`` prints both; at one instant as at 0.1 bits per pixel, where the points' own
+noise matters least."""
 MOST_ERROR_PX = 0.06
 """Largest error found, at 0.16 px of noise; noise above that has other causes than the encoder."""
 BLOCK_PX = 16.0
