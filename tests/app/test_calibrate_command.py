@@ -339,7 +339,7 @@ def test_nothing_is_written_when_the_fit_fails(shaken: Path, tmp_path: Path, mon
     """An error of the library leaves neither profile nor Kalibr's folder."""
 
     def refuse(*_: Any) -> None:
-        raise CalibrationError("the pictures do not follow the gyroscope")
+        raise CalibrationError("the frames do not follow the gyroscope")
 
     monkeypatch.setattr(command, "calibrate_geometry", refuse)
     with pytest.raises(CalibrationError):

@@ -70,7 +70,7 @@ def test_a_movie_that_follows_no_gyroscope_has_to_be_recorded_again() -> None:
     unknown = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None)
     plan = RestorationPlan(unknown, RestorationSettings())
     assert "virest calibrate" in _advice(plan)
-    advice = _advice(plan.refused(NoteCode.NOT_FOLLOWING, "the pictures do not follow the gyroscope"))
+    advice = _advice(plan.refused(NoteCode.NOT_FOLLOWING, "the frames do not follow the gyroscope"))
     assert "stabilisation off" in advice
     assert "calibrate" not in advice
 

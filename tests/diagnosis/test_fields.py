@@ -173,7 +173,7 @@ def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival()
     _, (field,) = judged(phone, phone.profile)
     assert field.covariates == ("focus",)
     assert field.confounded == ("scale over time",)
-    assert "scale over time would explain it as well" in field.sentence
+    assert "scale over time would explain it equally well" in field.sentence
     assert field.size == pytest.approx(0.04, rel=0.1)
     assert not field.fields[0].belongs_to_one_capture
 

@@ -494,7 +494,7 @@ def test_a_curve_that_was_not_told_widens_what_hangs_on_it(
     assert abs(loss - 0.5) < 2.5 * std
     assert std > 3 * narrow
     assert [f.p_value for f in final.findings] == pytest.approx([f.p_value for f in light.findings])
-    assert any("nothing told the curve" in note for note in final.notes) == (strength is None)
+    assert any("could not be estimated at constant exposure" in note for note in final.notes) == (strength is None)
     known = NOMINAL.with_estimate("gamma", 1.0, 0.002, "calibrated")
     sure = loss_of(settled(observed, evidence, known)[1])
     assert sure == pytest.approx((taken, narrow), rel=0.05)

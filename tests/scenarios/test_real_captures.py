@@ -96,7 +96,7 @@ def test_pictures_that_the_camera_stabilised_are_copied(virest, realdata: Path, 
     """Where pictures do not follow the gyroscope the run says so, ends with 0, and copies every covered frame."""
     capture = realdata / "gopro_hero7"
     result = process(virest, capture, tmp_path, "--preset", "fast", "--frames", "0:20")
-    assert "the pictures do not follow the gyroscope" in result.stderr
+    assert "the frames do not follow the gyroscope" in result.stderr
     assert any("do not follow" in warning for warning in result.account["warnings"])
     steps = {"deblurred": 0, "straightened": 0, "undistorted": 0}
     assert result.account["counts"] == {"restored": 0, "copied": 18, "skipped": 2, "failed": 0, **steps}

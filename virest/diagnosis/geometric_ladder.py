@@ -180,7 +180,9 @@ def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdic
         for entry in chosen.accepted
     ]
     if instead:
-        chosen.notes.append(f"{' and '.join(r.name for r in instead)} in place of others explains the points as well")
+        chosen.notes.append(
+            f"{' and '.join(r.name for r in instead)} in place of others would explain the points equally well"
+        )
     chosen.rival = rival
     return chosen
 

@@ -110,7 +110,7 @@ def _tracked(
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
         raise CaptureError(
-            f"{len(observed.pairs)} pairs of frames have points to follow, {MIN_PAIRS} are needed",
+            f"{len(observed.pairs)} pairs of frames have trackable points, {MIN_PAIRS} are needed",
             hint="a longer capture, or one with more texture",
         )
     schedules = lag_schedules(capture, capture.repeats) if not profile.extensions.frame_lag_frames else []
@@ -118,11 +118,13 @@ def _tracked(
     rungs_allowed = MAX_RUNGS if (follows or schedules) and not still else 0
     stamped_frames = sum(NO_STAMP not in frame.skip_codes for frame in capture.frames)
     if len(indices) < stamped_frames:
-        notes.append(f"points were followed in {len(indices)} of {stamped_frames} frames, runs spread over the capture")
+        notes.append(
+            f"points were tracked in {len(indices)} of {stamped_frames} frames, in runs spread over the capture"
+        )
     if still:
-        notes.append("the camera is at rest: points tell nothing of clocks, readout or lens")
+        notes.append("the camera is at rest: clocks, readout and lens cannot be estimated from the points")
     elif not rungs_allowed:
-        notes.append("the pictures do not follow the gyroscope at any offset: no cause was fitted to the points")
+        notes.append("the frames do not follow the gyroscope at any offset: no cause was fitted to the points")
     return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
 
 
@@ -219,7 +221,7 @@ class DiagnosisSession:
         scale, is_exposure = exposure_hypothesis(self.findings, exposure_s), False
         if points_left(self.geometric).significant:
             self.notes.append(
-                "points do not go where the model says: blur, and what it does to the curve, were not judged"
+                "tracked points disagree with the model: blur and its effect on the curve were not judged"
             )
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
@@ -246,7 +248,7 @@ class DiagnosisSession:
         if _paths_uncertain(extended, self.geometric):
             if self.light.observations is None or not light_varies(self.light.observations):
                 self.curve.notes.append(
-                    "blur depends on more than turns: the curve was not judged at constant exposure"
+                    "blur depends on more than rotation: the curve was not judged at constant exposure"
                 )
             return
         trajectory = integrate_gyro(self.capture.imu, extended)

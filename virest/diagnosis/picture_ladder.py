@@ -64,7 +64,7 @@ a black level would only absorb that."""
 VARIED_LIGHT = 0.25
 """Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
 UNEVEN = (
-    "brightness changes from frame to frame, and not alike on all sides of the picture: a shadow that comes or moves, "
+    "brightness changes from frame to frame, unevenly across the frame: a moving shadow "
     "or light from one side; no cause was named for it"
 )
 SOFT_Z = 5.0
@@ -134,7 +134,7 @@ def climb_light(
         return climb_photometry(capture, frames, profile, trajectory, rgb, each)
     span = f"frames {looked[0].index} to {looked[-1].index}"
     note = f"brightness was judged in {len(looked)} of {len(frames)} frames, {span}"
-    found.notes.append(f"{note}; the others' gain is taken to be that of the nearest" if gains else note)
+    found.notes.append(f"{note}; the other frames use the gain of the nearest judged frame" if gains else note)
     return found
 
 
@@ -152,7 +152,9 @@ def climb_photometry(
         verdict.notes.append("no frame at a known time: brightness not judged")
         return verdict
     if all(frame.exposure_s is None for frame in frames):
-        verdict.notes.append("exposures unknown: what changes brightness between frames cannot be told; not judged")
+        verdict.notes.append(
+            "exposures unknown: brightness changes between frames cannot be attributed and were not judged"
+        )
         return verdict
     by_index = {frame.index: frame for frame in frames}
     pictures = ((by_index[k], picture) for k, picture in rgb([frame.index for frame in frames]))
@@ -405,7 +407,8 @@ def climb_blur(
     if 1 not in named and fitted.determined[1] and sigma > SOFT_Z * float(std[1]):
         soft = float(np.hypot(sigma, fitted.nuisance[0]))
         verdict.notes.append(
-            f"edges are {soft:.2f} px soft: by the lens, or a defocus of about {sigma:.1f} px; not named"
+            f"edges are blurred by {soft:.2f} px: a soft lens, or a defocus of about {sigma:.1f} px; "
+            "not reported as a cause"
         )
     for k in named:
         alone = tuple(effects[j] for j in named)

@@ -93,7 +93,10 @@ def _notes(light: PictureVerdict, curve: PictureVerdict) -> list[str]:
     if curve.mixed or light.observations is None or light_varies(light.observations):
         return []
     names = " and ".join(finding.name for finding in light.findings)
-    return [f"nothing told the curve at constant exposure: {names} by the profile's, with its doubt in the deviations"]
+    return [
+        f"the response curve could not be estimated at constant exposure: {names} use the profile's "
+        "curve, and the standard deviations include its uncertainty"
+    ]
 
 
 # ── what is open ───────────────────────────────────────────────────────────────────────────────────────────────────

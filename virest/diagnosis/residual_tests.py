@@ -77,10 +77,10 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     strays = geometric.astray > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
     log.debug("left: %s, limit %.3f, beyond noise %.3f, stray %.3f", found, limit, beyond, stray)
     if strongest.size > limit and strongest.p_value < STRUCTURE_P:
-        sentence = f"{strongest.size:.3f} px remain, strongest along {strongest.along}"
+        sentence = f"residual {strongest.size:.3f} px, strongest along {strongest.along}"
         return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, True, sentence)
     if noisier:
-        sentence = f"{beyond:.3f} px remain beyond tracking noise, strongest along {strongest.along}"
+        sentence = f"residual {beyond:.3f} px beyond tracking noise, strongest along {strongest.along}"
         return Remaining(p_noisier, strongest.along, beyond, GEOMETRY, True, sentence)
     if strays:
         sentence = f"{stray:.0%} of the points move on their own"
@@ -133,7 +133,7 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
     strongest = max(found, key=lambda s: s.size)
     log.debug("light left: %s", found)
     significant = strongest.size > PHOTOMETRIC_STRUCTURE and strongest.p_value < STRUCTURE_P
-    sentence = f"{strongest.size:.1f} grey levels remain, strongest along {strongest.along}" if significant else ""
+    sentence = f"residual {strongest.size:.1f} grey levels, strongest along {strongest.along}" if significant else ""
     return Remaining(strongest.p_value, strongest.along, strongest.size, PHOTOMETRY, significant, sentence)
 
 

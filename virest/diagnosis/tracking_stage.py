@@ -88,7 +88,7 @@ class TrackedPoints:
         rest = self.observed.without_cells(cells)
         again = self._climbed(replace(rest, noise_px=step_noise_px(rest.pairs)), progress)
         again.astray = astray
-        again.notes.append(f"{astray:.0%} of the points lie in parts of the picture that go their own way: left out")
+        again.notes.append(f"{astray:.0%} of the points lie in image regions that move independently and were excluded")
         return again
 
     def described(self, found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
@@ -204,13 +204,16 @@ def with_null_values(
     telling = (agree or bool(capture.repeats)) and not at_rest(observed, profile)
     if unknown_lens:
         terms += [terms_of.FOCAL] if telling else []
-        notes.append(f"focal length unknown: {'fitted on every rung, from a guess' if telling else 'a guess is taken'}")
+        notes.append(
+            "focal length unknown: "
+            f"{'fitted at every step from an initial guess' if telling else 'an initial guess is used'}"
+        )
     if not profile.readout_known and telling:
         terms.append(terms_of.READOUT if profile.time_offset_s is None else PLAIN_READOUT)
     if profile.time_offset_s is not None:
         return profile, terms, notes, far or FarStart(), agree
     if far is None:
-        notes.append("the time offset is unknown and the pictures do not tell it: 0 taken")
+        notes.append("the time offset is unknown and could not be estimated from the frames: 0 is used")
         return replace(profile, time_offset_s=0.0), terms, notes, FarStart(), agree
     terms += [terms_of.TIME_OFFSET] if telling else []
     begun = replace(profile, time_offset_s=far.offset_s)

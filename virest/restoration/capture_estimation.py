@@ -397,7 +397,7 @@ def _filled(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTracks) ->
         if plan.refusal:
             return plan
         if estimate.explained < MIN_EXPLAINED:
-            return plan.refused(NoteCode.NOT_FOLLOWING, "the pictures do not follow the gyroscope")
+            return plan.refused(NoteCode.NOT_FOLLOWING, "the frames do not follow the gyroscope")
         return plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")
     offset_s = estimate.time_offset_s
     profile = plan.profile.with_estimate(

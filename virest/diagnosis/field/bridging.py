@@ -72,7 +72,7 @@ def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Do
     if p_value > MAX_P:
         found.notes.append(
             f"{len(doubtful.stretches)} stretches of the inertial log look {doubtful.stretches[0].kind}; "
-            "points there do not show it, their frames took no part in the ladder"
+            "tracked points do not confirm it, and their frames were excluded from the fits"
         )
         return
     half = np.arange(len(table)) % 2 == 0

@@ -45,7 +45,10 @@ REASONS = (
     "the lens shades off its centre, something stands before it or dirt lies on it, or the phone corrects its shading "
     "as the profile does not"
 )
-NEXT = "film an evenly lit wall, then the same with the phone upside down: what turns along is the phone's"
+NEXT = (
+    "film an evenly lit wall, then the same with the phone upside down: an error that rotates with "
+    "the phone belongs to the phone"
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -160,7 +160,9 @@ def _cleaned(columns: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
             raise CaptureError(f"a value of {largest:.3g} px in column {name}", hint="all values are in pixels")
     keep = np.all([np.isfinite(values) for values in table.values()], axis=0)
     if keep.sum() < LEAST_ROWS:
-        raise CaptureError(f"{int(keep.sum())} complete rows, {LEAST_ROWS} are needed", hint="write more residuals")
+        raise CaptureError(
+            f"{int(keep.sum())} complete rows, {LEAST_ROWS} are needed", hint="supply more residual rows"
+        )
     if not any(table[name][keep].any() for name in ("dx", "dy")):
         raise CaptureError("all residuals are 0", hint="dx and dy are measured minus predicted, in pixels")
     rows = np.flatnonzero(keep)
@@ -315,7 +317,7 @@ def _finding(
             curve[:, int(np.argmax(np.ptp(curve, axis=0)))], "time" if form.over_time else form.covariates[0]
         )
     sentence, reasons, following = _said(form, shape, size)
-    beside = f"; {' and '.join(rivals)} would explain it as well" if rivals else ""
+    beside = f"; {' and '.join(rivals)} would explain it equally well" if rivals else ""
     return TableFinding(
         form.kind, form.covariates, shape, f"{sentence} (residuals {before:.3g} px → {after:.3g} px, held out){beside}",
         size, unit, float(np.linalg.norm(std[row])), before, after, min(noise, after), p_value, rivals, form.knots,
@@ -328,7 +330,7 @@ def _said(form: _Form, shape: str, size: float) -> tuple[str, str, str]:
     name = " and the ".join(form.covariates)
     if len(form.knots) > 1 and form.kind != "displacement":
         unit = {"scale": f"{100 * size:.3g} % of the focal length", "delay": f"{1e3 * size:.3g} ms"}
-        said = f"{form.kind}s of up to {unit.get(form.kind, f'{size:.3g} px')} that the {name} make together: {shape}"
+        said = f"{form.kind}s of up to {unit.get(form.kind, f'{size:.3g} px')} from the interaction of {name}: {shape}"
         known = PATTERNS.get((form.kind, form.covariates), PATTERNS["scale", ("radius", "time")])
         reasons = known.reasons if form.kind != "shift" else "something that acts through both at once"
         return said, reasons, f"record again with the {name} moving independently of each other"
@@ -349,5 +351,5 @@ def _said(form: _Form, shape: str, size: float) -> tuple[str, str, str]:
             return said, known.reasons, known.next
         case _:
             said = SHIFT.format(size=f"{size:.3g} px", shape=f"({shape})" + " as a function", name=name)
-            reasons = "a pose or a clock that changes with it, or rows that are seen at other times than assumed"
+            reasons = "a pose or a clock that changes with it, or row times that differ from those assumed"
             return said, reasons, f"record again with {name} moving independently of everything else"

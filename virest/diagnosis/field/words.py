@@ -48,7 +48,7 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
     ("delay", ("row",)): Pattern(
         "points are {lateness} by up to {size} {where} of the readout, {shape} of the row: lines are not read evenly",
         "the sensor reads its lines in blocks or pauses between them, or the picture was cropped and scaled by lines",
-        "film a lamp that flickers at a known rate, without other light: its bands show each line's time",
+        "film a light that flickers at a known rate, without other light: its bands show each line's time",
     ),
     ("delay", ("time",)): Pattern(
         "frames are {lateness} by up to {size} {where} of the capture, {shape} of time: the stamps' clock wanders",
@@ -56,10 +56,11 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "film a display that counts milliseconds, and compare the steps of the stamps with the steps shown",
     ),
     ("displacement", ("x", "y")): Pattern(
-        "shifts of up to {size} depend on the position in the picture, {shape}, the same in all frames: {lens}",
+        "shifts of up to {size} depend on the position in the frame, {shape}, and are the same in all frames: {lens}",
         "a lens element off centre or tilted, a window or waterproof case in front, or a correction by the phone that "
         "the profile does not hold",
-        "calibrate the lens with a board in all corners, once with the phone upside down: what turns along is the lens",
+        "calibrate the lens with a board in all corners, once with the phone upside down: an error "
+        "that rotates with the phone belongs to the lens",
     ),
     ("scale", ("time",)): Pattern(
         "the focal length changes by {size} over the capture, {shape} of time",
@@ -73,7 +74,8 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
     ),
     ("rate", ("rate",)): Pattern(
         "the gyroscope's error depends on its rate, {shape}: up to {size} are missing {rates}",
-        "a sensor that saturates softly or sticks near rest, or a filter in the phone that bounds fast or small turns",
+        "a sensor that saturates softly or sticks near rest, or a filter in the phone that limits "
+        "fast or small rotations",
         "turn the phone on a table at several speeds and compare the log with the angle turned",
     ),
     ("rate", ("acceleration",)): Pattern(
@@ -84,15 +86,16 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
     ("delay", ("row", "time")): Pattern(
         "rows are {lateness} by up to {size} in some frames and not in others, {shape}: the readout changes as it runs",
         "a sensor that changes its mode or clock while it films, or a picture that is cropped and scaled as it goes",
-        "film a lamp that flickers at a known rate: its bands grow closer where the readout takes longer",
+        "film a light that flickers at a known rate: its bands grow closer where the readout takes longer",
     ),
     ("scale", ("radius", "time")): Pattern(
-        "the lens draws up to {size} longer outwards at some times and not at others, {shape}: its distortion changes",
+        "the magnification towards the edges changes by up to {size} over time, {shape}: its distortion changes",
         "a lens that warms up or refocuses without logging it, or a phone that corrects distortion frame by frame",
         "film a still board for a minute, once with the focus locked: a distortion that then stays is the focus's",
     ),
     ("scale", ("radius", "focus")): Pattern(
-        "the lens draws up to {size} longer outwards as it focuses, {shape}: its distortion changes with the focus",
+        "the magnification towards the edges changes by up to {size} as the lens focuses, {shape}: "
+        "its distortion changes with the focus",
         "focusing moves lens elements, and distortion moves along",
         "calibrate the lens with a board at several focus distances",
     ),
@@ -129,7 +132,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
         rates=_at_rates(fields[0]),
     )
     rms = f" (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out)"
-    beside = f"; in this capture {' and '.join(entry.rivals)} would explain it as well" if entry.rivals else ""
+    beside = f"; in this capture {' and '.join(entry.rivals)} would explain it equally well" if entry.rivals else ""
     return FieldFinding(
         form.covariates,
         form.kind,
@@ -158,8 +161,8 @@ def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
             f"beyond {first.limit_rad_s:.3g} rad/s the gyroscope reads too little: it clips, "
             f"{len(entry.stretches)} times for {total_s * 1e3:.0f} ms in all, on axis {axis_names(entry.stretches)}"
         )
-        reasons = "the turn was faster than the sensor's range"
-        following = "set the sensor to a wider range, or turn more slowly"
+        reasons = "the rotation was faster than the sensor's range"
+        following = "set the sensor to a wider range, or move more slowly"
     else:
         where = (
             f"in {len(entry.stretches)} stretches, {total_s * 1e3:.0f} ms in all, the first from {first.from_s:.2f} s"
@@ -167,12 +170,12 @@ def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
             else f"for {total_s * 1e3:.0f} ms from {first.from_s:.2f} s"
         )
         sentence = f"{where} the log does not follow the frames: inertial rows there lie on a straight line"
-        reasons = "rows were lost and a program filled the gap in, or the sensor's queue stalled"
+        reasons = "rows were lost and a program interpolated the gap, or the sensor's queue stalled"
         following = "look at the raw log for rows with equal steps, and record with less load on the phone"
-    bridged = "bridged from the points" if all(entry.bridged) else "left alone by process"
+    bridged = "bridged from the points" if all(entry.bridged) else "not corrected by process"
     said = f"{sentence} (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out; {bridged})"
     if not any(entry.bridged):
-        said = f"{sentence} (points {entry.before_px:.3g} px off there; {bridged})"
+        said = f"{sentence} (point residual {entry.before_px:.3g} px there; {bridged})"
     bridges = tuple(
         f for f in entry.profile.fields if f.kind == "rate" and f.covariates == ("time",) and f.belongs_to_one_capture
     )
@@ -310,7 +313,7 @@ def lens_words(shape: str) -> str:
     return {
         OFF_CENTRE: "a lens that is not centred (tangential distortion)",
         LINEAR: "the picture is scaled, turned, stretched or sheared",
-        RADIAL: "the radial distortion is another",
+        RADIAL: "the radial distortion differs from the profile's",
     }.get(shape, "a lens that the model's distortion does not describe")
 
 
