@@ -28,14 +28,14 @@ TRACKING = TrackingSettings(grid=(16, 12), halve_above_px=2000, min_corner_level
 
 
 def test_a_capture_within_its_start_up_is_restored_at_its_true_times(virest, realdata: Path, tmp_path: Path):
-    """All 25 frames are later than their stamps: the lag is found and followed, and what it is stands in the log."""
+    """All 25 frames are later content than their timestamps: the lag is found and followed, and what it is stands in the log."""
     result = process(virest, realdata / "honor_v10", tmp_path, "--preset", "fast")
     counts = result.account["counts"]
     assert counts["failed"] == 0
     assert counts["restored"] >= 22
     assert any("frame lag" in warning for warning in result.account["warnings"])
     assert result.account["profile"]["extensions"]["frame_lag"]["lag_s"] == pytest.approx(0.31, abs=0.05)
-    assert "later than their stamps" in result.stderr
+    assert "later content than their timestamps" in result.stderr
     assert_undamaged(result, realdata / "honor_v10")
 
 

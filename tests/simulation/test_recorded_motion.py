@@ -162,7 +162,7 @@ def test_what_cannot_be_taken_again_is_said(lively, tmp_path):
     """No focal length, no exposures, steps, and the capture itself as the output."""
     with pytest.raises(OutputError):
         simulate_like(lively, lively)
-    with pytest.raises(SettingsError, match="follow each other"):
+    with pytest.raises(SettingsError, match="consecutive frames"):
         simulate_like(tmp_path / "a", lively, frames=slice(0, 6, 2))
     with pytest.raises(CaptureError, match="no frame"):
         simulate_like(tmp_path / "a", lively, frames=slice(90, 95))

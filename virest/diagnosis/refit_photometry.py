@@ -94,8 +94,8 @@ def _notes(light: PictureVerdict, curve: PictureVerdict) -> list[str]:
         return []
     names = " and ".join(finding.name for finding in light.findings)
     return [
-        f"the response curve could not be estimated at constant exposure: {names} use the profile's "
-        "curve, and the standard deviations include its uncertainty"
+        f"the response curve could not be estimated at constant exposure: the profile's was used for {names}, and the "
+        "standard deviations include its uncertainty"
     ]
 
 
