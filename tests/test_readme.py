@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import yaml
 from documentation import DOCS, PAGES, README, ROOT, anchors, fences, links, name_of, prose, read, typed_lines
 from pydantic import BaseModel
 
+from virest import __version__
 from virest.app import pages
 from virest.app.bench import __main__ as bench
 from virest.app.cli import app
@@ -171,3 +173,16 @@ def test_every_picture_of_the_site_is_shown() -> None:
     """No picture lies in docs/ that no page shows."""
     shown = {(page.parent / target).resolve() for page in PAGES for target in links(page)}
     assert not {file for file in DOCS.rglob("*.png") if file.resolve() not in shown}
+
+
+def test_the_citation_names_this_version() -> None:
+    """The version stands in the package; CITATION.cff repeats it, since no tool of citations looks there."""
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))["version"] == __version__
+
+
+def test_the_container_asks_for_extras_that_there_are() -> None:
+    """pip only warns of an extra that it does not find, and the image would lack it."""
+    offered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    asked = re.findall(r"'\.\[([\w,]+)\]'", (ROOT / "Dockerfile").read_text("utf-8"))
+    assert len(asked) == 1
+    assert set(asked[0].split(",")) <= set(offered)

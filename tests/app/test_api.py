@@ -1,5 +1,6 @@
 """``import virest``: opening, restoring and deblurring on arrays, and the commands' records, without a file written."""
 
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 import virest
+from virest.app.api_records import CalibratedFacts, CalibrationFacts, SimulationFacts, SimulationOptions
+from virest.app.simulate import simulate_command
 from virest.camera.response import ResponseCurve
 from virest.errors import CalibrationError, CaptureError, SettingsError
 
@@ -124,10 +127,15 @@ def test_calibrating_gives_the_record_and_writes_only_what_is_asked_for(
 ) -> None:
     """Calibrating returns what ``--json`` prints; without ``out`` nothing is written."""
     monkeypatch.chdir(tmp_path)
-    options = {"width": 256, "height": 192, "frames": 18, "seed": 2, "rate_rad_s": 1.5, "exposure_ms": 6.0}
-    assert virest.simulate("walk", effects=["time_offset=0.02"], **options)["frames"] == 18
+    simulated = virest.simulate(
+        "walk", width=256, height=192, frames=18, seed=2, rate_rad_s=1.5, exposure_ms=6.0, effects=["time_offset=0.02"]
+    )
+    assert simulated["frames"] == 18
+    assert set(simulated) == set(SimulationFacts.__annotations__)
     before = sorted(tmp_path.rglob("*"))
     found = virest.calibrate("walk")
+    assert set(found) == {"with", *CalibrationFacts.__annotations__} - {"written"}
+    assert set(found["values"][0]) == set(CalibratedFacts.__annotations__)
     offset = next(value for value in found["values"] if value["name"] == "time_offset_s")
     assert offset["value"] == pytest.approx(0.02, abs=5e-4)
     with pytest.raises(SettingsError, match="did you mean 'focal'"):
@@ -140,3 +148,13 @@ def test_a_capture_that_does_not_tell_is_an_error(tmp_path: Path) -> None:
     virest.simulate(tmp_path / "rest", width=320, height=240, frames=8, rate_rad_s=0.0)
     with pytest.raises(CalibrationError):
         virest.calibrate(tmp_path / "rest")
+
+
+def test_the_typed_options_are_those_of_the_simulator() -> None:
+    """A type checker knows each keyword that simulate takes, with its type, and no other."""
+    taken = {
+        name: parameter.annotation
+        for name, parameter in inspect.signature(simulate_command).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    }
+    assert {name: kind.__forward_arg__ for name, kind in SimulationOptions.__annotations__.items()} == taken

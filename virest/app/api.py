@@ -9,11 +9,12 @@ import dataclasses
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.app.api_records import CalibrationFacts, DiagnosisFacts, SimulationFacts, SimulationOptions
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame, read_capture, resolve_profile
@@ -33,7 +34,6 @@ from virest.restoration.one_kernel import as_colour, deblur_along, even_path, pa
 from virest.restoration.settings import PRESETS, RestorationSettings
 
 Picture = NDArray[np.uint8]
-Json = dict[str, Any]
 PathLike = str | os.PathLike[str]
 
 
@@ -221,7 +221,7 @@ def deblur(
 
 def calibrate(
     path: PathLike, config: PathLike | None = None, extra: Sequence[str] = (), out: PathLike | None = None
-) -> Json:
+) -> CalibrationFacts:
     """Fit clock, readout, axes and gyroscope bias to a capture; returns the mapping of ``virest calibrate --json``.
 
     extra: names of ``--with``.  out: write the calibrated profile here.  Raises CalibrationError if the motion does
@@ -240,11 +240,11 @@ def calibrate(
             raise SettingsError(wrong, hint="virest calibrate --help lists the names of --with")
     plan = plan_calibration(Path(path), None if config is None else Path(config), extra)
     if out is not None:
-        return run_calibration(plan, CalibrationOutput(Path(out)))[0]
-    return find_calibration(plan)[0]
+        return cast(CalibrationFacts, run_calibration(plan, CalibrationOutput(Path(out)))[0])
+    return cast(CalibrationFacts, find_calibration(plan)[0])
 
 
-def diagnose(path: PathLike, config: PathLike | None = None, out: PathLike | None = None) -> Json:
+def diagnose(path: PathLike, config: PathLike | None = None, out: PathLike | None = None) -> DiagnosisFacts:
     """Test the camera model on a capture; returns the mapping of ``virest diagnose --json``.
 
     ``extended_profile`` is the profile with the causes included, as a mapping; ``residuals`` are the residuals of the
@@ -254,18 +254,18 @@ def diagnose(path: PathLike, config: PathLike | None = None, out: PathLike | Non
 
     chosen = None if config is None else Path(config)
     if out is not None:
-        return run_diagnosis(os.fspath(path), DiagnosisOptions(Path(out), chosen)).facts
-    return find_diagnosis(Path(path), chosen)
+        return cast(DiagnosisFacts, run_diagnosis(os.fspath(path), DiagnosisOptions(Path(out), chosen)).facts)
+    return cast(DiagnosisFacts, find_diagnosis(Path(path), chosen))
 
 
-def simulate(out: PathLike, **options: Any) -> Json:
+def simulate(out: PathLike, **options: Unpack[SimulationOptions]) -> SimulationFacts:
     """Write a capture with known ground truth to the folder ``out``; returns the mapping of ``virest simulate --json``.
 
     options: those of :func:`virest.app.simulate.simulate_command`, such as ``scene``, ``frames``, ``effects``.
     """
     from virest.app.simulate import simulate_command
 
-    return simulate_command(Path(out), **options)
+    return cast(SimulationFacts, simulate_command(Path(out), **options))
 
 
 def _settings(preset: str, given: Mapping[str, Any]) -> RestorationSettings:
