@@ -28,7 +28,7 @@ TRACKING = TrackingSettings(grid=(16, 12), halve_above_px=2000, min_corner_level
 
 
 def test_a_capture_within_its_start_up_is_restored_at_its_true_times(virest, realdata: Path, tmp_path: Path):
-    """All 25 frames are later content than their timestamps: the lag is found and followed, and what it is stands in the log."""
+    """All 25 frames are later than their stamps: the lag is found and followed, and what it is stands in the log."""
     result = process(virest, realdata / "honor_v10", tmp_path, "--preset", "fast")
     counts = result.account["counts"]
     assert counts["failed"] == 0
