@@ -29,7 +29,9 @@ from virest.diagnosis.local_blur import LENS_SIGMA_PX, LENS_STD_PX, BlurObservat
 from virest.diagnosis.local_blur_model import fitted_width
 from virest.image_formation.light import defocus_px
 from virest.inference.chance import t_ratio
-from virest.inference.robust import CAUCHY, robust_std
+from virest.inference.clustered import scatter
+from virest.inference.descent import Residuals, Slopes, System, descend
+from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -43,8 +45,8 @@ MIN_SIZE_PX = float(np.sqrt((LENS_SIGMA_PX + 3 * LENS_STD_PX) ** 2 - LENS_SIGMA_
 """Standard deviation (0.83 px) of the added Gaussian: edges are wider by three deviations of what coding makes of them.
 On 41 simulated captures without such a blur the largest was 0.50 px."""
 LEAST_CHANGE, LEAST_SCALE_PX, CLEARLY = 0.05, 1e-6, 2.0
-RIDGE, MIN_GAIN = 1e-3, 0.02
-CAP, BOUND, LEAST_WIDTH_PX, _STEPS = 10.0, 3.0, 0.2, 12
+MIN_GAIN = 0.02
+CAP, BOUND, LEAST_WIDTH_PX = 10.0, 3.0, 0.2
 """Deviations at which what is left is capped, and at which one edge counts no more; no edge is sharper than that."""
 ABERRATIONS = (4,), (2,), (2, 4)
 """Powers of the radius that the variance of field curvature and astigmatism, of coma, and of all has."""
@@ -81,6 +83,36 @@ class _Form:
 
 
 @dataclass(frozen=True, slots=True)
+class _AddedVariance:
+    """Widths as evidence of numbers, each of which adds its column's variance to every edge."""
+
+    width_px: Array
+    even_px: Array
+    columns: Array
+    """(n, k) px² per unit of each number."""
+
+    def look(self, numbers: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
+        """Widths left over, and slopes, which are cheap enough to be always new."""
+        width = np.sqrt(np.maximum(self.even_px**2 + self.columns @ numbers, LEAST_WIDTH_PX**2))
+        left = self.width_px - width
+        return Residuals(left, self.columns * (0.5 / width)[:, None], left)
+
+    def weighed(self, numbers: Array, look: Residuals) -> System[Array, Residuals]:
+        """Deviations by what is left; a number that edges do not determine adds less blur than would be reported.
+
+        Such are a knot without edges near it, and a cell's width beside an even defocus.
+        """
+        scale = max(robust_std(look.left), LEAST_SCALE_PX)
+        prior = (np.abs(self.columns).max(axis=0) / MIN_SIZE_PX**2) ** 2
+        rows, left = look.slope[:, None], look.left[:, None]
+        return System(numbers, look, rows, left, look.left**2, scale, prior, numbers)
+
+    def moved(self, numbers: Array, step: Array) -> Array:
+        """After a step."""
+        return numbers + step
+
+
+@dataclass(frozen=True, slots=True)
 class _Edges:
     """Widths of edges, and what an even blur makes of them."""
 
@@ -94,33 +126,18 @@ class _Edges:
     """Robust standard deviation of what that leaves."""
 
     def fitted(self, form: _Form, rows: Index | None = None, free: bool = True) -> tuple[Array, Array, Array]:
-        """The form's numbers (m,), px², their covariance, and what is left of all edges (n,), px.
+        """The form's numbers (m,), px², their covariance, and what is left of all edges (n,), px, by a fit to some.
 
-        Gauss-Newton on some rows, with Cauchy weights by the spread of what is left.  free: False keeps the form at 0.
+        free: False keeps the form at 0.
         """
         rows = np.arange(len(self.width_px)) if rows is None else rows
-        own = form.weights - form.weights.mean(axis=0)
-        columns = np.concatenate([own if free else own[:, :0], self.common, form.nuisance], axis=1)
-        numbers: Array = np.zeros(columns.shape[1])
-        inverse: Array = np.eye(len(numbers))
-        pull: Array = np.zeros((len(rows), len(numbers)))
-        for _ in range(_STEPS):
-            width = self._widths(columns @ numbers)
-            left = self.width_px - width
-            scale_px = max(min(self.scale_px, robust_std(left[rows])), LEAST_SCALE_PX)
-            weight = 1 / (1 + (left[rows] / (CAUCHY * scale_px)) ** 2) / scale_px**2
-            slope = columns[rows] * (0.5 / width[rows])[:, None]
-            normal = (slope * weight[:, None]).T @ slope
-            inverse = np.asarray(np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9))), float)
-            pull = slope * (weight * left[rows])[:, None]
-            numbers = numbers + inverse @ pull.sum(axis=0)
-        count = own.shape[1] if free else 0
-        sums = np.stack([np.bincount(form.block[rows], column) for column in pull.T], axis=-1)
-        covariance = (inverse @ (sums.T @ sums) @ inverse)[:count, :count]
-        return numbers[:count], covariance, self.width_px - self._widths(columns @ numbers)
-
-    def _widths(self, added: Array) -> Array:
-        return np.sqrt(np.maximum(self.even_px**2 + added, LEAST_WIDTH_PX**2))
+        own = (form.weights - form.weights.mean(axis=0))[:, : None if free else 0]
+        columns = np.concatenate([own, self.common, form.nuisance], axis=1)
+        start, count = np.zeros(columns.shape[1]), own.shape[1]
+        found = descend(_AddedVariance(self.width_px[rows], self.even_px[rows], columns[rows]), start)
+        covariance = found.sandwich(scatter(found.score, form.block[rows]))[:count, :count]
+        left = _AddedVariance(self.width_px, self.even_px, columns).look(found.state).left
+        return found.state[:count], covariance, left
 
     def missed(self, form: _Form, free: bool = True) -> Array:
         """Capped squares (n,) of what a fit to other blocks leaves of each width, px²."""
@@ -185,7 +202,7 @@ def _asked(edges: _Edges, form: _Form, forms: int) -> Scored | None:
     slope = 0.5 / edges.even_px / edges.scale_px
     left = (edges.width_px - edges.even_px) / edges.scale_px
     left = left - np.median(left)
-    weight = 1 / (1 + (left / CAUCHY) ** 2)
+    weight = cauchy_weight(left**2, CAUCHY)
     tangent = np.concatenate([edges.common, form.nuisance], axis=1) * slope[:, None]
     over_time = form.covariate != "radius"
     design = Design(form.covariate, (form.weights * slope[:, None])[order, None], over_time)
@@ -205,7 +222,7 @@ def _outstanding(left: Array, block: Index) -> float:
     bounded = np.clip(left, -BOUND, BOUND)
     count = np.maximum(np.bincount(block), 1)
     mean = np.bincount(block, bounded - np.median(bounded)) / np.sqrt(count)
-    spread = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), float(bounded.std()))
+    spread = max(robust_std(mean - np.median(mean)), float(bounded.std()))
     most = float(np.abs(mean - np.median(mean)).max()) / max(spread, 1e-9)
     return min(1.0, 2 * len(count) * float(stats.t.sf(most, len(count) - 1)))
 
