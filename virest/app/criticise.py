@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from virest.app.field_record import field_record
 from virest.app.outputs import plain
 from virest.diagnosis.field.residual_table import NEEDED, QUANTITY, Criticism, TableFinding, criticise
+from virest.diagnosis.findings import HeldOutGain
 from virest.errors import CaptureError
 
 Json = dict[str, Any]
@@ -117,30 +119,9 @@ def as_json(path: Path, found: Criticism) -> Json:
 
 
 def _field(field: TableFinding) -> Json:
-    excess = field.before**2 - field.noise**2
-    gain = 1 - (field.after**2 - field.noise**2) / excess if excess > 0 else 0.0
-    return {
-        "covariates": list(field.covariates),
-        "kind": field.kind,
-        "shape": field.shape,
-        "sentence": field.sentence,
-        "size": field.size,
-        "unit": field.unit,
-        "std": field.std,
-        "held_out": {
-            "metric": QUANTITY,
-            "before": field.before,
-            "after": field.after,
-            "gain": float(np.clip(gain, 0, 1)),
-        },
-        "p_value": field.p_value,
-        "confounded": list(field.confounded),
-        "reasons": field.reasons,
-        "next": field.next,
-        "knots": [list(k) for k in field.knots],
-        "values": [list(v) for v in field.values],
-        "figure": None,
-    }
+    held_out = HeldOutGain(QUANTITY, field.before, field.after, field.noise)
+    knots, values = ([list(one) for one in many] for many in (field.knots, field.values))
+    return field_record(field, held_out, knots=knots, values=values, figure=None)
 
 
 def describe(path: Path, found: Criticism) -> str:

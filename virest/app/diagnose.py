@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.diagnosis_text import SHOWN_COMPONENTS, describe
+from virest.app.field_record import field_record
 from virest.app.outputs import capture_name, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
 from virest.camera.profile import CameraProfile
@@ -256,29 +257,13 @@ def _cause(cause: Finding, figures: Sequence[str]) -> Json:
 
 
 def _field(field: FieldFinding, number: int) -> Json:
-    held_out = field.held_out
-    return {
-        "covariates": list(field.covariates),
-        "kind": field.kind,
-        "shape": field.shape,
-        "sentence": field.sentence,
-        "size": field.size,
-        "unit": field.unit,
-        "std": field.std,
-        "held_out": {
-            "metric": held_out.quantity,
-            "before": held_out.before,
-            "after": held_out.after,
-            "gain": held_out.gain,
-        },
-        "p_value": field.p_value,
-        "confounded": list(field.confounded),
-        "stability": field.stability,
-        "reasons": field.reasons,
-        "next": field.next,
-        "imu_untrusted_s": [list(stretch) for stretch in field.stretches_s],
-        "figure": _field_path(number) if field.fields else None,
-    }
+    return field_record(
+        field,
+        field.held_out,
+        stability=field.stability,
+        imu_untrusted_s=[list(stretch) for stretch in field.stretches_s],
+        figure=_field_path(number) if field.fields else None,
+    )
 
 
 def _field_path(number: int) -> str:

@@ -23,9 +23,9 @@ from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
 from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture
 from virest.restoration.clipped_light import measured_share, unseen_kept
-from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
+from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, still_part
 from virest.restoration.neighbours.refinement import RefinedMotion

@@ -9,8 +9,8 @@ import pytest
 from blurred_scene import FRAME, camera, record
 
 from virest.image_formation.row_motion import RowMotion
-from virest.restoration.contradiction import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.frame import restore_frame
+from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
 from virest.restoration.settings import PRESETS
 
 RATE = (0.9, -2.0, 0.1)

@@ -1,0 +1,55 @@
+"""Steps that would do harm according to the frames, where these contradict a profile's clock or blur.
+
+A frame has two motions: the predicted one, from the given profile, and the observed one, from the profile as the frames
+support it.  A stated value is kept, but a step that the observed motion says would do harm is skipped.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from virest.image_formation.kernels import blur_chords
+from virest.image_formation.row_motion import RowMotion
+from virest.image_formation.warp import straightened_points
+
+Array = NDArray[np.float64]
+
+GRID = 5
+"""Grid points in each direction at which two motions are compared."""
+MOST_OUTSIDE = 0.25
+"""Skip deblurring when more than this fraction of the predicted path lies outside the observed one.  A path that is a
+third too long leaves about as much error as it removes."""
+MOST_LEFT = 0.75
+"""Fraction of the rows' displacement that may remain under the observed motion, which is itself an estimate."""
+OTHER_BLUR = "the blur observed in this frame disagrees with the profile: not deblurred"
+OTHER_ROWS = "the row displacement observed in this frame disagrees with the profile: not straightened"
+
+
+def deblurring_loses(predicted: RowMotion, seen: RowMotion) -> bool:
+    """Whether more than MOST_OUTSIDE of the predicted blur paths lies outside the observed ones.
+
+    A predicted path that is too short removes less blur than there is, which does no harm.  The part beyond or beside
+    the observed path would remove blur that is not there.
+    """
+    places = _grid_points(predicted)
+    chord, true = blur_chords(predicted, places), blur_chords(seen, places)
+    along = np.clip((chord * true).sum(-1) / np.maximum((true**2).sum(-1), 1e-12), 0.0, 1.0)
+    return _rms(chord - along[:, None] * true) > MOST_OUTSIDE * _rms(chord)
+
+
+def straightening_loses(predicted: RowMotion, seen: RowMotion, anchor: float) -> bool:
+    """Whether straightening would leave points about as far from their observed positions as recorded, or farther."""
+    places = _grid_points(predicted)
+    true = straightened_points(seen, places, anchor)
+    return _rms(straightened_points(predicted, places, anchor) - true) > MOST_LEFT * _rms(places - true)
+
+
+def _grid_points(motion: RowMotion) -> Array:
+    width, height = motion.profile.width, motion.profile.height
+    x, y = (np.linspace(0, length - 1, GRID) for length in (width, height))
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean((vectors**2).sum(axis=-1))))
