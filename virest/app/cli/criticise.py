@@ -29,7 +29,7 @@ def criticise(
     $ virest criticise residuals.csv
     residuals.csv: 2400 residuals (2400 used), 0.202 px rms per coordinate
     tested covariates: x, y, row, frame
-    field: shifts of up to 0.677 px depend on the position in the picture, ...
+    field: shifts of up to 0.677 px depend on the position in the frame, ...
     remaining: 0.152 px without structure
     $ virest criticise residuals.csv --json | jq '.fields[].sentence'
     """  # noqa: D301
