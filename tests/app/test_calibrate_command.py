@@ -245,7 +245,7 @@ def test_a_value_that_no_phone_has_is_no_finding(shaken: Path, tmp_path: Path) -
     assert value["std"] < 0.02
     assert "gyro_scale" in facts["not_determined"]
     assert read_profile(tmp_path / "camera.yaml").gyro_scale == (1.0, 1.0, 1.0)
-    assert any("gyro_scale would be 1." in note and "no finding" in note for note in facts["notes"])
+    assert any("gyro_scale would be 1." in note and "implausible" in note for note in facts["notes"])
     assert "gyro_scale (implausible value)" in facts["verdict"]
     assert "no camera has it" in text
 

@@ -68,7 +68,7 @@ def test_what_no_phone_can_be_is_a_sign_of_something_else() -> None:
 
 @pytest.mark.parametrize(
     ("change", "std", "said"),
-    [(0.04, 0.01, "is absorbing a wrong gyro-scale"), (0.01, 0.02, "only as right as gyro-scale"), (0.01, 0.005, None)],
+    [(0.04, 0.01, "is absorbing a wrong gyro-scale"), (0.01, 0.02, "depends on gyro-scale"), (0.01, 0.005, None)],
 )
 def test_a_fitted_values_twin_is_asked_more_strictly(change: float, std: float, said: str | None) -> None:
     """Focal length and gyroscope scale make up for each other."""

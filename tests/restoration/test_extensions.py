@@ -181,7 +181,7 @@ def test_true_velocity_and_plane_undo_the_sway(simulated: Simulated) -> None:
     turned, moved = (restored(capture, p, slice(1, 10, 3)) for p in (plan, moving))
     gain = [psnr_db(capture, m) - psnr_db(capture, t) for m, t in zip(moved, turned, strict=True)]
     assert np.mean(gain) > 6
-    assert turned[0].warnings[0] == "camera translation not known: rotation only"
+    assert turned[0].warnings[0] == "camera translation unknown: rotation only"
     said = moved[0].parameters
     assert said["depth_source"] == "triangulated"
     assert said["depth_m"] == pytest.approx(1.5, abs=0.2)

@@ -175,7 +175,7 @@ def test_a_lens_that_shows_nothing_is_copied() -> None:
     result = _restore(turning, picture)
     assert (result.status, result.valid_px) == ("copied", (0, 0, 336, 240))
     np.testing.assert_array_equal(result.picture, picture)
-    assert "leave nothing" in result.warnings[0]
+    assert "no recorded pixel" in result.warnings[0]
     assert result.parameters["shutter"]["method"] == result.parameters["deblur"]["method"] == "none"
 
 

@@ -207,7 +207,7 @@ def _require_coarse(
 ) -> tuple[CoarseAlignment, float]:
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(
-            f"{len(observed.pairs)} pairs of frames have enough points to follow, {MIN_PAIRS} are needed",
+            f"{len(observed.pairs)} pairs of frames have enough trackable points, {MIN_PAIRS} are needed",
             hint="film something with texture, for a few seconds",
         )
     if len(imu) < 8:
@@ -218,7 +218,7 @@ def _require_coarse(
         coarse, skew = found
     if coarse is None:
         raise CalibrationError(
-            "the inertial data cover the frames at no offset within a second", hint="check the clocks by virest inspect"
+            "no offset within one second makes the inertial data cover the frames", hint="see virest inspect"
         )
     if (doubt := coarse.doubt(len(observed.pairs), observed.lens.fx_px)) is not None:
         raise CalibrationError(doubt[0], hint=doubt[1])
@@ -296,7 +296,7 @@ def _uneven_note(fitted: CameraProfile, given: CameraProfile) -> tuple[str, ...]
         return ()
     return (
         f"the profile's delay over the row belongs to rows read {given.shutter.readout_direction}, which the points "
-        "contradict: it was left out; virest diagnose finds it again",
+        "contradict: it was omitted; virest diagnose finds it again",
     )
 
 
@@ -364,8 +364,8 @@ def _conclude(
     profile = with_estimates(profile, values)
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
     notes = _notes(coarse, fit, moving, astray, observed, determined)
-    notes = (*notes, *(f"{calibrated(name).name} would be {said}: that is no finding, and it is left as it was; "
-                       "virest diagnose may find what it stands for" for name, said in beyond.items()))  # fmt: skip
+    notes = (*notes, *(f"{calibrated(name).name} would be {said}: that is implausible, so the given value was kept; "
+                       "virest diagnose may find the real cause" for name, said in beyond.items()))  # fmt: skip
     return GeometryCalibration(
         profile, values, correlations_of(fit, variances), _translation(fit), residual_px(fit),
         tracking_noise_px(observed, fit), residual_px(rough.before), coarse.explained, moving,
@@ -404,18 +404,18 @@ def _notes(
 ) -> tuple[str, ...]:
     notes = []
     if coarse.axes_changed:
-        notes.append("the profile's T_cam_imu does not fit: other axes were taken from the turns")
+        notes.append("the profile's T_cam_imu does not fit: axes were estimated from the rotations")
     if isinstance(fit.scene, DirectedMotion):
-        notes.append("the camera travels and no accelerometer tells how: points were judged across their parallax")
+        notes.append("the camera translates and there is no accelerometer: points were judged across their parallax")
     if astray:
-        notes.append(f"{astray:.0%} of the points lie in parts of the picture that go their own way, and were left out")
+        notes.append(f"{astray:.0%} of the points lie in image regions that move independently and were excluded")
     if moving > MANY_OUTLIERS:
-        notes.append(f"{moving:.0%} of the tracks do not go with the camera (moving objects, or a scene out of plane)")
+        notes.append(f"{moving:.0%} of the tracks do not follow the camera (moving objects, or not a plane)")
     if not observed.exposure_known:
-        notes.append("exposure times unknown: the offset counts to the middle of the exposure")
+        notes.append("exposure times unknown: the offset refers to the middle of the exposure")
     elif np.ptp(observed.exposure_s) < CONSTANT_EXPOSURE_S and determined["time_offset"]:
         notes.append(
-            "at constant exposure an offset cannot be told from another meaning of the stamp: "
+            "at constant exposure an offset cannot be distinguished from another timestamp reference: "
             f"exposure_end would give {1e3 * float(np.median(observed.exposure_s)):+.2f} ms more"
         )
     return tuple(notes)

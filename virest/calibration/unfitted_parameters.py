@@ -91,11 +91,11 @@ def held_notes(held: dict[str, HeldValue], fitted: Sequence[str]) -> list[str]:
         said.add(twin.name)
         if twin.sigma > TWIN_SIGMA:
             pair = f"--with {','.join([*fitted, twin.name])}"
-            notes.append(f"{name} is absorbing a wrong {twin}, which the points contradict: fit both, {pair}")
+            notes.append(f"{name} is absorbing a wrong {twin}, which the points contradict; fit both: {pair}")
         elif twin.std[0] > TWIN_STD:
             notes.append(
-                f"{name} is only as right as {twin.name}, which was held fixed: this motion tells it to "
-                f"± {twin.std[0]:.1%} only; turn the phone about its optical axis too"
+                f"{name} depends on {twin.name}, which was held fixed and is determined by this motion to "
+                f"± {twin.std[0]:.1%} only; also rotate the phone about its optical axis"
             )
     wrong = [value for name, value in held.items() if name not in said and value.sigma > WRONG_SIGMA]
     if wrong and all(value.believable for value in wrong):
@@ -106,7 +106,7 @@ def held_notes(held: dict[str, HeldValue], fitted: Sequence[str]) -> list[str]:
         )
     elif wrong:
         notes.append(
-            "the points do not fit the model: held fixed, but wanted as no phone has it: "
+            "the points do not fit the model; the fit needs implausible values of fixed parameters: "
             f"{', '.join(str(value) for value in wrong if not value.believable)}; ask virest diagnose for the cause"
         )
     return notes

@@ -56,9 +56,9 @@ MIN_COARSE_EXPLAINED = 0.5
 """Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
 OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
 """A stated offset this far from the pictures' is warned of; a bias below three of this may be tracking's own."""
-OTHER_OFFSET = "the pictures put the time offset at"
+OTHER_OFFSET = "the frames indicate a time offset of"
 UNCHECKED = "agreement of frames and gyroscope could not be tested"
-OTHER_PATHS = "the pictures show blur paths"
+OTHER_PATHS = "the frames show blur paths"
 NOT_ESTIMATED = "translation and depth not estimated: rotation only"
 
 
@@ -130,7 +130,7 @@ def _planned(
         if not agreement.tested and not followed:
             plan = plan.noted(NoteCode.UNCHECKED, f"{UNCHECKED} ({agreement.reason})")
         if not agreement.agrees and not followed:
-            plan = plan.refused(NoteCode.DISAGREEMENT, f"pictures and gyroscope disagree: {agreement.reason}")
+            plan = plan.refused(NoteCode.DISAGREEMENT, f"frames and gyroscope disagree: {agreement.reason}")
         elif profile.time_offset_s is not None and agreement.best_offset_s is not None:
             offset_s, std_s = agreement.best_offset_s, STEP_S
             estimate = refine_time_offset(
@@ -221,7 +221,7 @@ def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[i
 def _with_seen_paths(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, powers: Mapping[int, TilePowers]
 ) -> RestorationPlan:
-    """Say where the pictures show blur paths of another length than predicted, and take no step that then loses.
+    """Say where the frames show blur paths of another length than predicted, and take no step that then loses.
 
     Tracked points see the middle of the exposures, and an offset found with them holds for it.  A stated one that they
     do not contradict, or contradict only because the exposures differ as much, stays.
@@ -282,7 +282,7 @@ def _with_translations(plan: RestorationPlan, capture: Capture, alignment: Visua
     unscaled = [motion.unscaled for motion in known.values() if motion.unscaled]
     if unscaled:
         reason = max(unscaled, key=unscaled.count)
-        text = f"travel known over depth, not in metres, in {len(unscaled)} of {len(motions)} frames ({reason})"
+        text = f"velocity over depth known, but not in metres, in {len(unscaled)} of {len(motions)} frames ({reason})"
         plan = plan.noted(NoteCode.TRANSLATION, text)
     translations = {index: _translation(motion, profile.depth_m) for index, motion in known.items()}
     scaled = [motion for motion in known.values() if not motion.unscaled]
@@ -326,8 +326,8 @@ def _account(known: list[FrameMotion], alignment: VisualInertialAlignment) -> st
     spread = np.sqrt(np.nanmean((std_m_s**2).sum(axis=1)))
     points = int(np.median([m.depth.points for m in known]))
     return (
-        f"translation of {len(known)} frames from pictures and accelerometer: velocity {speed:.3f} ± {spread:.3f} m/s "
-        f"rms, depth {depth:.2f} ± {std:.2f} m in the middle, from some {points} points a frame"
+        f"translation of {len(known)} frames from points and accelerometer: velocity {speed:.3f} ± {spread:.3f} m/s "
+        f"rms, depth {depth:.2f} ± {std:.2f} m at the centre, from about {points} points per frame"
     )
 
 

@@ -124,8 +124,8 @@ CAUSES = (
         lambda given, found: float(np.log(_focal_px(found) / _focal_px(given))),
         _with_focal,
         lambda given, found, std: (
-            f"focal length of {_focal_px(found):.1f} ± {_focal_px(found) * std[0]:.1f} px taken, "
-            f"where the profile has {_focal_px(given):.1f} px"
+            f"focal length of {_focal_px(found):.1f} ± {_focal_px(found) * std[0]:.1f} px used "
+            f"instead of the profile's {_focal_px(given):.1f} px"
         ),
     ),
     Cause(
@@ -136,8 +136,8 @@ CAUSES = (
         lambda given, found: float(np.log(_gyro_ratio(given, found))),
         _with_gyro_scale,
         lambda given, found, std: (
-            f"gyroscope scale of {found.gyro_scale[0]:.4f} ± {found.gyro_scale[0] * std[0]:.4f} taken, "
-            f"where the profile has {given.gyro_scale[0]:g}"
+            f"gyroscope scale of {found.gyro_scale[0]:.4f} ± {found.gyro_scale[0] * std[0]:.4f} used "
+            f"instead of the profile's {given.gyro_scale[0]:g}"
         ),
     ),
     Cause(
@@ -148,7 +148,7 @@ CAUSES = (
         lambda given, found: found.clock_skew - given.clock_skew,
         _with_skew,
         lambda given, found, std: (
-            f"clock skew of {found.clock_skew:+.5f} ± {std[0]:.5f} taken, where the profile has {given.clock_skew:+g}"
+            f"clock skew of {found.clock_skew:+.5f} ± {std[0]:.5f} used instead of the profile's {given.clock_skew:+g}"
         ),
     ),
     Cause(
@@ -160,7 +160,7 @@ CAUSES = (
         _with_stabiliser,
         lambda given, found, std: (
             f"stabiliser that cancels {found.extensions.stabilisation_fraction:.3f} ± {std[0]:.3f} of the shake above "
-            f"{found.extensions.stabilisation_cutoff_hz:.2g} Hz taken, where the profile has "
+            f"{found.extensions.stabilisation_cutoff_hz:.2g} Hz used instead of the profile's "
             f"{given.extensions.stabilisation_fraction:g}"
         ),
     ),

@@ -53,7 +53,7 @@ LEAST_CODER_NOISE = 0.5
 times that.  Few iterations from few tiles enlarge noise that was missed; more of them, with neighbours, do not."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels go over into each other between the tiles."""
-NOTHING_LEFT = "straightening would leave nothing of what was recorded (check lens, axes and clock): left alone"
+NOTHING_LEFT = "straightening would leave no recorded pixel (check lens, axes and clock): not straightened"
 MIN_RELIGHT = 0.002
 """A relative change of light below this is less than half a grey level anywhere."""
 
@@ -178,11 +178,11 @@ def _limits(motion: RowMotion) -> tuple[str, ...]:
     if depth_m is not None and np.isinf(depth_m):
         return ()
     if motion.translation is None:
-        return ("camera translation not known: rotation only",)
+        return ("camera translation unknown: rotation only",)
     if not np.any(motion.translation.inverse_depth_plane):
-        return ("depth not known: rotation only",)
+        return ("depth unknown: rotation only",)
     if not motion.translation.in_metres:
-        return ("travel known over depth, not in metres",)
+        return ("velocity over depth known, but not in metres",)
     return ()
 
 
@@ -231,11 +231,11 @@ def _source_map(
 def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: float) -> tuple[str, tuple[str, ...]]:
     """The method for a frame of so long a blur, and why it is ``none``."""
     if settings.deblur == "none":
-        return "none", ("no deblurring asked for",)
+        return "none", ("deblurring is switched off",)
     if motion.exposure_s <= 0:
-        return "none", ("exposure time not known, not deblurred",)
+        return "none", ("exposure time unknown: not deblurred",)
     if longest_px < settings.min_blur_px:
-        return "none", (f"blur of {longest_px:.2f} px is below {settings.min_blur_px:g} px, left alone",)
+        return "none", (f"blur of {longest_px:.2f} px is below {settings.min_blur_px:g} px: not deblurred",)
     return settings.deblur, ()
 
 

@@ -19,7 +19,7 @@ from virest.restoration.plan_notes import NoteCode
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
 MOST_FRAMES = 90
-SOURCE = "repeated frames, and turns of the frames against the gyroscope's"
+SOURCE = "repeated frames, and frame rotations against the gyroscope"
 
 
 def find_lag(capture: Capture, profile: CameraProfile, read_gray: GrayReader) -> StartUpLag | None:

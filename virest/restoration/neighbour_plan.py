@@ -51,7 +51,7 @@ def with_neighbours_asked(
     missing = survey_turns(runs, sights, neighbours, trajectory)
     if missing is not None:
         said = (
-            f"neighbouring frames turn by {missing.rate_rad_s:.3f} rad/s rms other than predicted: "
+            f"neighbouring frames rotate by {missing.rate_rad_s:.3f} rad/s rms more or less than predicted: "
             "each frame's motion is corrected by its neighbours"
         )
         plan = replace(plan, missing_turn=missing, notes=(*plan.notes, said))
@@ -74,7 +74,7 @@ def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[Resto
     if mask is None:
         return plan, dict(sights)
     said = (
-        "edges overshoot as they do where a phone sharpens: before it deblurs a frame, process undoes the expected "
+        "edges overshoot as after a phone's sharpening: before deblurring, process undoes the expected "
         f"unsharp mask, of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
     )
     plan = replace(plan, mask=mask, notes=(*plan.notes, said))

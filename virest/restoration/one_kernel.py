@@ -49,7 +49,7 @@ def deblur_along(
     luma, chroma = measure_picture(picture, field(centres), curve, clipped_anywhere(picture, curve))
     if not luma.measured:
         raise SettingsError(
-            f"a picture of {width}x{height} is too small for this kernel: its noise could not be measured",
+            f"a picture of {width}x{height} is too small for this kernel: its noise cannot be measured",
             hint="crop less, or pass a shorter kernel",
         )
     longest_px = float(np.linalg.norm(np.ptp(path_px, axis=0)))
