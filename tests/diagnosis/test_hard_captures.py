@@ -139,7 +139,7 @@ def test_pictures_of_another_motion_tell_no_unknown_values() -> None:
     _, terms, notes, _, follows = with_null_values(camera.observed, stranger, unknown)  # type: ignore[arg-type]
     assert not follows
     assert terms == []
-    assert any("a guess" in note for note in notes)
+    assert any("initial guess" in note for note in notes)
     own = SimpleNamespace(imu=camera.imu, repeats=())
     assert {term.name for term in with_null_values(camera.observed, own, unknown)[1]} == {  # type: ignore[arg-type]
         "focal_length", "readout_time", "time_offset",

@@ -30,7 +30,7 @@ def test_an_exposure_stated_twice_too_long_deblurs_nothing(virest, work: Path):
     (warning,) = said(result, "blur paths")
     assert "exposure-scale" in warning
     assert {line["deblur"]["method"] for line in result.lines} == {"none"}
-    assert any("blur elsewhere" in reason for reason in reasons(result))
+    assert any("blur observed in this frame disagrees" in reason for reason in reasons(result))
     recorded = process(virest, capture, work / "stated-long-raw", "--deblur", "none", "--shutter", "none")
     assert np.all(psnrs_db(result, result, capture) > psnrs_db(recorded, result, capture))
 
@@ -52,4 +52,4 @@ def test_a_right_profile_is_not_contradicted(virest, work: Path, scene: str, see
     capture = simulate(virest, work / f"stated-right-{scene}", *OPTIONS.split(), seed, "--scene", scene)
     result = process(virest, capture, work / "stated-right-run", "--preset", "fast")
     assert not said(result, "the pictures")
-    assert not any("elsewhere" in reason for reason in reasons(result))
+    assert not any("disagrees with the profile" in reason for reason in reasons(result))

@@ -107,7 +107,7 @@ class GeometryCalibration:
         open_values = [value.name for value in self.values if not value.determined]
         if not open_values:
             return "calibrated"
-        return f"calibrated but for {', '.join(open_values)}, which this motion does not determine"
+        return f"calibrated, except {', '.join(open_values)} (not determined by this motion)"
 
 
 def calibrate_geometry(
