@@ -100,8 +100,12 @@ def become(arguments: list[str], cwd: str, streams: list[str]) -> None:
 
 
 def leave(code: int) -> NoReturn:
-    """End as the interpreter does, but for taking apart all that is loaded: that is a tenth of a second."""
-    threading._shutdown()  # type: ignore[attr-defined]
+    """End as the interpreter does, but for taking apart all that is loaded: that is a tenth of a second.
+
+    As the interpreter does, what a library raises at the end is ignored: Python 3.11's executors may wake a closed pipe.
+    """
+    with contextlib.suppress(OSError):
+        threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()
