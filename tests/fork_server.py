@@ -102,7 +102,7 @@ def become(arguments: list[str], cwd: str, streams: list[str]) -> None:
 def leave(code: int) -> NoReturn:
     """End as the interpreter does, but for taking apart all that is loaded: that is a tenth of a second.
 
-    As the interpreter does, what a library raises at the end is ignored: Python 3.11's executors may wake a closed pipe.
+    What a library raises at the end is ignored, as by the interpreter: executors of 3.11 may wake a closed pipe.
     """
     with contextlib.suppress(OSError):
         threading._shutdown()  # type: ignore[attr-defined]
