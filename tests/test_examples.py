@@ -6,9 +6,7 @@ from typing import Any
 
 import matplotlib as mpl
 import pytest
-from documentation import DOCS, README, ROOT, fences, typed_lines
-
-from virest.app.cli import run
+from documentation import DOCS, README, ROOT, fences
 
 PYTHON = [fence for page in (README, DOCS / "python.md") for fence in fences(page) if fence.language == "python"]
 
@@ -41,14 +39,3 @@ def test_the_notebook_runs(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert names["better"].profile.shutter.readout_time_s == pytest.approx(0.012, abs=5e-4)
     made = {path.name for path in workplace.iterdir()}
     assert made == {"sample_data", "walk", "extended.yaml"}
-
-
-@pytest.mark.scenario
-def test_the_first_session_of_the_quick_start_runs(workplace: Path) -> None:
-    """A reader who types the commands in order gets a preview, a run and a report."""
-    session = next(f for f in fences(DOCS / "quickstart.md") if f.language == "console")
-    for line in typed_lines(session):
-        words = line.split(" | ")[0].split()[1:]
-        assert run([*words, "--jobs", "1"] if words[0] == "process" else words) == 0, line
-    assert (workplace / "preview.png").stat().st_size > 10_000
-    assert (workplace / "virest-out" / "text" / "report.html").is_file()

@@ -19,7 +19,9 @@ from virest.app.cli import program
 from virest.app.gallery import gallery_page
 
 BLOCKS = [block for page in PAGES for block in pages.blocks(page)]
-CHEAP_S = 4.5
+SESSIONS = [block for block in BLOCKS if block.took_s is not None and block.took_s <= 45.0
+            and not any("-m virest.app.bench" in command for command in block.commands)]  # fmt: skip
+"""Blocks that the tests run: those of a minute's CPU time and more, and the benches, are left to `make readme`."""
 WITHOUT_INPUT = ("import", "doctor")
 """Commands whose input the repository does not hold: a bag, the machine."""
 GALLERY = DOCS / "gallery.md"
@@ -73,8 +75,8 @@ def test_a_block_was_printed_by_this_version(block: pages.Block) -> None:
 
 @pytest.mark.scenario
 @pytest.mark.skipif(shutil.which("jq") is None, reason="some blocks pipe into jq")
-@pytest.mark.parametrize("block", [b for b in BLOCKS if b.took_s is not None and b.took_s <= CHEAP_S], ids=label)
-def test_a_cheap_block_prints_what_the_page_says(block: pages.Block) -> None:
+@pytest.mark.parametrize("block", SESSIONS, ids=label)
+def test_a_session_prints_what_the_page_says(block: pages.Block) -> None:
     """The commands of a block are run from an empty folder; clocks and last digits may differ."""
     assert not pages.differences(block.session, pages.rerun(block)[0])
 
