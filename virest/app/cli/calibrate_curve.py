@@ -42,8 +42,8 @@ def calibrate_curve(
 
     \b
     $ virest calibrate-curve bracket --plot curve.png
-    five_segment b (0.1564, 0.0819), c (0.7936, 0.7957), y_max 1
-    fit error 1.34 grey levels rms, exposures 0.06214 to 1 covered
+    five_segment b (0.1564, 0.08188), c (0.794, 0.7961), y_max 1
+    fit error 1.34 grey levels rms, exposures 0.06215 to 1 covered
     the curve is known to ± 0.36 grey levels there
     ...
     $ virest calibrate-curve stills --exposures stills/exposures.csv
