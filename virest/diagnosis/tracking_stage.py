@@ -52,9 +52,9 @@ NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 
 
 def frames_to_follow(capture: Capture, profile: CameraProfile) -> list[int]:
     """Movie indices, rising: every stamped frame of a short capture; of a longer one lively runs and the start-up."""
-    offset_as_timestamp = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
-    if len(offset_as_timestamp) <= WHOLE_FRAMES:
-        return offset_as_timestamp
+    stamped = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
+    if len(stamped) <= WHOLE_FRAMES:
+        return stamped
     chosen = high_motion_frames(capture.frames, capture.imu, FRAMES_IN_RUNS, profile.time_offset_s or 0.0)
     begun = [frame.index for frame in capture.frames if frame.only_startup][:FRAMES_IN_RUNS]
     return sorted({*chosen, *begun})
