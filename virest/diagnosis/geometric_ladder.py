@@ -1,9 +1,9 @@
-"""The ladder for what moves points: rung by rung the cause that best predicts stretches of time it was not fitted to.
+"""The geometric ladder: stepwise selection of causes that move points, judged on held-out blocks of time.
 
-On each rung every cause is fitted together with those already in; the most promising are then fitted on half of the
-blocks of time and judged on the other half, both ways.  The best enters if the gain holds in the blocks (a t test) and
-its value is significant against a deviation that includes tracking's own bias.  Then all are fitted together again, and
-what is no longer significant leaves.
+On each rung every cause is fitted together with those already accepted.  The most promising are then fitted on half of
+the time blocks and judged on the other half, both ways.  The best enters if its gain holds over the blocks (a t test)
+and its value is significant against a deviation that includes the tracker's bias.  All accepted causes are then fitted
+again together, and those no longer significant leave.
 """
 
 from __future__ import annotations
@@ -47,21 +47,22 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 PROMISING = 3
-"""Causes that each fold chooses from."""
+"""Number of causes that each fold chooses from."""
 MAX_P, MIN_GAIN, LARGE_GAIN = POINT_LEVELS.max_p, POINT_LEVELS.least_gain, POINT_LEVELS.evenness[-1][0]
-"""Fields are searched for by the levels of named causes."""
-FEEBLE_GAIN, ASTRAY_SCALE = 0.1, 1.25
-"""A cause that takes less than this part away, while points are this many times their noise from where the model puts
-them, is not what is wrong: two that gain little alone are then tried together."""
+"""The search for fields uses the levels of the named causes."""
+SMALL_GAIN, ASTRAY_SCALE = 0.1, 1.25
+"""If the best single cause removes less than this part of the loss, while residuals exceed the noise by this factor,
+the fault is elsewhere: causes are then tried in pairs."""
 PAIR_FIRSTS, PAIRS_JUDGED = 8, 4
-"""The best causes alone, each beside all others, which it may hide; pairs that each fold chooses from."""
+"""The best single causes are each tried with all others, which they may hide; the second number is how many pairs each
+fold chooses from."""
 RIVAL_T = 2.0
-"""A cause rivals the best if the blocks do not prefer the best by this many standard errors."""
+"""A cause is a rival if the blocks prefer the best one by less than this many standard errors."""
 EVEN_T = 0.25
-"""Of two rivals neither is the better one below this many standard errors."""
+"""Two rivals are equally good below this many standard errors."""
 PLAINER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length"}
-"""A low pass is a delay but for fast turns, and pixels that are not square another focal length but for one of two
-directions: where points do not tell, the plainer cause is said, with the other as its rival."""
+"""For slow rotations a low pass is a delay; in one image direction a pixel aspect is a focal length.  Where the points
+cannot tell the two apart, the plainer cause is named, with the other as its rival."""
 MAX_RUNGS = 5
 
 
@@ -75,80 +76,80 @@ def climb(
     max_rungs: int = MAX_RUNGS,
     each: ParallelMap = one_by_one,
 ) -> GeometricVerdict:
-    """Climb from a profile; null_terms: unknown values, fitted on every rung and no cause.
+    """Climb from a profile; null_terms: unknown values, which are fitted on every rung and are not causes.
 
-    lags: the start-up schedules to try.  far: changes at which turns were seen to agree.
-    Where a rival might have entered first, the ladder is climbed once more from there, with the causes of the first
-    climb alone: whatever else the rival needs makes it the less simple explanation.
+    lags: the start-up schedules to try.  far: changes of clocks and axes at which the rotations agree.
+    Where a rival might have entered first, the ladder is climbed once more from there, with only the causes of the
+    first climb: any further cause that the rival needs makes it the less simple explanation.
     """
-    say = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
     start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
     model, notes = _with_unknowns(evidence, start)
     nominal_model = model
-    course = SearchContext(evidence, nominal, lags, far or FarStart(), each)
-    say(0.1)
-    path, fork = _ascended(course, _Path(model, (), ()), max_rungs)
-    say(0.6)
+    context = SearchContext(evidence, nominal, lags, far or FarStart(), each)
+    report(0.1)
+    path, fork = _climbed_to_end(context, _Path(model, (), ()), max_rungs)
+    report(0.6)
     verdict = conclude(evidence, nominal_model, path.model, list(path.accepted), list(path.rungs), nominal)
     if fork is not None:
         among = frozenset(entry.name for entry in path.accepted)
-        other, _ = _ascended(replace(course, among=among), fork, max_rungs)
-        say(0.9)
+        other, _ = _climbed_to_end(replace(context, among=among), fork, max_rungs)
+        report(0.9)
         rival = conclude(evidence, nominal_model, other.model, list(other.accepted), list(other.rungs), nominal)
-        verdict = _either(evidence, verdict, rival)
-    verdict.left_open = _left_open(course, verdict)
+        verdict = _better_end(evidence, verdict, rival)
+    verdict.left_open = _left_open(context, verdict)
     verdict.notes += notes
     return verdict
 
 
-def _left_open(course: SearchContext, verdict: GeometricVerdict) -> dict[str, Array]:
-    """What further causes leave open in the values of those that entered, where points stay astray."""
+def _left_open(context: SearchContext, verdict: GeometricVerdict) -> dict[str, Array]:
+    """Variance that further causes would add to the accepted values, where residuals stay above the noise."""
     effects = [entry.effect for entry in verdict.accepted if entry.effect is not None and entry.effect.term is not None]
     if not effects or verdict.fit.scale < ASTRAY_SCALE:
         return {}
     tried = {entry.name for entry in verdict.accepted}
-    further = [candidate for candidate in course.candidates(verdict.model, tried) if candidate.added]
-    return variance_left_open(course.evidence, verdict.model, effects, further, is_plausible, course.each)
+    further = [candidate for candidate in context.candidates(verdict.model, tried) if candidate.added]
+    return variance_left_open(context.evidence, verdict.model, effects, further, is_plausible, context.each)
 
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """A way up the ladder so far."""
+    """The rungs climbed so far, with the model they led to."""
 
     model: Model
     accepted: tuple[Accepted, ...]
     rungs: tuple[Rung, ...]
 
     def further(self, evidence: Evidence, step: _Step, rung: Rung) -> _Path:
-        """With what enters on the next rung."""
+        """The path with the causes that enter on the next rung."""
         model, _ = refitted(evidence, step.model, JUDGE_POINTS)
         log.debug("rung %d: %s", len(self.rungs) + 1, _names(step))
         entered = replace(rung, entered=_names(step))
         return _Path(model, (*self.accepted, *step.accepted), (*self.rungs, entered))
 
 
-def _ascended(course: SearchContext, path: _Path, max_rungs: int) -> tuple[_Path, _Path | None]:
-    """The path to its end, and the one that leaves it where it first might as well have gone another way."""
+def _climbed_to_end(context: SearchContext, path: _Path, max_rungs: int) -> tuple[_Path, _Path | None]:
+    """The path to its end, and the path that takes the rival at the first rung that had one."""
     fork: tuple[_Path, _Step, Rung] | None = None
     while len(path.rungs) < max_rungs:
-        step, rival, rung = _rung(course, path.model, list(path.accepted))
+        step, rival, rung = _rung(context, path.model, list(path.accepted))
         if step is None:
             path = replace(path, rungs=(*path.rungs, rung))
             break
         if rival is not None and fork is None:
             fork = (path, rival, rung)
-        path = path.further(course.evidence, step, rung)
-    return path, None if fork is None else fork[0].further(course.evidence, *fork[1:])
+        path = path.further(context.evidence, step, rung)
+    return path, None if fork is None else fork[0].further(context.evidence, *fork[1:])
 
 
-def _either(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
-    """The better of two ends of the ladder by held-out blocks; where those do not tell, one with the other as a rival.
+def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
+    """The better of two ends of the ladder by held-out blocks; where they are equal, one with the other as its rival.
 
-    Which of the two was reached first may depend on rounding; which is told must not.  Where the blocks do not tell, it
-    is the end with fewer causes; of equally many, the one with the lower held-out loss; where that differs by less than
-    EVEN_T standard errors, so that rounding may change the order, the names decide.  Of two with the same causes, which
-    differ by where their fits ended, it is the first.
+    Which end was reached first may depend on rounding; which is reported must not.  Of two equal ends it is the one
+    with fewer causes; then the one with the lower held-out loss; where the losses differ by less than EVEN_T standard
+    errors, so that rounding may change their order, the names decide.  Two ends with the same causes, which differ
+    only by where their fits stopped, give the first.
     """
     if {entry.name for entry in first.accepted} == {entry.name for entry in second.accepted}:
         return first
@@ -193,7 +194,7 @@ def _joined(rivals: Sequence[Rival], more: Sequence[Rival]) -> tuple[Rival, ...]
 
 
 def _with_unknowns(evidence: Evidence, start: Model) -> tuple[Model, list[str]]:
-    """The model with its unknown values fitted; those that end where no camera is stay where they began."""
+    """The model with its unknown values fitted; those that end at impossible values keep their initial guess."""
     model, notes = refitted(evidence, start, SCREEN_POINTS)[0], []
     at_ends = evidence.impossible(model.profile) - evidence.impossible(start.profile)
     if "readout_time" in evidence.impossible(model.profile):
@@ -211,7 +212,7 @@ def _with_unknowns(evidence: Evidence, start: Model) -> tuple[Model, list[str]]:
 
 @dataclass(frozen=True, slots=True)
 class SearchContext:
-    """What is the same on all rungs."""
+    """The inputs that all rungs share."""
 
     evidence: Evidence
     nominal: CameraProfile
@@ -222,13 +223,13 @@ class SearchContext:
     """Names of the causes that may enter; None: all."""
 
     def candidates(self, model: Model, tried: set[str]) -> list[Candidate]:
-        """All causes not yet in a model."""
+        """All causes that are not yet in a model."""
         found = candidates_of(self.evidence, self.nominal, model, tried, self.lags, self.far)
         found = [entry for entry in found if self.among is None or entry.name in self.among]
         return worth_beginning(self.evidence, model, found)
 
     def judged(self, base: Screened, better: Sequence[Screened], count: int) -> Trial:
-        """The model without and with each promising cause; losses by the smallest scale, that all can be compared."""
+        """The model without and with each promising cause; all losses use the smallest scale, to be comparable."""
         allowed = promising(base, better, count)
         kept = [entry for entry in better if entry.candidate.name in allowed[0] | allowed[1]]
         scale = min(entry.scale for entry in (base, *kept))
@@ -239,7 +240,7 @@ class SearchContext:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """The model without and with each promising cause, on blocks that took no part in the fits."""
+    """The model without and with each promising cause, on held-out blocks."""
 
     evidence: Evidence
     before: Judged
@@ -249,10 +250,10 @@ class Trial:
     scale: float
 
     def rounds(self) -> Iterator[tuple[Judged, Judged, Array]]:
-        """(cause, what choosing one gains, gain by block), best first, each time without those before it.
+        """(cause, result of choosing, gain by block), best first, each time without the causes before it.
 
-        The cause is the best over all blocks; what it is judged by was chosen for each block by others.  A lag shows in
-        one block, of which others tell nothing: it is judged as it is.
+        The cause is the best over all blocks; the gain it is judged by was chosen for each block from the other blocks.
+        A start-up lag shows in one block only, so it is judged without such a choice.
         """
         left = sorted(self.judged, key=lambda entry: float(entry.block_loss.mean()))
         while left:
@@ -266,27 +267,27 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What enters on a rung."""
+    """The causes that enter on a rung."""
 
     model: Model
     accepted: tuple[Accepted, ...]
     part: float
-    """Of the held-out loss that it takes away."""
+    """Part of the held-out loss that they remove."""
 
 
-def _rung(course: SearchContext, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, _Step | None, Rung]:
-    """What enters, what might have entered as well, and the rung."""
+def _rung(context: SearchContext, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, _Step | None, Rung]:
+    """(step that enters, its rival, rung)."""
     tried = {entry.name for entry in accepted}
     nothing = Candidate("", model, (), None)
-    base, *others = screen(course.evidence, [nothing, *course.candidates(model, tried)], course.each)
+    base, *others = screen(context.evidence, [nothing, *context.candidates(model, tried)], context.each)
     better = [entry for entry in best_of_each(others) if min(np.subtract(entry.losses, base.losses)) < 0]
-    trial = course.judged(base, better, PROMISING)
-    typical = course.evidence.typical_px
+    trial = context.judged(base, better, PROMISING)
+    typical = context.evidence.typical_px
     rung = Rung(None, {j.candidate.name: j.rms * typical for j in trial.judged}, trial.before.rms * typical, GEOMETRY)
     step, rival = _best_single(model, trial)
-    feeble = step is None or step.part < FEEBLE_GAIN
-    if feeble and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
-        pair, other = _best_pair(course, model, tried, base, better)
+    small = step is None or step.part < SMALL_GAIN
+    if small and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
+        pair, other = _best_pair(context, model, tried, base, better)
         if pair is not None:
             step, rival = pair, other
             rung = replace(rung, tried={**rung.tried, _names(pair): pair.accepted[0].after})
@@ -298,7 +299,7 @@ def _names(step: _Step) -> str:
 
 
 def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None]:
-    """The cause that takes most away where it was neither fitted nor chosen, if that holds, and its strongest rival."""
+    """The cause with the largest held-out gain, if that gain is significant, and its strongest rival."""
     evidence, before, judged = trial.evidence, trial.before, trial.judged
     typical = evidence.typical_px
     for best, after, gain in trial.rounds():
@@ -331,7 +332,7 @@ def _rivals(before: Judged, best: Judged, other: Judged, gain: Array) -> bool:
 
 
 def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: float) -> _Step | None:
-    """The strongest of the rivals that is significant too."""
+    """The strongest rival that is significant itself."""
     typical = trial.evidence.typical_px
     for other in sorted(others, key=lambda entry: float(entry.block_loss.mean())):
         gain = trial.before.block_loss - other.block_loss
@@ -346,11 +347,11 @@ def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: floa
 
 
 def _best_pair(
-    course: SearchContext, model: Model, tried: set[str], base: Screened, better: Sequence[Screened]
+    context: SearchContext, model: Model, tried: set[str], base: Screened, better: Sequence[Screened]
 ) -> tuple[_Step | None, _Step | None]:
-    """Two causes that gain together what neither does alone, while points are far from where the model puts them.
+    """Two causes that gain together what neither gains alone, while residuals are far above the noise.
 
-    A stabiliser hides the clocks' drift, and the drift blurs what the stabiliser does.
+    A stabiliser and a clock drift hide each other.
     """
     pairs: list[Candidate] = []
     members_of: dict[str, tuple[Candidate, Candidate]] = {}
@@ -358,19 +359,19 @@ def _best_pair(
     for first in [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]:
         with_it = replace(first.model, terms=(*first.model.terms, *first.added))
         done |= {first.name}  # A beside B is B beside A
-        for second in course.candidates(with_it, {*tried, *done}):
+        for second in context.candidates(with_it, {*tried, *done}):
             if second.added:
                 name = f"{first.name}{JOINED}{second.name}"
                 members_of[name] = first, second
                 pairs.append(replace(second, name=name))
     if not pairs:
         return None, None
-    found = best_of_each(race(course.evidence, pairs, PAIRS_JUDGED, course.each))
-    trial = course.judged(base, found, PAIRS_JUDGED)
+    found = best_of_each(race(context.evidence, pairs, PAIRS_JUDGED, context.each))
+    trial = context.judged(base, found, PAIRS_JUDGED)
     before = trial.before
     for pair, after, gain in trial.rounds():
         part = float(gain.mean() / before.block_loss.mean())
-        if part < FEEBLE_GAIN or not POINT_LEVELS.holds(part, chance_of(gain)):
+        if part < SMALL_GAIN or not POINT_LEVELS.holds(part, chance_of(gain)):
             continue
         step = _pair_step(model, trial, members_of[pair.candidate.name], pair, after)
         if step is not None:

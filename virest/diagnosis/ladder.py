@@ -43,11 +43,11 @@ from virest.diagnosis.tracking_stage import (
     TrackedPoints,
     at_model_times,
     at_rest,
-    evened,
     frames_to_follow,
-    pulses,
-    pulsing,
+    lighting_changes,
+    with_flicker_of,
     with_null_values,
+    without_lighting_changes,
 )
 from virest.errors import CaptureError
 from virest.image_formation.point_model import predict
@@ -186,7 +186,7 @@ class DiagnosisSession:
     def _described(self, lit: CameraProfile) -> GeometricVerdict:
         """The verdict of the points with the fields that they ask for under this light."""
         own = self.geometric.model.profile
-        same = self.geometric is self.first and pulsing(own, lit) == own
+        same = self.geometric is self.first and with_flicker_of(own, lit) == own
         if same and self._asks_unlit is not None and not self._asks_unlit():
             return self.geometric
         return self.points.described(self.geometric, lit)
@@ -198,15 +198,17 @@ class DiagnosisSession:
         frames, moved = self.frames, self.geometric.model.profile
         trajectory = integrate_gyro(self.capture.imu, moved)
         self.light = climb_light(self.capture, frames, moved, trajectory, pictures, self.each)
-        if points_left(self.geometric).significant and pulses(self.light.profile):
-            even = evened(gray, frames, self.light.profile)
+        if points_left(self.geometric).significant and lighting_changes(self.light.profile):
+            even = without_lighting_changes(gray, frames, self.light.profile)
             followed = set(frames_to_follow(self.capture, given)) & {frame.index for frame in frames}
             guide = find_guide(self.capture, given, gray, sorted(followed))
             again = observe_tracks(self.capture, track_pairs(even(sorted(followed)), guide=guide), given)
             again = _seen(again, self.capture, given, self.kept_back)
             start = self.points.start
             self.points = replace(
-                self.points, observed=again.covered(self.capture.imu, start), start=pulsing(start, self.light.profile)
+                self.points,
+                observed=again.covered(self.capture.imu, start),
+                start=with_flicker_of(start, self.light.profile),
             )
             self.geometric = self.points.climbed(progress)
         self.geometric = self._described(self.light.profile)

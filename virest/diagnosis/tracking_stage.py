@@ -1,4 +1,4 @@
-"""The points of a capture: tracked, with what the profile leaves open, ready for their ladder."""
+"""Tracked points of a capture and the terms that its profile leaves open: where the geometric ladder begins."""
 
 from __future__ import annotations
 
@@ -34,35 +34,35 @@ from virest.motion.integration import integrate_gyro
 
 Array = NDArray[np.float64]
 WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
-"""Every frame of captures up to 15 s at 30 frames a second is followed; of longer ones runs, this many frames in
-all."""
+"""Captures of up to 15 s at 30 frames a second are tracked in every frame; longer ones in runs of frames, of this
+total length."""
 MIN_PAIRS = 6
 MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
 AXIS_EXPLAINED = 0.6
-"""Least squared correlation about one axis."""
+"""Least squared correlation between the rotations of pictures and gyroscope about one axis."""
 WELL_EXPLAINED = 0.98
-"""Turns that agree so well leave no other clock rate to look for far off."""
+"""Rotations that agree this well leave no distant clock rate to search for."""
 STRAY_PART = 0.1
-"""More of the points than this gone their own way is no chance."""
+"""A larger share of independently moving points is not chance."""
 TOGETHER = 0.3
 """Least intraclass correlation of points that move together."""
 NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 2).ravel()
-"""Number of the block of two by two cells that each cell lies in."""
+"""Index of the block of two by two cells that each cell belongs to."""
 
 
 def frames_to_follow(capture: Capture, profile: CameraProfile) -> list[int]:
-    """Movie indices, rising: every stamped frame of a short capture; of a longer one lively runs and the start-up."""
+    """Movie indices, ascending: every stamped frame, or the start-up and the runs with most motion of a long capture."""
     stamped = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
     if len(stamped) <= WHOLE_FRAMES:
         return stamped
     chosen = high_motion_frames(capture.frames, capture.imu, FRAMES_IN_RUNS, profile.time_offset_s or 0.0)
-    begun = [frame.index for frame in capture.frames if frame.only_startup][:FRAMES_IN_RUNS]
-    return sorted({*chosen, *begun})
+    startup = [frame.index for frame in capture.frames if frame.only_startup][:FRAMES_IN_RUNS]
+    return sorted({*chosen, *startup})
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedPoints:
-    """Tracked points and where their ladder begins."""
+    """Tracked points and the profile from which their ladder begins."""
 
     capture: Capture
     observed: ObservedTracks
@@ -74,31 +74,31 @@ class TrackedPoints:
     each: ParallelMap = one_by_one
 
     def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
-        """The ladder's end, climbed again without the parts of the picture that move together on their own."""
+        """The ladder's end; climbed again without image regions that move independently, where there are any."""
         found = self._climbed(self.observed, progress)
         if not self.rungs_allowed:
             return found
         cells = self.observed.astray_cells(found.table.first_px, found.fit.distance)
-        place = self.observed.cells(found.table.first_px)
-        there, astray = cells[place], float(cells[place].mean())
-        neighbours = len(cells) * found.table.pair + NEIGHBOURHOOD[place]
-        calm = found.fit.difference_px * found.fit.weight[:, None]
-        if astray < STRAY_PART or _together(calm[there], neighbours[there]) < TOGETHER:
+        cell = self.observed.cells(found.table.first_px)
+        independent, share = cells[cell], float(cells[cell].mean())
+        neighbourhood = len(cells) * found.table.pair + NEIGHBOURHOOD[cell]
+        weighted_px = found.fit.difference_px * found.fit.weight[:, None]
+        if share < STRAY_PART or _shared_part(weighted_px[independent], neighbourhood[independent]) < TOGETHER:
             return found
         rest = self.observed.without_cells(cells)
         again = self._climbed(replace(rest, noise_px=step_noise_px(rest.pairs)), progress)
-        again.astray = astray
-        again.notes.append(f"{astray:.0%} of the points lie in image regions that move independently and were excluded")
+        again.astray = share
+        again.notes.append(f"{share:.0%} of the points lie in image regions that move independently and were excluded")
         return again
 
     def described(self, found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
-        """A ladder's end with the fields that its points ask for, under the light that was found.
+        """A ladder's end with the fields that its residuals require, under the lighting found by the photometric stage.
 
-        Pulsing light moves the mean time of each row's light, which looks like rows that are read unevenly.
+        Flicker shifts the mean time of each row's light, which looks like an uneven readout.
         """
         if not self.rungs_allowed or found.evidence is None:
             return found
-        model = replace(found.model, profile=pulsing(found.model.profile, lit))
+        model = replace(found.model, profile=with_flicker_of(found.model.profile, lit))
         return with_fields(replace(found, model=model), found.evidence, self.capture)
 
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
@@ -118,10 +118,10 @@ class TrackedPoints:
         return found
 
 
-def _together(difference_px: Array, group: NDArray[np.intp]) -> float:
-    """How much of the differences (n, 2) neighbours of one moment share: their intraclass correlation.
+def _shared_part(difference_px: Array, group: NDArray[np.intp]) -> float:
+    """Intraclass correlation of residuals (n, 2) within groups: neighbours in one pair of frames.
 
-    Neighbours that are badly tracked share nothing; a thing that moves is shared by its points.
+    Badly tracked neighbours share nothing; points on one moving object share its motion.
     """
     count = np.bincount(group)
     ordered = float((count * (count - 1)).sum())
@@ -131,7 +131,7 @@ def _together(difference_px: Array, group: NDArray[np.intp]) -> float:
 
 
 def at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]:
-    """Frames that can be looked at, with the stamps that the model gives them."""
+    """Usable frames, with the timestamps that the model gives them."""
     lag = geometric.model.lag
     frames = []
     for frame in capture.frames:
@@ -141,16 +141,16 @@ def at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]
     return frames
 
 
-# ── light that pulls at points ───────────────────────────────────────────────────────────────────────────────────
+# ── lighting that disturbs tracking ──────────────────────────────────────────────────────────────────────────────
 
 
-def pulses(profile: CameraProfile) -> bool:
-    """Whether light changes between frames, which pulls at the points that are followed."""
+def lighting_changes(profile: CameraProfile) -> bool:
+    """Whether the lighting changes between frames, which biases tracked points."""
     return bool(profile.extensions.flicker_amplitude or profile.extensions.gain)
 
 
-def pulsing(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:
-    """The profile with the lamps' flicker: it moves the mean time of each row's light."""
+def with_flicker_of(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:
+    """The profile with the flicker of another: flicker shifts the mean time of each row's light."""
     light = lit.extensions
     extensions = replace(
         profile.extensions,
@@ -161,8 +161,8 @@ def pulsing(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:
     return replace(profile, extensions=extensions)
 
 
-def evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Reader:
-    """The same pictures without flicker and gain, to follow points by."""
+def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Reader:
+    """The same pictures without flicker and gain changes, for tracking."""
     by_index = {frame.index: frame for frame in frames}
     curve = profile.response or ResponseCurve("srgb")
     height, width, shutter, clock = profile.height, profile.width, profile.shutter, RowClock(profile)
@@ -185,15 +185,15 @@ def evened(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Rea
     return even
 
 
-# ── what the profile leaves open ─────────────────────────────────────────────────────────────────────────────────
+# ── values that the profile leaves open ──────────────────────────────────────────────────────────────────────────
 
 
 def with_null_values(
     observed: ObservedTracks, capture: Capture, profile: CameraProfile
 ) -> tuple[CameraProfile, list[Term], list[str], FarStart, bool]:
-    """The profile with unknown values begun somewhere, terms to fit on every rung, and far-off starts of the clocks.
+    """(profile with initial guesses, terms to fit on every rung, notes, distant starts of the clocks, agreement).
 
-    The last: whether the turns of pictures and gyroscope agree at any offset, as far as the camera turns.
+    Agreement: whether the rotations of pictures and gyroscope agree at some offset, as far as the camera rotates.
     """
     terms: list[Term] = []
     notes: list[str] = []
@@ -201,34 +201,34 @@ def with_null_values(
     profile = replace(profile, intrinsics=observed.lens)
     far = _agree_at(observed, capture, profile)
     agree = far is not None or _hardly_turns(observed, profile) or _one_axis_agrees(observed, capture, profile)
-    telling = (agree or bool(capture.repeats)) and not at_rest(observed, profile)
+    informative = (agree or bool(capture.repeats)) and not at_rest(observed, profile)
     if unknown_lens:
-        terms += [terms_of.FOCAL] if telling else []
+        terms += [terms_of.FOCAL] if informative else []
         notes.append(
             "focal length unknown: "
-            f"{'fitted at every step from an initial guess' if telling else 'an initial guess is used'}"
+            f"{'fitted at every step from an initial guess' if informative else 'an initial guess is used'}"
         )
-    if not profile.readout_known and telling:
+    if not profile.readout_known and informative:
         terms.append(terms_of.READOUT if profile.time_offset_s is None else PLAIN_READOUT)
     if profile.time_offset_s is not None:
         return profile, terms, notes, far or FarStart(), agree
     if far is None:
         notes.append("the time offset is unknown and could not be estimated from the frames: 0 is used")
         return replace(profile, time_offset_s=0.0), terms, notes, FarStart(), agree
-    terms += [terms_of.TIME_OFFSET] if telling else []
-    begun = replace(profile, time_offset_s=far.offset_s)
-    return begun, terms, notes, FarStart(0.0, far.skewed_offset_s - far.offset_s, far.skew, far.axes), agree
+    terms += [terms_of.TIME_OFFSET] if informative else []
+    aligned = replace(profile, time_offset_s=far.offset_s)
+    return aligned, terms, notes, FarStart(0.0, far.skewed_offset_s - far.offset_s, far.skew, far.axes), agree
 
 
 def at_rest(observed: ObservedTracks, profile: CameraProfile) -> bool:
-    """Whether neither turns nor points move by more from frame to frame than a tracker errs: nothing can be told."""
+    """Whether neither rotations nor points exceed a tracker's error from frame to frame: nothing is determined."""
     steps = (np.linalg.norm(pair.points_second_px - pair.points_first_px, axis=-1) for pair in observed.pairs)
     moved_px = np.median(np.concatenate([np.zeros(1), *steps]))
     return bool(moved_px < MIN_MOTION_PX) and _hardly_turns(observed, profile)
 
 
 def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:
-    """Whether the pictures' turns are too small to be compared with a gyroscope's."""
+    """Whether the pictures' rotations are too small for a comparison with the gyroscope."""
     if len(observed.pairs) < MIN_PAIRS:
         return True
     turns = observed.turns(profile)
@@ -237,21 +237,24 @@ def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:
 
 
 def _one_axis_agrees(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> bool:
-    """Whether turns about some axis follow the gyroscope's by any factor: a stabiliser takes most of pitch and yaw."""
+    """Whether rotations about some axis are proportional to the gyroscope's.
+
+    An optical stabiliser removes most of pitch and yaw, not roll.
+    """
     profile = replace(profile, time_offset_s=profile.time_offset_s or 0.0)
     turns = observed.covered(capture.imu, profile).turns(profile)
     if len(turns.vector_rad) < MIN_PAIRS:
         return False
     times = (np.asarray(profile.imu_time_s(s)) for s in (turns.first_s, turns.second_s))
-    told = turns.detrended(gyro_turns(integrate_gyro(capture.imu, profile), *times))
+    measured = turns.detrended(gyro_turns(integrate_gyro(capture.imu, profile), *times))
     seen = turns.detrended(turns.vector_rad)
-    product = (seen * told).sum(axis=0) ** 2
-    square = np.maximum((seen**2).sum(axis=0) * (told**2).sum(axis=0), 1e-30)
+    product = (seen * measured).sum(axis=0) ** 2
+    square = np.maximum((seen**2).sum(axis=0) * (measured**2).sum(axis=0), 1e-30)
     return bool(np.max(product / square) > AXIS_EXPLAINED)
 
 
 def _agree_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> FarStart | None:
-    """Changes of the profile's clocks and axes at which turns agree best; None where they agree nowhere."""
+    """Changes of the profile's clocks and axes at which the rotations agree best; None where they agree nowhere."""
     if len(observed.pairs) < MIN_PAIRS:
         return None
     turns, given_s = observed.turns(profile), profile.time_offset_s or 0.0
