@@ -17,7 +17,7 @@ from scipy.linalg import null_space
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.diagnosis.field.screening import ALIKE_PART, MAX_P, MIN_T, Design, score_forms
+from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION, MAX_P, MIN_T, Design, score_forms
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
 from virest.inference.chance import t_ratio
@@ -167,7 +167,7 @@ def instead_of_gain(observations: PhotometricObservations, profile: CameraProfil
         return None
     before = found.held_out.before**2
     by_gain = before - _left_by(_thinned(observations), profile) ** 2
-    if before - found.held_out.after**2 < ALIKE_PART * by_gain:
+    if before - found.held_out.after**2 < RIVAL_GAIN_FRACTION * by_gain:
         return None
     return replace(found, rivals=("gain_drift",))
 

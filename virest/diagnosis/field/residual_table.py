@@ -132,7 +132,7 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
                 break
         else:
             break
-        form = open_forms[selection.best.place]
+        form = open_forms[selection.best.index]
         tangent = np.concatenate([tangent, form.design], axis=-1)
         after = float(np.sqrt(max(scale**2 - (selection.size * scale) ** 2, 0.0)))
         found.append((form, selection.best.p_value, selection.rivals, scale, after))

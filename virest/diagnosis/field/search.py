@@ -243,7 +243,7 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     selection = search.best(scored)
     instead = selection is None and any(OVER not in name for name in in_model)
     if (selection := search.best(scored, RIVAL_T) if instead else selection) is not None:
-        form = smooth[selection.best.place]
+        form = smooth[selection.best.index]
         if form.step_s is not None:
             scale = lasting_change(seen, tangent, search.effect(form))
             form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
@@ -253,7 +253,7 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     smooth = list({form.family: form for form in reversed(alone) if not form.local and form.step_s is None}.values())
     tangent = np.concatenate([tangent, *map(search.effect, smooth)], axis=-1)
     if (selection := search.best(search.scored(tangent, forms))) is not None:
-        yield (_Asked(forms[selection.best.place], selection),)
+        yield (_Asked(forms[selection.best.index], selection),)
     elif sudden is not None:
         # one that comes back: of a few frames, whose signs are too few for a test by flips
         yield from ((_Asked(form, sudden=sudden),) for form in forms if form.local and form.kind == "scale")
@@ -289,7 +289,7 @@ class _Search:
         for entry in score_forms(
             seen.left, seen.weight, tangent, designs, self.block, seen.table.pair, asked=self.asked
         ):
-            family = forms[entry.place].family
+            family = forms[entry.index].family
             if family not in best or worth(entry) > worth(best[family]):
                 best[family] = entry
         whole = seen.weight * (seen.left**2).sum(axis=-1)
