@@ -35,8 +35,8 @@ MIN_T, MIN_LOCAL_T = 3.0, 2.0
 """Minimum ratio of the held-out gain to its standard error, in general and for a form over time.  A gain over time may
 lie in a few blocks: if it lies in one seventh of 30 blocks, the ratio is at most 2.2, however large the gain is."""
 HALVES_VARIANCE = 12.0
-"""Variance, per free number, of the summed gains of both halves of the points, each fitted to the other half, when there
-is no effect: 2 (e'Xv)·2 and v'X'Xv, v and e'X of unit variance, have 4 k + 2 k per half; their mean is −2 k."""
+"""Variance, per free number, of the summed gains of both halves of the points, each fitted to the other half, without
+an effect: 2 (e'Xv)·2 and v'X'Xv, v and e'X of unit variance, have 4 k + 2 k per half; their mean is −2 k."""
 RIVAL_T = 2.0
 """Forms whose gains differ by less than this many standard errors are indistinguishable."""
 RIVAL_GAIN_FRACTION = 0.9

@@ -362,7 +362,7 @@ def _where(field: Field) -> str:
 
 
 def _at_rates(field: Field) -> str:
-    """Where along a rate an error begins: an error that grows with the rate is negligible below a quarter of the range."""
+    """Where an error over a rate begins: one that grows with the rate is negligible below a quarter of the range."""
     if field.covariates[0] not in RATES or len(field.covariates) > 1:
         return ""
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
