@@ -26,8 +26,8 @@ FINE_ROW_KNOTS, FINE_PLACE_KNOTS, FINE_RATE_KNOTS = 21, 7, 13
 MOST_KNOTS, MOST_PLACE_KNOTS, MOST_RATE_KNOTS = 41, 10, 25
 PAIR_ROW_KNOTS, PAIR_RADIUS_KNOTS = 3, 3
 LEAST_TIMES, TIME_STEPS = 4, ((0.4, 12), (0.1, MOST_KNOTS))
-"""(knot spacing in s, maximum number of knots) over time, coarse and fine; 0.1 s is 3 frames, and a focus hunts back and
-forth in 0.5 s."""
+"""(knot spacing in s, maximum number of knots) over time, coarse and fine.  0.1 s is 3 frames; a hunting focus has a
+period of 0.5 s."""
 FINE_RATE_QUANTILE = 0.97
 """Fine knots over a rate cover this quantile of the readings; too few rows lie beyond."""
 SINH_SPACING = 3.0

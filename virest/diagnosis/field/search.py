@@ -266,8 +266,8 @@ class _Search:
     seen: PointResiduals
     block: Index
     blind_s: float
-    """Ignore points closer in time to a sudden change than this.  The change moves them by many times their noise, so an
-    instant that is wrong by one frame would be rejected by the most informative points."""
+    """Ignore points closer in time to a sudden change than this.  The change moves them by many times their noise, so
+    the most informative points would reject an instant that is wrong by one frame."""
     asked: int
     """Total number of forms tested."""
     _effects: dict[int, tuple[FieldForm, Array]] = field(default_factory=dict, repr=False)

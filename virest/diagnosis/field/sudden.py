@@ -68,7 +68,7 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
 
 
 def _growth(arm: Array, off: Array) -> float:
-    """Robust relative expansion of points with residuals ``off`` (n, 2) at ``arm`` (n, 2) from the centre, shift removed."""
+    """Robust relative expansion of points with residuals off (n, 2) at arm (n, 2) from the centre, beside a shift."""
     design = np.concatenate([np.concatenate([arm[:, :1], arm[:, 1:]]), np.repeat(np.eye(2), len(arm), axis=0)], axis=1)
     flat = np.concatenate([off[:, 0], off[:, 1]])
     weight = np.ones(len(flat))
