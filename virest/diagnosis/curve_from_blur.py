@@ -1,6 +1,6 @@
 """Response curve from blur at constant exposure: motion blur mixes light before the curve is applied.
 
-Take two frames of the same scene, A nearly sharp and B blurred, with blur paths k_A and k_B from the gyroscope.  If E is
+Take two frames of one scene, A nearly sharp and B blurred, with blur paths k_A and k_B from the gyroscope.  If E is
 the curve, ``k_B ∗ E′(A)`` and ``k_A ∗ E′(B)`` are both the same light blurred by both paths.  Under a wrong curve the
 bright side of every blurred edge grows or shrinks, whichever way the edge faces.  Registration, path length and
 brightness errors have other patterns; they are free parameters in every tile, and only the remainder is used.  The path
@@ -59,8 +59,8 @@ undershoots."""
 DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 """(absolute, relative) σ caused by low-bitrate encoders, in addition to the scatter between pairs of frames."""
 AGREEMENT = 0.07
-"""Correlation of coding residuals with a curve change, measured on movies with 0.1 to 0.4 bit per pixel whose curve is the
-profile's."""
+"""Correlation of coding residuals with a curve change, measured on movies of 0.1 to 0.4 bit per pixel with the
+profile's curve."""
 READ_PARTS = 4
 """Number of parts in which frames are read in parallel."""
 _MIN_TILE_PIXELS = 400
@@ -128,7 +128,7 @@ class MixingEvidence:
         return self.darkest / 255.0 / FLOOR_PART
 
     def mean_square(self, effect_name: str, change: float) -> tuple[float, float]:
-        """Mean squares of the tile differences after a curve change, and of the part that no change explains; grey levels².
+        """Mean squares, grey levels², of tile differences after a curve change, and of the part no change explains.
 
         Each tile's registration, brightness and path length are fitted and removed.
         """
@@ -414,7 +414,7 @@ def _tiles(width: int, height: int, side: int) -> list[tuple[slice, slice]]:
 
 
 def _usable(sharp: Rgb, blurred: Rgb, place: Plane) -> Mask:
-    """Pixels whose neighbourhood lies inside both frames, is unclipped in all channels, and has nearly uniform chroma."""
+    """Pixels whose neighbourhood is inside both frames, unclipped in all channels, and nearly uniform in chroma."""
     height, width = blurred.shape[:2]
     edge = 8
     x, y = place[..., 0], place[..., 1]

@@ -11,9 +11,9 @@ its range, so the mean of z(u) and 1 − z(−u) is fitted.  Where the step is w
 observable; the priors AMOUNT and RADIUS_PX then decide, and the standard deviations grow accordingly.
 
 The significance test uses all isolated edges, whatever their width: if a textured surface happens to be brightest next
-to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The mask's
-values come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in many frames
-counts once.
+to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The values
+of the mask come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in many
+frames counts once.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
 PROFILE_STD = 0.003
 """Misfit of a mean profile, as a fraction of the step, correlated within 1 px."""
 UNSHARPENED_OVERSHOOT, UNSHARPENED_STD, UNSHARPENED_CAPTURES = 0.001, 0.003, 95
-"""Overshoot of unsharpened decoded movies (all edges, weaker side), its σ, and the number of simulated captures on which
-it was measured: 0.001 ± 0.002, −0.003 to 0.0065 on 5 scenes at 320 × 240 and 640 × 480; boards have 0.004."""
+"""Overshoot of unsharpened decoded movies (all edges, weaker side), its σ, and the number of simulated captures behind
+it: 0.001 ± 0.002, −0.003 to 0.0065 on 5 scenes at 320 × 240 and 640 × 480; boards have 0.004."""
 SELECTED_OVERSHOOT, SELECTED_STD = 0.020, 0.017
 """The same for the sharpest edges, mean of both sides: coding, interpolation, and selection of steep edges."""
 UNSHARPENED_RADII_PX = (0.6, 2.2)
@@ -243,7 +243,7 @@ def _jackknife(values: Sequence[Array]) -> Array:
 
 
 def _held_out(profiles: Array, block: NDArray[np.intp]) -> HeldOutGain:
-    """Residual rms of the mean profile of every other block about a step fitted to the rest, without and with a mask."""
+    """Held-out rms of the mean profile of every other block, step fitted to the rest, without and with a mask."""
     seen, judged = (_symmetrised(np.median(profiles[use], axis=0)) for use in halves(block))
     width = least_squares(lambda s: sharpened_step(s[0], 0.0, 1.0) - seen, [0.7], bounds=(BOUNDS[0][0], BOUNDS[1][0]))
     theta, _ = _fit(seen)

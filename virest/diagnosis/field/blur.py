@@ -5,8 +5,8 @@ variance over the distance from the principal point, time, and the logged focus 
 defocus, a longer path, and the effect of contrast and brightness on a measured width.  Over the radius r, third-order
 aberrations make spots proportional to r (coma) and to r² (field curvature, astigmatism; Welford, Aberrations of Optical
 Systems, 1986, chapter 7), so the variance is a r² + b r⁴.  Over time and focus it is piecewise linear.  To separate
-scene and lens, errors over the radius are treated as correlated within image cells and whole quarters are held out; over
-time each cell has its own width.
+scene and lens, errors over the radius are treated as correlated within image cells and whole quarters are held out;
+over time each cell has its own width.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ FINER_LEFT = 0.98
 FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
 MOST_OBSERVATIONS = 15_000
 MIN_SIZE = 0.06
-"""Grey levels (rms).  On 19 captures without such a field, texture and encoder left up to 0.06, with t ratios up to 1.8."""
+"""Grey levels (rms).  On 19 captures without such a field, texture and encoder left up to 0.06, with t up to 1.8."""
 CAUCHY, CAP = 2.5, 5.0
 """Residual with half weight, and residual cap, in noise σ."""
 RIDGE = 1e-3
@@ -132,7 +132,7 @@ def _fitted(
 def instead_of_cause(
     observations: PhotometricObservations, profile: CameraProfile
 ) -> tuple[str, Callable[[CameraProfile], CameraProfile], LightField | None]:
-    """The cause that a map may replace, the profile without that cause, and the map; None as map if none replaces it."""
+    """The cause that a map may replace, the profile without it, and the map; None for the map if none replaces it."""
     if (found := instead_of_gain(observations, profile)) is not None:
         return "gain_drift", without_gain, found
     return "flicker", without_flicker, instead_of_flicker(observations, profile)
