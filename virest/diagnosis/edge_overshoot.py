@@ -11,8 +11,8 @@ its range, so the mean of z(u) and 1 − z(−u) is fitted.  Where the step is w
 observable; the priors AMOUNT and RADIUS_PX then decide, and the standard deviations grow accordingly.
 
 The significance test uses all isolated edges, whatever their width: if a textured surface happens to be brightest next
-to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The values
-of the mask come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in many
+to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The
+values of the mask come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in many
 frames counts once.
 """
 
