@@ -12,8 +12,8 @@ observable; the priors AMOUNT and RADIUS_PX then decide, and the standard deviat
 
 The significance test uses all isolated edges, whatever their width: if a textured surface happens to be brightest next
 to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The
-values of the mask come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in many
-frames counts once.
+values of the mask come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in
+many frames counts once.
 """
 
 from __future__ import annotations
