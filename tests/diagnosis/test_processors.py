@@ -18,7 +18,7 @@ from virest.diagnosis import geometric_ladder
 from virest.diagnosis.cross_validation import Judged
 from virest.diagnosis.findings import ParameterChange
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
-from virest.diagnosis.geometric_findings import _apart
+from virest.diagnosis.geometric_findings import _widened
 from virest.diagnosis.geometric_ladder import _either
 from virest.diagnosis.geometric_verdict import Accepted
 
@@ -112,7 +112,7 @@ def test_the_better_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_deviations_hold_what_two_ends_differ_by() -> None:
     """0.0041 and 0.0052 are equally likely: half the squared difference is in the variance."""
-    change = _apart(ParameterChange(0.0, 0.0041, 2e-4), ParameterChange(0.0, 0.00515, 2e-4))
+    change = _widened(ParameterChange(0.0, 0.0041, 2e-4), ParameterChange(0.0, 0.00515, 2e-4))
     assert change.std == pytest.approx(np.hypot(2e-4, 0.00105 / np.sqrt(2)))
     word = ParameterChange("exposure_start", "exposure_end", None)
-    assert _apart(word, word) == word
+    assert _widened(word, word) == word

@@ -1,4 +1,4 @@
-"""Causes that look alike: what one kind of evidence cannot tell apart, settled by another, or named as rivals."""
+"""Ambiguous causes: resolve them with a second kind of evidence, or report them as rivals."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ COINCIDENCE_SIGMA = 3.5
 
 
 def offset_as_timestamp(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
-    """At constant exposure an offset of just half or one exposure is another meaning of the stamp.
+    """At constant exposure, report an offset of exactly half or one exposure as a different timestamp reference.
 
-    Where exposures are unknown, points are placed at the exposure's start: an offset may be half of it.
+    Where exposures are unknown, points are timed at the start of the exposure, so an offset may be half of it.
     """
     if float(np.median(exposure_s)) <= 0:
         return [_or_exposure(finding) for finding in findings]
@@ -71,7 +71,7 @@ def _or_exposure(finding: Finding) -> Finding:
 
 
 def _meaning(now: str, shift_s: float, exposure_s: float, std_s: float) -> str | None:
-    """The stamp's meaning that an offset amounts to: its first row starts later by (now − meaning) exposures."""
+    """The timestamp reference equivalent to an offset: its first row starts later by (now − meaning) exposures."""
     for meaning, fraction in STAMP_FRACTION.items():
         expected = (STAMP_FRACTION[now] - fraction) * exposure_s
         if meaning != now and abs(shift_s - expected) < COINCIDENCE_SIGMA * std_s:
@@ -80,7 +80,7 @@ def _meaning(now: str, shift_s: float, exposure_s: float, std_s: float) -> str |
 
 
 def exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array) -> float | None:
-    """The exposure scale whose longer or shorter middle would look like the time offset found."""
+    """The exposure scale that shifts the mid-exposure by the time offset found; None without such an offset."""
     exposure = float(np.median(exposure_s))
     for finding in findings:
         if finding.name == "time_offset" and not varies(exposure_s) and exposure > 0:
@@ -90,7 +90,7 @@ def exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array) -> float
 
 
 def as_exposure(findings: Sequence[Finding], scale: float, exposure_s: float) -> Finding:
-    """Put an offset down to the exposure: the points tell its size better than the blur."""
+    """Attribute an offset to the exposure time, with its more precise value from the points."""
     finding = next(f for f in findings if f.name == "time_offset")
     std = 2.0 * float(finding.parameters["time_offset_s"].std) / exposure_s
     return replace(
@@ -103,13 +103,13 @@ def as_exposure(findings: Sequence[Finding], scale: float, exposure_s: float) ->
 
 
 def one_exposure(blurred: picture_ladder.PictureVerdict) -> picture_ladder.PictureVerdict:
-    """The blur's verdict without an exposure of its own: the points have told it."""
+    """Drop the blur-based exposure finding; tracked points already determined it."""
     blurred.findings = [finding for finding in blurred.findings if finding.name != "exposure_time"]
     return blurred
 
 
 def exposed(profile: CameraProfile, scale: float) -> CameraProfile:
-    """The profile with its exposures longer by a factor."""
+    """The profile with exposures scaled by a factor."""
     shutter = profile.shutter
     return replace(profile, shutter=replace(shutter, exposure_scale=shutter.exposure_scale * scale))
 
@@ -120,7 +120,7 @@ def merged(
     blurred: CameraProfile,
     is_exposure: bool,
 ) -> CameraProfile:
-    """Every cause in one profile: geometry from the first, light from the second, blur from the third."""
+    """Combine all causes in one profile: geometry from ``moved``, photometry from ``lit``, blur from ``blurred``."""
     light = lit.extensions
     extensions = replace(
         moved.extensions,

@@ -1,4 +1,4 @@
-"""Causes of moving points at the places where their fits may begin."""
+"""Geometric causes and the starting points of their fits."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from virest.motion.scene_motion import InertialMotion
 
 Array = NDArray[np.float64]
 SCREEN_POINTS = 1500
-"""Points that a first look at a cause is fitted to."""
+"""Points used to screen a cause."""
 CLOCKS = ("time_offset", "clock_skew")
-FURTHER_OFF = 1.1
-"""A far start of the clocks is tried unless points are off there by more than this factor."""
+MAX_START_RESIDUAL_RATIO = 1.1
+"""Skip a far clock start when its median residual exceeds the current one by this factor."""
 CONSTANT_EXPOSURE = 0.03
-"""Exposures within this part of their median are one."""
+"""Exposures whose range is below this fraction of their median are constant."""
 
 
 @dataclass(frozen=True, slots=True)
 class FarStart:
-    """Changes of a profile, beyond a fit's reach, at which the turns of pictures and gyroscope agree."""
+    """Profile changes beyond the reach of a fit at which frame rotations and gyroscope agree."""
 
     offset_s: float = 0.0
     """At the profile's own clock rate; 0: none."""
@@ -36,12 +36,12 @@ class FarStart:
     """At the rate changed by ``skew``."""
     skew: float = 0.0
     axes: tuple[tuple[float, ...], ...] | None = None
-    """Rotation of the sensor; None: the profile's own will do."""
+    """Rotation of the sensor; None: keep the profile's."""
 
     def start(self, name: str, profile: CameraProfile, model: CameraProfile, offset_free: bool) -> CameraProfile | None:
-        """A model's profile where a fit of this effect might begin, counted from the given one.
+        """A model's profile at the far start of an effect's fit, relative to ``profile``.
 
-        A skew moves the offset along if that is fitted too.
+        A skew also changes the offset if that is fitted too.
         """
         if name == "imu_rotation" and self.axes is not None:
             return replace(model, r_cam_imu=self.axes)
@@ -56,7 +56,7 @@ class FarStart:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One cause at one starting point: the model to begin from and the terms it adds."""
+    """One cause at one starting point: the initial model and the terms it adds."""
 
     name: str
     model: Model
@@ -66,26 +66,26 @@ class Candidate:
 
 
 def worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate]) -> list[Candidate]:
-    """Without far starts of the clocks that are well further off than where the model stands: a fit would come back.
+    """Drop far clock starts with clearly larger residuals than the current model, to which a fit would return.
 
-    Those a little further off stay, for all else that is fitted was settled where the model stands.
+    Slightly worse starts are kept, because the other parameters were fitted at the current model.
     """
     table = evidence.table(model, SCREEN_POINTS)
-    here = _off_px(evidence, model, table)
+    here = _median_residual_px(evidence, model, table)
     return [
         candidate
         for candidate in candidates
         if candidate.name not in CLOCKS
         or candidate.model.profile == model.profile
-        or _off_px(evidence, candidate.model, table) < FURTHER_OFF * here
+        or _median_residual_px(evidence, candidate.model, table) < MAX_START_RESIDUAL_RATIO * here
     ]
 
 
-def _off_px(evidence: Evidence, model: Model, table: TrackTable) -> float:
-    """Median distance of the points from where a model puts them."""
+def _median_residual_px(evidence: Evidence, model: Model, table: TrackTable) -> float:
+    """Median residual of the points under a model, px."""
     known = ground(evidence.imu, model.profile, translation=isinstance(model.scene, InertialMotion))
-    off = table.second_px - predict(known, table, model.scene).second_px
-    return float(np.median(np.linalg.norm(off, axis=-1)))
+    residual_px = table.second_px - predict(known, table, model.scene).second_px
+    return float(np.median(np.linalg.norm(residual_px, axis=-1)))
 
 
 def candidates_of(
@@ -96,32 +96,32 @@ def candidates_of(
     lags: Sequence[Schedule],
     far: FarStart,
 ) -> list[Candidate]:
-    """All causes that are not in a model yet, each at all places where its fit may begin.
+    """All causes that are not in the model yet, each at all its starting points.
 
-    lags: the start-up schedules to try.  far: changes at which turns were seen to agree.
+    lags: the start-up schedules to try.  far: changes at which the rotations agree.
     """
     in_terms = {term.name for term in model.terms}
     found: list[Candidate] = []
     for effect in GEOMETRIC_EFFECTS:
-        if effect.name in tried or effect.name in in_terms or not _tells(evidence, effect):
+        if effect.name in tried or effect.name in in_terms or not _is_identifiable(evidence, effect):
             continue
         if effect.term is None:
-            found += _words(effect, model)
+            found += _word_candidates(effect, model)
             continue
         for values in (None, *effect.starts):
             profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
             found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
-        begun = far.start(effect.name, nominal, model.profile, "time_offset" in in_terms)
-        if begun is not None:
-            found.append(Candidate(effect.name, replace(model, profile=begun), (effect.term,), effect))
-    found += _depths(evidence, model, tried)
+        far_start = far.start(effect.name, nominal, model.profile, "time_offset" in in_terms)
+        if far_start is not None:
+            found.append(Candidate(effect.name, replace(model, profile=far_start), (effect.term,), effect))
+    found += _depth_candidates(evidence, model, tried)
     if "frame_lag" not in tried:
-        found += [_lagging(model, *lag) for lag in lags]
+        found += [_lag_candidate(model, *lag) for lag in lags]
     return found
 
 
-def _tells(evidence: Evidence, effect: GeometricEffect) -> bool:
-    """Whether points can tell this cause: an exposure's length only by its changes, otherwise it is an offset."""
+def _is_identifiable(evidence: Evidence, effect: GeometricEffect) -> bool:
+    """Whether points can identify this cause: a constant exposure time is indistinguishable from an offset."""
     return effect.name != "exposure_time" or varies(evidence.observed.exposure_s)
 
 
@@ -131,7 +131,7 @@ def varies(exposure_s: Array) -> bool:
     return middle > 0 and float(np.ptp(exposure_s)) >= CONSTANT_EXPOSURE * middle
 
 
-def _words(effect: GeometricEffect, model: Model) -> list[Candidate]:
+def _word_candidates(effect: GeometricEffect, model: Model) -> list[Candidate]:
     choice, profile = effect.effect.choice, model.profile
     assert choice is not None
     now = next(iter(effect.effect.read(profile, profile).values()))
@@ -142,7 +142,7 @@ def _words(effect: GeometricEffect, model: Model) -> list[Candidate]:
     ]
 
 
-def _depths(evidence: Evidence, model: Model, tried: set[str]) -> list[Candidate]:
+def _depth_candidates(evidence: Evidence, model: Model, tried: set[str]) -> list[Candidate]:
     depth_m = model.profile.depth_m
     if "scene_depth" in tried or depth_m is None:
         return []
@@ -152,7 +152,7 @@ def _depths(evidence: Evidence, model: Model, tried: set[str]) -> list[Candidate
     return [Candidate("scene_depth", replace(model, scene=scene), (), None)]
 
 
-def _lagging(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...]) -> Candidate:
+def _lag_candidate(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...]) -> Candidate:
     extensions = replace(model.profile.extensions, frame_lag_s=lag_s, frame_lag_frames=frames)
     return Candidate(
         "frame_lag", replace(model, profile=replace(model.profile, extensions=extensions), lag=by_frame), (), None

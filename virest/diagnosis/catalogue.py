@@ -1,8 +1,9 @@
-"""The causes that have names, and how sure each must be.
+"""The named causes, and the significance that each needs.
 
-They stand in the table of effects.  Points: geometric_effects; brightness: photometry_effects; blur: local_blur_fit;
-edges: edge_overshoot.  A phone's denoiser has no line: at 0.15 to 0.3 bit a pixel the encoder takes more of the noise
-in flat places than a strong denoiser does, and how much depends on the encoder more than on the denoiser.
+They are listed in the table of effects.  Points: geometric_effects; brightness: photometry_effects; blur:
+local_blur_fit; edges: edge_overshoot.  A phone's denoiser is not listed: at 0.15 to 0.3 bit per pixel the encoder
+removes more noise in flat regions than a strong denoiser does, and the amount depends more on the encoder than on the
+denoiser.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from virest.effects.table import EFFECTS as CATALOGUE
 __all__ = ["CATALOGUE", "FALSE_ALARM", "MAX_P"]
 
 FALSE_ALARM = 1e-3
-"""Probability that a capture with nothing wrong has any cause named."""
+"""Probability that any cause is reported for a capture without errors."""
 
 MAX_P = FALSE_ALARM / len(CATALOGUE)
-"""Probability, below which a cause's value is significant: by Bonferroni, since any cause may be the one that is."""
+"""p value below which a cause is significant: Bonferroni correction over all causes."""

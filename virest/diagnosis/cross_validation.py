@@ -1,4 +1,4 @@
-"""Candidates tried: fitted to all blocks of time with few points, or to half of them and judged on the others."""
+"""Cross-validation of candidates: screen with few points, then fit to half of the time blocks and judge on the rest."""
 
 from __future__ import annotations
 
@@ -28,24 +28,25 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 JUDGE_POINTS = 3500
 LAGGING_BLOCK = 2
-"""Pairs in a block of those that a start-up moves: neighbours share a frame, and nothing was fitted that more share."""
+"""Pairs per block among those that a start-up lag moves: only neighbouring pairs share a frame and its errors."""
 
 GLANCE, RACED, RACED_STARTS = 2, 3, 2
-"""Steps that all of many candidates take; causes that go on from there, times those wanted, and starts of each."""
+"""Iterations of all candidates in the first round; causes that continue, as a multiple of the count wanted; and
+starting points kept per cause."""
 
 FOLDS = (0, 1)
-"""A fit of fold k sees every other block of time, from block k on; the others judge it."""
+"""A fit of fold k uses every other time block, from block k on; the others judge it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A candidate, or a way of choosing one, on blocks that took no part in its fit."""
+    """A candidate, or a rule for choosing one, judged on held-out blocks."""
 
     candidate: Candidate
     distance: Array
     """(n,) whitened held-out distances of the points."""
     block_loss: Array
-    """(blocks,) mean held-out loss a point."""
+    """(blocks,) mean held-out loss per point."""
     pair_loss: Array
     """(pairs,) the same."""
     rms: float
@@ -76,10 +77,10 @@ def screen(evidence: Evidence, candidates: Sequence[Candidate], each: ParallelMa
 
 
 def race(evidence: Evidence, candidates: Sequence[Candidate], count: int, each: ParallelMap) -> list[Screened]:
-    """Screen many: all begin, those that are best for either fold after a few steps go on to the end.
+    """Screen many candidates: after a few iterations of all, only the best of either fold are fitted to the end.
 
-    Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  Of each cause up to RACED_STARTS starting points
-    go on, of the causes as many as RACED times the count that is wanted.
+    Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  RACED × count causes continue, each with up to
+    RACED_STARTS starting points.
     """
     begun = _descended(evidence, [(c, (c.model, c.model)) for c in candidates], GLANCE, each)
     going: set[int] = set()
@@ -129,7 +130,7 @@ def _screened(candidate: Candidate, first: Half, second: Half) -> Screened:
 
 
 def best_of_each(screened: list[Screened]) -> list[Screened]:
-    """For each cause the starting point that fits best, chosen for each fold by its own blocks; best causes first."""
+    """The best starting point of each cause, chosen per fold on its own blocks; best causes first."""
     by_name: dict[str, list[Screened]] = {}
     for entry in screened:
         by_name.setdefault(entry.candidate.name, []).append(entry)
@@ -145,7 +146,7 @@ def best_of_each(screened: list[Screened]) -> list[Screened]:
 
 
 def promising(base: Screened, better: Sequence[Screened], count: int) -> tuple[frozenset[str], frozenset[str]]:
-    """Names of the most promising causes of each fold, by the blocks that it is fitted to alone."""
+    """Names of the most promising causes of each fold, judged only on its fitted blocks."""
     first, second = (
         frozenset(
             entry.candidate.name
@@ -160,7 +161,7 @@ def promising(base: Screened, better: Sequence[Screened], count: int) -> tuple[f
 def judge(
     evidence: Evidence, screened: Sequence[Screened], scale: float, depth_spread_per_m: float, each: ParallelMap
 ) -> list[Judged]:
-    """Fit on every other block, judge on those between, and the other way round."""
+    """Fit on every other block, judge on the rest, and vice versa."""
     tables = [evidence.table(entry.candidate.model, JUDGE_POINTS) for entry in screened]
     use = halves(evidence.block)
     calls = [
@@ -185,11 +186,11 @@ def _judged(evidence: Evidence, candidate: Candidate, table: TrackTable, distanc
 def choose(
     evidence: Evidence, judged: Sequence[Judged], allowed: tuple[frozenset[str], frozenset[str]], scale: float
 ) -> Judged:
-    """What the best cause gains where nothing chose it: a choice for each block by other blocks alone.
+    """Gain of the best cause without selection bias: the cause is chosen for each block by other blocks only.
 
-    A block of one fold is judged by fits that saw the other fold's blocks; which cause counts is chosen by the
-    remaining blocks of its own fold, which those fits did not see either.  Of causes that are not promising by the
-    fitted blocks none is chosen, and where none is, the first of ``judged``, which is the model without.
+    A block is judged by fits to the other fold.  Its cause is chosen on the remaining blocks of its own fold, which
+    these fits did not use either.  Only causes promising on the fitted blocks are eligible; if there are none, the
+    first of ``judged`` is used, which is the model without an added cause.
     """
     table = evidence.table(judged[0].candidate.model, JUDGE_POINTS)
     block = evidence.block[table.pair]
@@ -217,7 +218,7 @@ def _held_out(
 
 
 def lagging_gain(evidence: Evidence, before: Judged, after: Judged) -> Array:
-    """Gain (blocks,) of the pairs that a start-up schedule moves, by blocks of neighbours that share errors."""
+    """Gain (blocks,) of the pairs that a start-up lag moves, in blocks of neighbours with shared errors."""
     last = after.candidate.model.profile.extensions.frame_lag_frames
     moved = np.array([pair.first <= last for pair in evidence.observed.pairs])
     both = min(len(before.pair_loss), len(after.pair_loss), len(moved))

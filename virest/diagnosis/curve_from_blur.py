@@ -1,21 +1,21 @@
-"""The curve from blur at constant exposure: a hand's blur mixes light before the curve, and so shows the curve.
+"""Response curve from blur at constant exposure: motion blur mixes light before the curve is applied.
 
-Of two frames of one place, A nearly sharp and B blurred, with paths k_A and k_B from the gyroscope, both
-``k_B ∗ E′(A)`` and ``k_A ∗ E′(B)`` are the same light blurred by both paths, if E is the curve.  Under a wrong curve
-the bright side of every blurred edge grows or shrinks, whichever way the edge faces; a wrong registration, a wrong
-length of the path and a change of brightness do something else.  They are free in every tile, and only what is left
-counts.  A path in a wrong direction is not: correct the geometry first.  Each colour is mixed on its own, for luma is
-the curve of no light; what is compared is the luma of both sides, but not where colours change: movies keep those at
-half the resolution.
+Take two frames of one scene, A nearly sharp and B blurred, with blur paths k_A and k_B from the gyroscope.  If E is
+the curve, ``k_B ∗ E′(A)`` and ``k_A ∗ E′(B)`` are both the same light blurred by both paths.  Under a wrong curve the
+bright side of every blurred edge grows or shrinks, whichever way the edge faces.  Registration, path length and
+brightness errors have other patterns; they are free parameters in every tile, and only the remainder is used.  The path
+direction is not free: correct the geometry first.  Each colour channel is mixed separately, because luma is not a curve
+of light.  The luma of both sides is compared, except where colours change: movies store those at half the resolution.
 
-An encoder of few bits smooths grey levels, not light.  That mixes as under a straighter curve, in the same sense in all
-pairs of frames, so scatter does not show it: what the encoder leaves in a tile agrees with a change of the curve by a
-part of its size, whatever the blur.  A real change agrees the more the more a tile's light is mixed.
+A low-bitrate encoder smooths grey levels, not light.  This looks like a straighter curve, with the same sign in all
+pairs of frames, so the scatter between pairs does not reveal it: coding residuals in a tile are correlated with a curve
+change by a fraction of their size (AGREEMENT), independent of the blur.  The effect of a real change grows with the
+mixing of light in a tile.
 
-Nothing in a picture is much darker than its black level, which bounds the black level before anything is compared.
+Nothing in a frame is much darker than its black level, which bounds the black level before any comparison.
 
-What a gamma and a black level do this way is nearly the same: each is estimated as if the other were nominal, and they
-are rivals.  Only exposures × ISO that change as logged tell them apart (photometry_fit).
+Gamma and black level have nearly the same effect here: each is estimated with the other at its nominal value, and they
+are rivals.  Only exposures × ISO that change as logged distinguish them (photometry_fit).
 """
 
 from __future__ import annotations
@@ -49,25 +49,26 @@ ReadRgb = Callable[[Sequence[int]], Iterable[tuple[int, Rgb | None]]]
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 GAMMA_STEPS = np.log([0.8, 1.0, 1.25])
-"""Where residuals are taken for a gamma: added to the logarithm of the profile's."""
+"""Steps at which residuals are evaluated for gamma, added to the logarithm of the profile's gamma."""
 LARGEST_BLACK = 0.08
-"""Residuals are taken at no more black level, half of it and none, but never beyond what the darkest greys allow."""
+"""Largest black level at which residuals are evaluated, also at half of it and at 0; limited by the darkest greys."""
 LEAST_BLACK = 0.01
 FLOOR_QUANTILE, FLOOR_PART = 0.001, 0.5
-"""This quantile of the greys excludes a black level of which it is less than this part: noise and undershoots."""
+"""Exclude a black level if this quantile of the greys is below this fraction of it; the margin covers noise and
+undershoots."""
 DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
-"""(absolute, relative) deviation that encoders of few bits leave, beside the scatter between pairs of frames."""
+"""(absolute, relative) σ caused by low-bitrate encoders, in addition to the scatter between pairs of frames."""
 AGREEMENT = 0.07
-"""How well what an encoder leaves may agree with a change of the curve: their correlation, of movies with 0.1 to 0.4
-bits a pixel whose curve is the profile's."""
+"""Correlation of coding residuals with a curve change, measured on movies of 0.1 to 0.4 bit per pixel with the
+profile's curve."""
 READ_PARTS = 4
-"""In which the frames may be read side by side."""
+"""Number of parts in which frames are read in parallel."""
 _MIN_TILE_PIXELS = 400
 _EVERY = 2
-"""Pixels are compared this far apart along both sides: neighbours of a blurred picture say the same."""
+"""Pixel spacing of the comparison along both axes; neighbours in a blurred frame are redundant."""
 _NODE_PX = 16
 _AT_AN_END = ((np.arange(256) > 247) | (np.arange(256) < 4)).astype(np.uint8)
-"""Of a colour's 256 levels, those that may be clipped."""
+"""Mask of the 256 levels that may be clipped."""
 _MAX_CHROMA_RANGE = 40
 """Levels of Cr or Cb within a blur's reach."""
 
@@ -84,29 +85,29 @@ class MixingSettings:
     reach_frames: int = 8
     tile_px: int = 80
     tiles: int = 60
-    """At most ``most`` of a pair's tiles, evenly over the picture: more tell nothing new."""
+    """Maximum number of tiles per pair, evenly spaced over the frame; more add no information."""
 
 
 @dataclass(frozen=True, slots=True)
 class MixingEvidence:
-    """What each tile of each pair says; scores are residuals projected on what a change of the curve would do."""
+    """Evidence of each tile of each pair; scores are residuals projected on the effect of a curve change."""
 
     pair: Indices
     """(n,) number of the pair of frames."""
     pixels: Array
-    """(n,) pixels that took part, every second one along both sides, by their weights."""
+    """(n,) weighted number of compared pixels, every second one along both axes."""
     noise: Array
-    """(n,) robust standard deviation of what remains, grey levels."""
+    """(n,) robust standard deviation of the residuals, grey levels."""
     darkest: float
-    """Grey level that next to nothing in these pictures is darker than."""
+    """Grey level below which almost no pixel of these frames lies."""
     steps: dict[str, Array]
-    """Effect → (3,) changes at which the scores are taken."""
+    """Effect → (3,) changes at which the scores are evaluated."""
     stiffness: dict[str, Array]
-    """Effect → (n,) squared length of its pattern in noises, per unit of the effect squared."""
+    """Effect → (n,) squared length of its pattern in units of noise, per squared unit of the effect."""
     score: dict[str, Array]
     """Effect → (n, 3) scores at the steps; the estimate is where their sum crosses zero."""
     rest: dict[str, Array]
-    """Effect → (n,) squared length of what no such change explains in the tile, in noises."""
+    """Effect → (n,) squared length of the part that no such change explains, in units of noise."""
 
     def subset(self, use: Mask) -> MixingEvidence:
         """Only the chosen tiles."""
@@ -127,9 +128,9 @@ class MixingEvidence:
         return self.darkest / 255.0 / FLOOR_PART
 
     def mean_square(self, effect_name: str, change: float) -> tuple[float, float]:
-        """Of the tiles' differences after a change of the curve, and of what no change explains; grey levels squared.
+        """Mean squares, grey levels², of tile differences after a curve change, and of the part no change explains.
 
-        Each tile's free registration, brightness and length of path are taken off.
+        Each tile's registration, brightness and path length are fitted and removed.
         """
         at = np.array([np.polyval(parabola, change) for parabola in self._parabolas(effect_name)])
         square, stiffness = self.noise**2, np.maximum(self.stiffness[effect_name], 1e-12)
@@ -195,7 +196,7 @@ def _read_part(read_rgb: ReadRgb, wanted: list[int]) -> list[tuple[int, Rgb]]:
 
 
 def _steps(darkest: float) -> dict[str, Array]:
-    """Changes at which residuals are taken; beyond its darkest greys a picture would only be clipped."""
+    """Changes at which residuals are evaluated; a black level above the darkest greys would only clip the frame."""
     most = float(np.clip(darkest / 255.0 / FLOOR_PART, LEAST_BLACK, LARGEST_BLACK))
     return {"response_curve": GAMMA_STEPS, "black_level": np.array([0.0, 0.5, 1.0]) * most}
 
@@ -203,8 +204,8 @@ def _steps(darkest: float) -> dict[str, Array]:
 def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_name: str) -> MixingEstimate | None:
     """Gamma or black level, the other as in the profile; None with fewer than 3 pairs of frames.
 
-    std: by leaving pairs out, and AGREEMENT over how large the change is in noises at a pixel.  A black level below 0
-    or brighter than the darkest greys is none: its p value is 1.
+    std: jackknife over pairs, combined with AGREEMENT divided by the effect per pixel in units of noise.  A black level
+    below 0 or above the darkest greys is rejected: its p value is 1.
     """
     pairs = np.unique(evidence.pair)
     if len(pairs) < 3:
@@ -226,9 +227,9 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
 
 
 def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOutGain | None:
-    """Find the change on half the pairs of frames and judge it on the others, and the reverse.
+    """Estimate the change on half of the frame pairs and judge it on the others, and vice versa.
 
-    RMS of the luma that one frame's light, blurred and encoded, differs by from the other's, grey levels.
+    Rms luma difference, grey levels, between the light of both frames after mutual blur and encoding.
     """
     pairs = np.unique(evidence.pair)
     if len(pairs) < 4:
@@ -244,7 +245,7 @@ def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOutGain | No
 
 
 def _root(evidence: MixingEvidence, effect_name: str) -> float:
-    """Where the parabola through the three summed scores crosses zero nearest to no change."""
+    """Zero of the parabola through the 3 summed scores, the one nearest to the linear estimate."""
     x = evidence.steps[effect_name]
     total = evidence.score[effect_name].sum(axis=0)
     straight = -total[1 if effect_name == "response_curve" else 0] * (x[2] - x[0]) / (total[2] - total[0])
@@ -273,7 +274,7 @@ def _choose_pairs(frames: Sequence[Frame], camera: TurningCamera, settings: Mixi
 
 
 def _central_blur_px(frames: Sequence[Frame], camera: TurningCamera) -> Array:
-    """How far apart the ends of the exposure see the point that its middle has at the picture's centre, (n,)."""
+    """Blur length (n,), px, at the frame centre: distance of the point between start and end of the exposure."""
     centre = np.array([(camera.profile.width - 1) / 2, (camera.profile.height - 1) / 2])
     logged_s = np.array([frame.exposure_s or 0.0 for frame in frames])
     at = camera.frames(np.array([frame.time_s for frame in frames]), logged_s)
@@ -283,7 +284,7 @@ def _central_blur_px(frames: Sequence[Frame], camera: TurningCamera) -> Array:
 
 
 def _darkest(pictures: Sequence[Rgb]) -> float:
-    """Grey level that next to nothing is darker than, 0 without pictures."""
+    """Grey level below which almost no pixel lies; 0 without frames."""
     return float(np.median([np.quantile(rgb[::2, ::2], FLOOR_QUANTILE) for rgb in pictures])) if pictures else 0.0
 
 
@@ -308,22 +309,22 @@ def _compare(
     kernels = [
         [_kernel(path) for path in path_over_exposure(middles, frame, camera)] for frame in (sharp[0], blurred[0])
     ]
-    told = _spread([k for k, tile in enumerate(tiles) if _tells(usable[tile])], settings.tiles)
-    pixels = [_compared(usable, tiles[k]) for k in told]
-    if not told:
+    chosen = _evenly_chosen([k for k, tile in enumerate(tiles) if _is_usable(usable[tile])], settings.tiles)
+    pixels = [_compared(usable, tiles[k]) for k in chosen]
+    if not chosen:
         return []
     curve = camera.profile.response or ResponseCurve("srgb")
 
     def light(seen: ResponseCurve) -> list[tuple[Plane, list[Plane]]]:
-        """Either picture's light where the blurred one has it, with the other's kernels."""
+        """Light of both frames, aligned to the blurred one, each with the other's kernels."""
         table = seen.linear_table()
         moved = cv2.remap(cv2.LUT(sharp[1], table), place, None, cv2.INTER_CUBIC)
         return [(np.asarray(moved, np.float32), kernels[1]), (np.asarray(cv2.LUT(blurred[1], table)), kernels[0])]
 
     def levels(changed: ResponseCurve, both: list[tuple[Plane, list[Plane]]]) -> Array:
-        """Difference of luma (n,) in the compared pixels of all tiles that tell, of both pictures' light."""
+        """Luma difference (n,) of both frames in the compared pixels of all usable tiles."""
         first, second = (
-            np.concatenate([_filtered(one, by[k], tiles[k])[at] for k, at in zip(told, pixels, strict=True)])
+            np.concatenate([_filtered(one, by[k], tiles[k])[at] for k, at in zip(chosen, pixels, strict=True)])
             for one, by in both
         )
         return np.asarray((255 * (changed.encode(second) - changed.encode(first))) @ LUMA, float)
@@ -335,23 +336,23 @@ def _compare(
         whole[tile] = _filtered(from_sharp[0], kernel, tile)
     nominal, nuisance = levels(curve, as_given), _nuisances((255 * curve.encode(whole)) @ LUMA)
     bent = [replace(curve, extra_gamma=curve.extra_gamma * float(np.exp(s))) for s in steps["response_curve"][[0, 2]]]
-    lifted = [replace(curve, black_level=curve.black_level + float(s)) for s in steps["black_level"][1:]]
-    gammas, blacks = ([levels(one, light(one)) for one in changed] for changed in (bent, lifted))
+    raised = [replace(curve, black_level=curve.black_level + float(s)) for s in steps["black_level"][1:]]
+    gammas, blacks = ([levels(one, light(one)) for one in changed] for changed in (bent, raised))
     stacks = [np.stack(stack, axis=-1) for stack in ((gammas[0], nominal, gammas[1]), (nominal, *blacks))]
     free = np.concatenate(
-        [np.stack([plane[tiles[k]][at] for plane in nuisance], axis=-1) for k, at in zip(told, pixels, strict=True)]
+        [np.stack([plane[tiles[k]][at] for plane in nuisance], axis=-1) for k, at in zip(chosen, pixels, strict=True)]
     )
     ends = np.cumsum([len(at[0]) for at in pixels])
     parts = [slice(end - len(at[0]), end) for end, at in zip(ends, pixels, strict=True)]
     return [_tile_scores([stack[part] for stack in stacks], tuple(steps.values()), free[part]) for part in parts]
 
 
-def _spread(numbers: list[int], count: int) -> list[int]:
-    """At most ``count`` of the numbers, evenly."""
+def _evenly_chosen(numbers: list[int], count: int) -> list[int]:
+    """At most ``count`` of the numbers, evenly spaced."""
     return [numbers[k] for k in np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))]
 
 
-def _tells(usable: Mask) -> bool:
+def _is_usable(usable: Mask) -> bool:
     """Whether enough of a tile's pixels can be compared."""
     return bool(usable.sum() >= 2 * _MIN_TILE_PIXELS and usable[::_EVERY, ::_EVERY].sum() >= _MIN_TILE_PIXELS)
 
@@ -363,9 +364,9 @@ def _compared(usable: Mask, tile: tuple[slice, slice]) -> tuple[Indices, Indices
 
 
 def _tile_scores(levels: list[Array], steps: tuple[Array, ...], free: Array) -> Array:
-    """Scores of one tile with everything projected out that is no change of the curve; robust weights per pixel.
+    """Scores of one tile after projecting out all nuisances, with robust weights per pixel.
 
-    levels: of each effect, differences (n, 3) at its steps.  free: (n, k) what else may differ.
+    levels: for each effect, luma differences (n, 3) at its steps.  free: (n, k) nuisance patterns.
     """
     free = free.astype(float)
     patterns = [(level[:, 2] - level[:, 0]) / (x[2] - x[0]) for level, x in zip(levels, steps, strict=True)]
@@ -387,13 +388,13 @@ def _tile_scores(levels: list[Array], steps: tuple[Array, ...], free: Array) -> 
 
 
 def _length2(values: Array, base: Array) -> float:
-    """Squared length of what is left of values (n,) without the orthonormal base (n, k)."""
+    """Squared length of values (n,) after removing the orthonormal base (n, k)."""
     left = values - base @ (base.T @ values)
     return float(left @ left)
 
 
 def _nuisances(grey: Plane) -> list[Plane]:
-    """What a wrong registration, brightness and path length do: slopes, the picture, a constant, the Laplacian."""
+    """Patterns of registration, brightness and path-length errors: gradients, the frame, a constant, the Laplacian."""
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     slopes = [cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))]
     bend = cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.5), cv2.CV_32F)
@@ -402,7 +403,7 @@ def _nuisances(grey: Plane) -> list[Plane]:
 
 
 def _nodes(width: int, height: int) -> Array:
-    """Pixels (rows, columns, 2) every _NODE_PX, one beyond the picture's end."""
+    """Pixels (rows, columns, 2) every _NODE_PX, one beyond the frame border."""
     x, y = (np.arange(n // _NODE_PX + 2) * float(_NODE_PX) for n in (width, height))
     return np.stack(np.meshgrid(x, y), axis=-1)
 
@@ -413,7 +414,7 @@ def _tiles(width: int, height: int, side: int) -> list[tuple[slice, slice]]:
 
 
 def _usable(sharp: Rgb, blurred: Rgb, place: Plane) -> Mask:
-    """Pixels whose surroundings are inside both pictures, clipped in no colour of either, and about of one hue."""
+    """Pixels whose neighbourhood is inside both frames, unclipped in all channels, and nearly uniform in chroma."""
     height, width = blurred.shape[:2]
     edge = 8
     x, y = place[..., 0], place[..., 1]
@@ -433,7 +434,7 @@ def _usable(sharp: Rgb, blurred: Rgb, place: Plane) -> Mask:
 
 
 def _kernel(path_px: Array) -> Plane:
-    """Weights by which a pixel gathers light from its surroundings along a path (m, 2): at minus the displacement."""
+    """Weights with which a pixel gathers light along a path (m, 2), located at minus the displacement."""
     fine = (path_px[:-1, None] + np.diff(path_px, axis=0)[:, None] * (np.arange(6) / 6)[:, None]).reshape(-1, 2)
     reach = int(np.abs(fine).max() + 2)
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
@@ -448,7 +449,7 @@ def _kernel(path_px: Array) -> Plane:
 
 
 def _filtered(light: Plane, kernel: Plane, tile: tuple[slice, slice]) -> Plane:
-    """One tile of a picture blurred by its own kernel, with as much of its neighbours as that reaches."""
+    """One tile of a frame blurred by its own kernel, including the neighbouring pixels that the kernel reaches."""
     reach, (height, width), (rows, columns) = len(kernel) // 2, light.shape[:2], tile
     top, left = max(rows.start - reach, 0), max(columns.start - reach, 0)
     part = light[top : min(rows.stop + reach, height), left : min(columns.stop + reach, width)]

@@ -1,19 +1,19 @@
-"""Sharpening that the phone applied, from the overshoot beside isolated edges that hardly blur.
+"""Sharpening by the phone, measured from the overshoot at isolated edges with little blur.
 
-No blur of light takes a step above its bright side or below its dark one, and no response curve does; an unsharp mask
-``y + amount (y − G_radius ∗ y)`` does both.  Across a step that lens and path spread by a Gaussian of width s the
-profile is, as part of the step's height,
+Neither a blur of light nor a response curve takes a step above its bright side or below its dark one; an unsharp mask
+``y + amount (y − G_radius ∗ y)`` does both.  Across a step blurred by lens and path with a Gaussian of width s, the
+profile as a fraction of the step height is
 
     z(u) = Φ(u/s) + amount (Φ(u/s) − Φ(u/√(s² + radius²))),
 
-the linear form of Polesel, Ramponi & Mathews 2000 (doi:10.1109/83.826787).  A curve bends a profile and does not take
-it beyond its ends, so the mean of z(u) and 1 − z(−u) is fitted.  Where the step is wider than the mask, amount and
-radius show as amount · radius² alone; what phones use (AMOUNT, RADIUS_PX) then decides, and the deviations say so.
+the linear form of Polesel, Ramponi & Mathews 2000 (doi:10.1109/83.826787).  A response curve bends a profile but keeps
+its range, so the mean of z(u) and 1 − z(−u) is fitted.  Where the step is wider than the mask, only amount · radius² is
+observable; the priors AMOUNT and RADIUS_PX then decide, and the standard deviations grow accordingly.
 
-Whether there is a mask all isolated edges tell, whatever their width: where a textured surface happens to be brightest
-beside an edge, that edge overshoots and is the steeper for it, so the sharpest ones overshoot in any such scene.  The
-mask's values come from the sharpest, for a soft step hardly overshoots.  What one place of the scene shows in many
-frames counts once.
+The significance test uses all isolated edges, whatever their width: if a textured surface happens to be brightest next
+to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The
+values of the mask come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in
+many frames counts once.
 """
 
 from __future__ import annotations
@@ -43,33 +43,32 @@ from virest.motion.trajectory import Trajectory, turned
 Array = NDArray[np.float64]
 
 SHARPEST = 0.4
-"""Part of the edges, the sharpest, that the mask's values come from: a soft step overshoots less."""
+"""Fraction of the edges, the sharpest, used to estimate the mask; a soft step overshoots less."""
 MIN_USED = 60
-PLACE_PX, PLACE_GROUPS = 20.0, 16
-"""Edges whose directions in the world fall into one cell of this side, at the lens's focal length, show one place; and
-how many groups of places the deviation is drawn from, each left out in turn."""
+LOCATION_PX, LOCATION_GROUPS = 20.0, 16
+"""Cell size of a scene location: edges whose world directions share a cell, at the lens's focal length, show the same
+location; and the number of location groups of the jackknife."""
 RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
-"""Of phones' unsharp masks, and how far it varies (in the logarithm): 0.8 to 2 px."""
+"""Prior of the radius of phones' unsharp masks and its σ (logarithmic): 0.8 to 2 px."""
 AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
-"""Of phones' unsharp masks, and how far it varies."""
+"""Prior of the amount of phones' unsharp masks and its σ."""
 PROFILE_STD = 0.003
-"""Misfit of a mean profile, as part of the step; neighbours within a pixel share it."""
-BARE_OVERSHOOT, BARE_STD, BARE_CAPTURES = 0.001, 0.003, 95
-"""Of decoded movies that nobody sharpened, the weaker side's overshoot of all edges, how far it may vary, and on how
-many simulated captures that was measured.  It was 0.001 ± 0.002, −0.003 to 0.0065: five scenes at 320 × 240 and
-640 × 480, of which boards have 0.004."""
+"""Misfit of a mean profile, as a fraction of the step, correlated within 1 px."""
+UNSHARPENED_OVERSHOOT, UNSHARPENED_STD, UNSHARPENED_CAPTURES = 0.001, 0.003, 95
+"""Overshoot of unsharpened decoded movies (all edges, weaker side), its σ, and the number of simulated captures behind
+it: 0.001 ± 0.002, −0.003 to 0.0065 on 5 scenes at 320 × 240 and 640 × 480; boards have 0.004."""
 SELECTED_OVERSHOOT, SELECTED_STD = 0.020, 0.017
-"""The same of the sharpest edges, both sides' mean: coding, interpolation, and that edges which overshoot are steep."""
-BARE_RADII_PX = (0.6, 2.2)
-"""How far it reaches: from interpolation's to that of edges which were picked for their sharpness."""
+"""The same for the sharpest edges, mean of both sides: coding, interpolation, and selection of steep edges."""
+UNSHARPENED_RADII_PX = (0.6, 2.2)
+"""Range of this overshoot: from that of interpolation to that of edges selected for sharpness."""
 SIZE_ERROR = 0.2
-"""Relative, of amount and radius: coding damps the overshoot at some frequencies more than at others."""
+"""Relative error of amount and radius: coding damps the overshoot depending on frequency."""
 BOUNDS = ([0.2, 0.0, np.log(0.4)], [3.0, 6.0, np.log(4.0)])
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeProfiles:
-    """Profiles across isolated edges that hardly moved, dark to bright, 0 and 1 at the plateaus."""
+    """Profiles across isolated edges with little motion, dark to bright, 0 and 1 at the plateaus."""
 
     profile: Array
     """(n, m) on GRID_PX, 0.5 at the middle."""
@@ -78,7 +77,7 @@ class EdgeProfiles:
     stamp_s: Array
     """(n,) of the frame."""
     place: NDArray[np.intp]
-    """(n,) number of the place in the scene."""
+    """(n,) number of the scene location."""
 
     def __len__(self) -> int:
         return len(self.profile)
@@ -86,26 +85,26 @@ class EdgeProfiles:
 
 @dataclass(frozen=True, slots=True)
 class Sharpening:
-    """An unsharp mask that the edges show."""
+    """An unsharp mask estimated from edges."""
 
     amount: float
     amount_std: float
     radius_px: float
     radius_std_px: float
     overshoot: float
-    """Of the sharpest edges, beyond the plateaus, both sides' mean, as part of the step."""
+    """Overshoot of the sharpest edges, mean of both sides, as a fraction of the step."""
     z: float
-    """Of all edges' overshoot, less that of bare movies, in its deviations; of the weaker of the two sides."""
+    """Excess overshoot of all edges over that of unsharpened movies, in σ, on the weaker side."""
     held_out: HeldOutGain
-    """Rms of the mean profile, as part of the step, without and with the mask."""
+    """Residual rms of the mean profile, as a fraction of the step, without and with the mask."""
 
     @property
     def p_value(self) -> float:
-        """Probability of such an overshoot on both sides where nobody sharpened.
+        """Probability of such an overshoot on both sides without sharpening.
 
-        Student's, with the freedom of the captures that told what is usual there.
+        Student's t, with the degrees of freedom of the captures on which the unsharpened overshoot was measured.
         """
-        return student_tail(self.z, BARE_CAPTURES - 1)
+        return student_tail(self.z, UNSHARPENED_CAPTURES - 1)
 
 
 def judge_sharpening(
@@ -116,9 +115,9 @@ def judge_sharpening(
     each: ParallelMap = one_by_one,
     steps: IsolatedSteps | None = None,
 ) -> PictureVerdict:
-    """Name the sharpening, where edges overshoot by more than coding alone makes them.
+    """Report sharpening where edges overshoot more than coding explains.
 
-    steps: of the frames of :func:`frames_to_read`, where they have been seen already.
+    steps: those of the frames of :func:`frames_to_read`, if already detected.
     """
     verdict = PictureVerdict(profile)
     seen = look_for_steps(gray, capture, each) if steps is None else steps
@@ -138,19 +137,19 @@ def judge_sharpening(
 
 
 def edge_profiles(steps: IsolatedSteps, profile: CameraProfile, trajectory: Trajectory) -> EdgeProfiles:
-    """The steps that hardly moved, in grey levels, for sharpening follows the curve."""
+    """Profiles of the steps with little motion, in grey levels, since sharpening is applied after the curve."""
     clock, lens = RowClock(profile), profile.intrinsics
     assert lens is not None
     tensors = path_tensors(steps.stamp_s, steps.exposure_s, steps.points_px, profile, trajectory)
     steps = steps.chosen(np.sqrt(across(tensors, steps.normal)) < STILL_PX)
     seen_s = clock.seen_s(steps.points_px, steps.stamp_s, steps.exposure_s)
     ways = turned(trajectory.orientation(seen_s), lens.rays(steps.points_px))
-    return _measured(steps.profile, steps.stamp_s, _places(ways, lens.fx_px))
+    return _measured(steps.profile, steps.stamp_s, _locations(ways, lens.fx_px))
 
 
 def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
-    """Amount and radius; None where there are too few sharp edges, or places, to tell."""
-    if len(edges) < MIN_USED / SHARPEST or len(np.unique(edges.place)) < PLACE_GROUPS:
+    """Amount and radius; None with too few sharp edges or scene locations."""
+    if len(edges) < MIN_USED / SHARPEST or len(np.unique(edges.place)) < LOCATION_GROUPS:
         return None
     sharp = edges.width_px <= np.quantile(edges.width_px, SHARPEST)
     profiles, block = edges.profile[sharp], time_blocks(edges.stamp_s[sharp])
@@ -158,10 +157,10 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
     if len(profiles) < MIN_USED or len(numbers) < 4:
         return None
     mean = np.median(profiles, axis=0)
-    theta, covariance = _fit(_evened(mean))
+    theta, covariance = _fit(_symmetrised(mean))
     without = [np.median(profiles[block != b], axis=0) for b in numbers]
-    scatter = _jackknife([_fit(_evened(one))[0] for one in without])
-    std = np.sqrt(np.diag(covariance + scatter + _by_bare_overshoot(_evened(mean), theta)))
+    scatter = _jackknife([_fit(_symmetrised(one))[0] for one in without])
+    std = np.sqrt(np.diag(covariance + scatter + _covariance_of_unsharpened(_symmetrised(mean), theta)))
     amount, radius_px = float(theta[1]), float(np.exp(theta[2]))
     return Sharpening(
         amount,
@@ -175,12 +174,12 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
 
 
 def _significance(edges: EdgeProfiles) -> float:
-    """How far all edges overshoot beyond what bare ones do, in deviations; of the weaker side."""
-    group = np.unique(edges.place, return_inverse=True)[1] % PLACE_GROUPS
+    """Excess overshoot of all edges over that of unsharpened movies, in σ, on the weaker side."""
+    group = np.unique(edges.place, return_inverse=True)[1] % LOCATION_GROUPS
     sides = _overshoots(np.median(edges.profile, axis=0))
-    without = [_overshoots(np.median(edges.profile[group != g], axis=0)) for g in range(PLACE_GROUPS)]
-    std = np.sqrt(np.diag(_jackknife(without)) + BARE_STD**2)
-    return float(((sides - BARE_OVERSHOOT) / std).min())
+    without = [_overshoots(np.median(edges.profile[group != g], axis=0)) for g in range(LOCATION_GROUPS)]
+    std = np.sqrt(np.diag(_jackknife(without)) + UNSHARPENED_STD**2)
+    return float(((sides - UNSHARPENED_OVERSHOOT) / std).min())
 
 
 def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
@@ -192,9 +191,9 @@ def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _places(ways: Array, focal_px: float) -> NDArray[np.intp]:
-    """Number (n,) of the place in the world that each direction (n, 3) goes to."""
-    cell = np.floor(ways / np.linalg.norm(ways, axis=-1, keepdims=True) * focal_px / PLACE_PX)
+def _locations(ways: Array, focal_px: float) -> NDArray[np.intp]:
+    """Number (n,) of the scene location in each world direction (n, 3)."""
+    cell = np.floor(ways / np.linalg.norm(ways, axis=-1, keepdims=True) * focal_px / LOCATION_PX)
     return np.unique(cell, axis=0, return_inverse=True)[1].ravel()
 
 
@@ -204,7 +203,7 @@ def _measured(profiles: Array, stamp_s: Array, place: NDArray[np.intp]) -> EdgeP
     return EdgeProfiles(profiles, 0.5 * width, stamp_s, place)
 
 
-def _evened(mean: Array) -> Array:
+def _symmetrised(mean: Array) -> Array:
     return np.asarray(0.5 * (mean + 1.0 - mean[::-1]))
 
 
@@ -227,10 +226,10 @@ def _fit(mean: Array) -> tuple[Array, Array]:
     return found.x, np.linalg.pinv(found.jac.T @ found.jac)
 
 
-def _by_bare_overshoot(mean: Array, theta: Array) -> Array:
-    """What the values move by, squared, if part of the overshoot is not sharpening's, whether narrow or wide."""
+def _covariance_of_unsharpened(mean: Array, theta: Array) -> Array:
+    """Covariance (3, 3) of the values due to overshoot from other sources, narrow and wide."""
     moved = np.zeros((3, 3))
-    for radius_px in BARE_RADII_PX:
+    for radius_px in UNSHARPENED_RADII_PX:
         bare = sharpened_step(theta[0], 1.0, radius_px) - sharpened_step(theta[0], 0.0, radius_px)
         away = _fit(mean - np.hypot(SELECTED_OVERSHOOT, SELECTED_STD) / bare.max() * bare)[0] - theta
         moved += np.outer(away, away)
@@ -238,14 +237,14 @@ def _by_bare_overshoot(mean: Array, theta: Array) -> Array:
 
 
 def _jackknife(values: Sequence[Array]) -> Array:
-    """Covariance of an estimate from those that leave out one block each."""
+    """Jackknife covariance of an estimate from its leave-one-block-out values."""
     away = np.stack(values) - np.mean(values, axis=0)
     return np.asarray(away.T @ away * (len(values) - 1) / len(values))
 
 
 def _held_out(profiles: Array, block: NDArray[np.intp]) -> HeldOutGain:
-    """Rms of the mean profile of every other block about the step fitted to the rest, without and with a mask."""
-    seen, judged = (_evened(np.median(profiles[use], axis=0)) for use in halves(block))
+    """Held-out rms of the mean profile of every other block, step fitted to the rest, without and with a mask."""
+    seen, judged = (_symmetrised(np.median(profiles[use], axis=0)) for use in halves(block))
     width = least_squares(lambda s: sharpened_step(s[0], 0.0, 1.0) - seen, [0.7], bounds=(BOUNDS[0][0], BOUNDS[1][0]))
     theta, _ = _fit(seen)
     models = sharpened_step(width.x[0], 0.0, 1.0), sharpened_step(theta[0], theta[1], float(np.exp(theta[2])))

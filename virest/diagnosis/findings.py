@@ -1,4 +1,4 @@
-"""What a diagnosis says: causes with their sizes, what each gains on frames it was not fitted to, and what remains."""
+"""Results of a diagnosis: causes with their sizes, their gains on held-out frames, and what remains."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from virest.effects import records
 
 CONSISTENT, EXPLAINED, UNEXPLAINED = "consistent", "explained", "unexplained"
 GEOMETRY, PHOTOMETRY, BLUR, EDGES = records.GEOMETRY, records.PHOTOMETRY, records.BLUR, records.EDGES
-"""Of the mean profile across edges, as part of the step."""
+"""Held-out quantities; EDGES is the rms of the mean edge profile, as a fraction of the step."""
 JOINED = " + "
-"""Between the names of two causes that enter together."""
+"""Separator between the names of two causes that enter together."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterChange:
-    """One value of the profile, as it was and as the data want it."""
+    """One profile value: nominal and estimated."""
 
     nominal: Any
     estimate: Any
@@ -44,15 +44,15 @@ class HeldOutGain:
 
     @classmethod
     def of_folds(cls, quantity: str, folds: Sequence[tuple[float, float, float]]) -> HeldOutGain:
-        """Of folds, each judged by a fit that saw the others: rms (before, after, noise) of each."""
+        """Combine folds, each with its held-out rms (before, after, noise)."""
         before, after, noise = np.sqrt(np.mean(np.square(folds), axis=0)).tolist() if len(folds) else (0.0,) * 3
         return cls(quantity, before, after, noise)
 
     @property
     def gain(self) -> float | None:
-        """1 − (after² − noise²) / (before² − noise²), in [0, 1]; a lower bound, without noise, where it is unknown.
+        """1 − (after² − noise²) / (before² − noise²), in [0, 1]; with unknown noise a lower bound (noise = 0).
 
-        None where before is no more than the measured noise: there is no excess of which to take a part.
+        None where ``before`` does not exceed the measured noise.
         """
         floor = (self.noise or 0.0) ** 2
         excess_before = self.before**2 - floor
@@ -63,7 +63,7 @@ class HeldOutGain:
 
 @dataclass(frozen=True, slots=True)
 class Rival:
-    """Another cause that explains as well."""
+    """Another cause that explains the data equally well."""
 
     name: str
     held_out_after: float
@@ -79,14 +79,14 @@ class Finding:
     held_out: HeldOutGain
     rivals: tuple[Rival, ...]
     p_value: float | None
-    """Probability of so large a value, or of so even a gain, by chance; None: not computed."""
+    """Probability of such a value, or such a consistent gain, by chance; None: not computed."""
     sentence: str
     """What it means, for people."""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldFinding:
-    """An unknown effect, described by what it does along recorded covariates."""
+    """An unnamed effect, described along recorded covariates."""
 
     covariates: tuple[str, ...]
     kind: str
@@ -100,15 +100,15 @@ class FieldFinding:
     std: float | None
     held_out: HeldOutGain
     p_value: float | None
-    """For the whole set of forms that were asked; None: none can be given."""
+    """For the whole set of tested forms; None: not available."""
     confounded: tuple[str, ...]
-    """Forms over other covariates that this capture cannot tell from it."""
+    """Forms over other covariates that this capture cannot distinguish from it."""
     stability: float | None
-    """Part of the resampled captures in which it, or one of these, is chosen again."""
+    """Fraction of resamples in which it, or one of these, is chosen again."""
     reasons: str
-    """What may be behind it."""
+    """Likely reasons."""
     next: str
-    """The measurement that would tell the reasons apart."""
+    """The measurement that would distinguish the reasons."""
     fields: tuple[Field, ...] = ()
     """As the extended profile holds them."""
     stretches_s: tuple[tuple[float, float], ...] = ()
@@ -129,10 +129,10 @@ class Nominal:
 
 @dataclass(frozen=True, slots=True)
 class Remaining:
-    """Structure that no named cause removes."""
+    """Residual structure that no named cause explains."""
 
     p_value: float | None
-    """Of no structure; None: not computed (parts of the picture that move together and were left out)."""
+    """For the hypothesis of no structure; None: not computed (excluded image regions that move together)."""
     strongest_along: str
     """``row``, ``time``, ``radius``, ``rate``, ``brightness`` ..."""
     size: float
@@ -147,7 +147,7 @@ class Rung:
     """One step of the ladder: what was tried and what entered."""
 
     entered: str | None
-    """A cause, or two that gain together only; None: nothing gained enough."""
+    """A cause, or two that gain only together; None: no candidate gained enough."""
     tried: dict[str, float]
     """Held-out rms with each candidate added."""
     before: float
@@ -169,13 +169,13 @@ class Diagnosis:
     """Strongest first."""
     unexplained: Remaining
     nominal_profile: CameraProfile
-    """The given one, with null values fitted."""
+    """The given profile, with null values estimated."""
     extended_profile: CameraProfile
-    """With every cause built in."""
+    """The profile with all causes applied."""
     ladder: tuple[Rung, ...] = ()
     residuals: dict[str, Any] = default(default_factory=dict)
     """For figures: ``before`` and ``after``, each a mapping of covariate names, ``x_px`` and ``y_px`` to arrays."""
     notes: tuple[str, ...] = ()
-    """What was left out or could not be judged, and why."""
+    """What was excluded or could not be judged, and why."""
     fields: tuple[FieldFinding, ...] = ()
     """Effects that no cause names, strongest first."""

@@ -1,4 +1,4 @@
-"""The end of the ladder: everything fitted together again, without what is no longer significant or of no use."""
+"""End of the ladder: joint refit without causes that are no longer significant or useful."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def conclude(
     rungs: list[Rung],
     nominal: CameraProfile,
 ) -> GeometricVerdict:
-    """Fit everything together from the nominal profile on, and let go of what is no longer significant.
+    """Refit everything jointly, and remove causes that are no longer significant.
 
-    So too of what held-out points are better off without: one of a pair may have stood in for a cause found later.
+    Causes that no longer improve held-out points are removed too: one of a pair may have absorbed a cause found later.
     """
     entered = len(accepted)
     paired = any(JOINED in (rung.entered or "") for rung in rungs)
@@ -45,7 +45,7 @@ def conclude(
             entry
             for entry in accepted
             if not POINT_LEVELS.significant(
-                _doubt(evidence, fitted, table, entry, model.profile, nominal_model.profile)
+                _p_value_of(evidence, fitted, table, entry, model.profile, nominal_model.profile)
             )
         ]
         if not leaving and (paired or len(accepted) < entered):
@@ -70,9 +70,9 @@ def conclude(
 
 
 def lag_std_s(evidence: Evidence, model: Model, table: TrackTable) -> float:
-    """Deviation of a start-up lag: of an offset of the lagging pairs alone, with how far they want one.
+    """Standard deviation of a start-up lag, from a time offset fitted to the lagging pairs alone.
 
-    A schedule allows for lags in steps; what lies between two steps shows as such an offset.
+    Schedules have discrete lags; the error between two steps appears as such an offset, whose value is included.
     """
     lagging = np.array([pair.first <= model.profile.extensions.frame_lag_frames for pair in evidence.observed.pairs])
     fitted = evidence.fit(model, (terms_of.TIME_OFFSET,), table, lagging)
@@ -85,9 +85,9 @@ def lag_std_s(evidence: Evidence, model: Model, table: TrackTable) -> float:
 
 
 def _rejudged(evidence: Evidence, model: Model, nominal: Model, entry: Accepted, fitted: TrackFit) -> Accepted:
-    """The cause with what it gains held out beside those that stayed.
+    """The cause with its held-out gain beside the remaining causes.
 
-    With one that left, or as one of a pair, it gained something else on its rung.
+    Its gain on its rung differs if a cause was removed since, or if it entered as one of a pair.
     """
     if not _has_term(entry):
         return entry
@@ -104,10 +104,10 @@ def _has_term(entry: Accepted) -> bool:
     return entry.effect is not None and entry.effect.term is not None
 
 
-def _doubt(
+def _p_value_of(
     evidence: Evidence, fitted: TrackFit, table: TrackTable, entry: Accepted, found: CameraProfile, given: CameraProfile
 ) -> float:
-    """Probability that an accepted cause is nothing, now that the others are in; 0 for a word."""
+    """p value of an accepted cause beside all others; 0 for a cause with a word as value."""
     if entry.name == "scene_depth":
         return depth_p(fitted, table, given.depth_m)
     if entry.effect is None or entry.effect.term is None:
@@ -116,7 +116,7 @@ def _doubt(
 
 
 def _without(model: Model, nominal: Model, leaving: Accepted) -> Model:
-    """The nominal model with the kept causes' terms, to be fitted anew from where they stand."""
+    """The model without one cause, whose parameters return to nominal; the other causes are kept for a refit."""
     if leaving.name == "scene_depth":
         return replace(model, scene=nominal.scene)
     assert leaving.effect is not None

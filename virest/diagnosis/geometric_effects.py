@@ -1,6 +1,6 @@
-"""Causes that move points, as the table of effects has them, each with its term of the fit.
+"""Causes that move points, from the table of effects, each with its fit term.
 
-A cause with a word for a value (a direction, a stamp's meaning) is tried word by word.
+A cause with a word as value (a direction, a timestamp reference) is tried for each word.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ class GeometricEffect:
 
     effect: Effect
     term: Term | None
-    """None: nothing continuous to fit (a word)."""
+    """None: no continuous parameter (a word)."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """To another process goes the name: both have the table."""
+        """Pickle by name, since every process has the table."""
         return geometric_effect, (self.name,)
 
     @property
     def name(self) -> str:
-        """As the table has it."""
+        """Name in the table."""
         return self.effect.name
 
     @property
     def starts(self) -> tuple[tuple[float, ...], ...]:
-        """Changes of the term's values to begin from, besides none."""
+        """Starting changes of the term's values, besides 0."""
         return () if self.effect.steps is None else self.effect.steps.starts
 
     def total_change(self, nominal: CameraProfile, found: CameraProfile) -> Array:
@@ -51,7 +51,7 @@ class GeometricEffect:
         return self.effect.steps.between(nominal, found)
 
     def changes(self, nominal: CameraProfile, found: CameraProfile, std: Array | None) -> dict[str, ParameterChange]:
-        """The parameters before and after, with their deviations from those of the term's values (k,)."""
+        """The parameters before and after; their standard deviations follow from those of the term's values (k,)."""
         before, after = (self.effect.read(profile, nominal) for profile in (nominal, found))
         spread = {} if std is None else self.effect.spread(after, std)
         return {name: ParameterChange(before[name], after[name], spread.get(name)) for name in after}
@@ -63,7 +63,7 @@ GEOMETRIC_EFFECTS = tuple(
 
 
 def geometric_effect(name: str) -> GeometricEffect:
-    """The cause of this name; KeyError: none is called so."""
+    """The cause with this name; KeyError if there is none."""
     return _BY_NAME[name]
 
 

@@ -1,4 +1,4 @@
-"""Tracked points as evidence: laid out for a profile, fitted on some stretches of time, judged on the others."""
+"""Tracked points as evidence: fitted on some time blocks, judged on the others."""
 
 from __future__ import annotations
 
@@ -37,15 +37,16 @@ __all__ = [
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 CAP = 4.0
-"""Differences count up to this many of their own median scales: single lost tracks do not decide."""
+"""Residual cap, in median scales, so that single lost tracks do not dominate."""
 BLOCK_LENGTHS = (7, 11, 8, 13, 9)
-"""Pairs in a block of time, in turn."""
+"""Pairs per time block, repeated in this order."""
 FULL_LENGTH_PAIRS = 60
-"""With fewer pairs blocks are shorter, so that there are some six of them."""
+"""With fewer pairs, blocks are shortened so that about 6 remain."""
 TILT_STD, KNOWN_DEPTH_STD = 0.8, 0.03
-"""Of a plane at a known depth: its slope, and the part by which the depth ahead differs between moments."""
-MISPLACED, HELD_DEPTH_STD = 4.0, 1e-3
-"""A plane that points pull this many KNOWN_DEPTH_STD away is held where the profile says: that is what is judged."""
+"""Prior σ of a plane at a known depth: its slope, and the relative variation of its depth over time."""
+MAX_DEPTH_PULL, HELD_DEPTH_STD = 4.0, 1e-3
+"""If the fit moves a plane by more than MAX_DEPTH_PULL × KNOWN_DEPTH_STD, hold it at the profile's depth (relative σ
+HELD_DEPTH_STD), so that this depth is judged."""
 ITERATIONS = 10
 START_INVERSE_DEPTH_PER_M = 0.5
 MIN_SWAY_DEPTH_PER_M = 1e-4
@@ -53,13 +54,13 @@ MIN_SWAY_DEPTH_PER_M = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A profile, what travels with it, and the terms that have been fitted so far."""
+    """A profile with its scene and start-up lag, and the terms fitted so far."""
 
     profile: CameraProfile
     scene: Motion | None
     terms: tuple[Term, ...]
     lag: tuple[float, ...] = ()
-    """(frames,) seconds by which a slot shows a later capture; empty: none."""
+    """(frames,) s by which a frame slot shows a later capture; empty: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +70,10 @@ class Evidence:
     imu: ImuSamples
     observed: ObservedTracks
     block: NDArray[np.intp]
-    """(pairs,) number of the block of time."""
+    """(pairs,) number of the time block."""
 
     def noise_px(self, fitted: TrackFit) -> float:
-        """Tracking noise: capped rms per coordinate of what a free smooth flow leaves, without the camera model."""
+        """Tracking noise, px: capped residual rms per coordinate about a free smooth flow, without the camera model."""
         return capped_rms(noise_distances(self.observed, fitted)) * self.typical_px
 
     @property
@@ -92,11 +93,11 @@ class Evidence:
         return float(np.median(self.observed.exposure_s))
 
     def impossible(self, profile: CameraProfile) -> frozenset[str]:
-        """Names of the effects whose values in a profile no camera has."""
+        """Names of the effects with physically impossible values in a profile."""
         return impossible(profile, self.period_s, self.exposure_s)
 
     def table(self, model: Model, max_points: int) -> TrackTable:
-        """The points, with the stamps that the model gives the frames."""
+        """The points, with the model's frame stamps."""
         observed = self.observed
         if model.lag:
             observed = replace(observed, stamp_s=observed.stamp_s + np.array(model.lag))
@@ -107,7 +108,7 @@ class Evidence:
         return fit_model(self.imu, model, terms, table if use is None else table.chosen(use[table.pair]))
 
     def distances(self, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
-        """Whitened distances (n,) of all points of a table from a fit that perhaps saw only some of them."""
+        """Whitened distances (n,) of all points of a table under a fit, which may have used only some of them."""
         return distances(self.imu, fitted, table, depth_spread_per_m)
 
 
@@ -124,25 +125,25 @@ def fit_model(
 
 
 def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
-    """Number the blocks of time."""
+    """Collect the pairs and number their time blocks."""
     part = min(len(observed.pairs) / FULL_LENGTH_PAIRS, 1.0)
     lengths = [max(round(part * length), 1) for length in BLOCK_LENGTHS]
     return Evidence(imu, observed, varied_blocks(np.arange(len(observed.pairs)), lengths))
 
 
 def relief_loss(fitted: TrackFit) -> float:
-    """Mean loss of a fit as a likelihood counts it, at its own spread of depths."""
+    """Mean loss of a fit as a likelihood, including the cost of its spread of depths."""
     return float((loss(fitted.distance, 1.0) + 2 / CAUCHY**2 * fitted.relief_cost()).mean())
 
 
 def capped_rms(distance: Array) -> float:
-    """Rms per coordinate of whitened distances, each counted up to CAP times their median scale."""
+    """Rms per coordinate of whitened distances, each capped at CAP times their median scale."""
     scale = max(float(np.median(distance)) / RAYLEIGH_MEDIAN, 1e-9)
     return float(np.sqrt(np.mean(np.minimum(distance, CAP * scale) ** 2) / 2))
 
 
 def base_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) -> Motion | None:
-    """What the profile lets the camera do: nothing beside turning (depth inf), or go before a plane."""
+    """The scene motion that the profile allows: None for pure rotation (depth inf), or translation before a plane."""
     depth_m = profile.depth_m
     if depth_m is not None and np.isinf(depth_m):
         return None
@@ -156,7 +157,7 @@ def base_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) ->
     tilt = TILT_STD / depth_m
     placed = replace(scene, plane_std_per_m=(tilt, tilt, KNOWN_DEPTH_STD / depth_m), plane_axes=axes)
     pulled_m, _ = depth_of(evidence.fit(Model(profile, placed, ()), (), table), table)
-    if abs(depth_m / pulled_m - 1) < MISPLACED * KNOWN_DEPTH_STD:
+    if abs(depth_m / pulled_m - 1) < MAX_DEPTH_PULL * KNOWN_DEPTH_STD:
         return placed
     return replace(placed, plane_std_per_m=(tilt, tilt, HELD_DEPTH_STD / depth_m))
 
@@ -170,7 +171,7 @@ def free_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) ->
 
 
 def depth_of(fitted: TrackFit, table: TrackTable) -> tuple[float, float]:
-    """Median over the frames of the distance along the optical axis at the picture's centre, and its deviation."""
+    """Median over the frames of the distance along the optical axis at the frame centre, and its standard deviation."""
     scene = fitted.scene
     assert isinstance(scene, InertialMotion)
     assert fitted.ground.displacement is not None

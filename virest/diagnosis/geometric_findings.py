@@ -1,4 +1,4 @@
-"""Causes that move points, as findings: values with their deviations, gains, and sentences."""
+"""Geometric causes as findings: values with standard deviations, gains, and sentences."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ def findings_of(verdict: GeometricVerdict) -> list[Finding]:
 
 
 def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
-    """Parameters of one cause, before and after; where the ladder has two ends, with how far those are apart.
+    """Parameters of one cause, before and after; if the ladder has a rival end, its difference widens the deviation.
 
-    Either end is as likely: the second moment about the value told grows by half the squared difference.
+    Both ends are equally likely, so the variance about the reported value grows by half the squared difference.
     """
     changes = _changes_at(verdict, entry)
     twin = next((e for e in verdict.rival.accepted if e.name == entry.name), None) if verdict.rival else None
     if verdict.rival is None or twin is None:
         return changes
-    there = _changes_at(verdict.rival, twin)
-    return {name: _apart(change, there[name]) for name, change in changes.items()}
+    at_rival = _changes_at(verdict.rival, twin)
+    return {name: _widened(change, at_rival[name]) for name, change in changes.items()}
 
 
-def _apart(change: ParameterChange, there: ParameterChange) -> ParameterChange:
+def _widened(change: ParameterChange, at_rival: ParameterChange) -> ParameterChange:
     if change.std is None or isinstance(change.estimate, str):
         return change
-    off = np.subtract(change.estimate, there.estimate) / np.sqrt(2)
-    return replace(change, std=np.hypot(change.std, off).tolist())
+    difference = np.subtract(change.estimate, at_rival.estimate) / np.sqrt(2)
+    return replace(change, std=np.hypot(change.std, difference).tolist())
 
 
 def _changes_at(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
@@ -74,7 +74,7 @@ def _sentence(entry: Accepted, changes: dict[str, ParameterChange]) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as people read it."""
+    """Format a value for readers."""
     if isinstance(value, list):
         return "(" + ", ".join(shown(v) for v in value) + ")"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,12 +1,12 @@
-"""Fields of blur: edges that are wider in some places or at some times than path, lens and an even defocus make them.
+"""Blur fields: edges wider in some image regions or at some times than blur path, lens and uniform defocus predict.
 
-Variances of blurs that follow each other add up, so what the widths of isolated edges leave over is regressed on an
-added variance along the distance from the principal point, time, and the logged focus distance, beside an even defocus,
-a longer path, and what contrast and brightness do to a measured width.  Over the radius r, third-order aberrations make
-spots in proportion to r (coma) and to r² (field curvature, astigmatism; Welford, Aberrations of Optical Systems, 1986,
-chapter 7), so the variance is a r² + b r⁴; over time and focus it is a straight line from knot to knot.  What lies in
-the scene is not the lens's: over the radius the pictures' cells err together and whole quarters are left out; over time
-each cell has its own width.
+Variances of successive blurs add up.  The residual widths of isolated edges are therefore regressed on an added
+variance over the distance from the principal point, time, and the logged focus distance.  Nuisances are a uniform
+defocus, a longer path, and the effect of contrast and brightness on a measured width.  Over the radius r, third-order
+aberrations make spots proportional to r (coma) and to r² (field curvature, astigmatism; Welford, Aberrations of Optical
+Systems, 1986, chapter 7), so the variance is a r² + b r⁴.  Over time and focus it is piecewise linear.  To separate
+scene and lens, errors over the radius are treated as correlated within image cells and whole quarters are held out;
+over time each cell has its own width.
 """
 
 from __future__ import annotations
@@ -39,17 +39,18 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 CELLS_ROUND, CELLS_OUT, CELLS = 12, 3, 5
-"""Cells that err together: sectors and rings about the middle; and squares each way, whose widths are compared."""
+"""Cells with correlated errors: sectors and rings about the centre.  CELLS: cells along each side, whose widths are
+compared over time."""
 RADIUS_KNOTS, FOCUS_KNOTS, TIME_STEP_S, LEAST_TIMES, MOST_TIMES = 9, 4, 0.2, 5, 24
 MIN_SIZE_PX = float(np.sqrt((LENS_SIGMA_PX + 3 * LENS_STD_PX) ** 2 - LENS_SIGMA_PX**2))
-"""Standard deviation (0.83 px) of the added Gaussian: edges are wider by three deviations of what coding makes of them.
+"""Standard deviation (0.83 px) of the added Gaussian, which widens edges by 3 σ of the width variation due to coding.
 On 41 simulated captures without such a blur the largest was 0.50 px."""
-LEAST_CHANGE, LEAST_SCALE_PX, CLEARLY = 0.05, 1e-6, 2.0
+LEAST_CHANGE, LEAST_SCALE_PX, BEATEN_T = 0.05, 1e-6, 2.0
 MIN_GAIN = 0.02
 CAP, BOUND, LEAST_WIDTH_PX = 10.0, 3.0, 0.2
-"""Deviations at which what is left is capped, and at which one edge counts no more; no edge is sharper than that."""
+"""Residual cap, in σ; influence bound of one edge, in σ; and minimum edge width."""
 ABERRATIONS = (4,), (2,), (2, 4)
-"""Powers of the radius that the variance of field curvature and astigmatism, of coma, and of all has."""
+"""Powers of the radius in the variance: field curvature and astigmatism; coma; all of them."""
 SENTENCES = {
     "radius": "pictures are softer by up to {size} px away from the principal point, {shape} of the distance",
     "time": "pictures are softer by up to {size} px at some times, {shape} of time: the focus moves",
@@ -72,19 +73,19 @@ class _Form:
     covariate: str
     knots: Array
     table: Array
-    """(knots, m) added variance there per number that is fitted."""
+    """(knots, m) added variance per fitted number."""
     weights: Array
     """(n, m) the same at each edge."""
     block: Index
-    """(n,) what errs together, rising in the order that parts are cut in."""
+    """(n,) group with correlated errors, numbered in the order in which parts are cut."""
     nuisance: Array
-    """(n, m) beside what all forms allow for."""
+    """(n, m) nuisances besides those common to all forms."""
     logged: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _AddedVariance:
-    """Widths as evidence of numbers, each of which adds its column's variance to every edge."""
+    """Edge widths as data for numbers that each add their column's variance."""
 
     width_px: Array
     even_px: Array
@@ -92,15 +93,15 @@ class _AddedVariance:
     """(n, k) px² per unit of each number."""
 
     def look(self, numbers: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
-        """Widths left over, and slopes, which are cheap enough to be always new."""
+        """Width residuals and their Jacobian, which is cheap enough to recompute every time."""
         width = np.sqrt(np.maximum(self.even_px**2 + self.columns @ numbers, LEAST_WIDTH_PX**2))
         left = self.width_px - width
         return Residuals(left, self.columns * (0.5 / width)[:, None], left)
 
     def weighed(self, numbers: Array, look: Residuals) -> System[Array, Residuals]:
-        """Deviations by what is left; a number that edges do not determine adds less blur than would be reported.
+        """Scale by the residuals; the prior keeps an undetermined number below the smallest reported blur.
 
-        Such are a knot without edges near it, and a cell's width beside an even defocus.
+        Undetermined are a knot without nearby edges, and a cell's width next to a uniform defocus.
         """
         scale = max(robust_std(look.left), LEAST_SCALE_PX)
         prior = (np.abs(self.columns).max(axis=0) / MIN_SIZE_PX**2) ** 2
@@ -114,19 +115,19 @@ class _AddedVariance:
 
 @dataclass(frozen=True, slots=True)
 class _Edges:
-    """Widths of edges, and what an even blur makes of them."""
+    """Edge widths, and their prediction under uniform blur."""
 
     width_px: Array
     """(n,) as measured."""
     even_px: Array
-    """(n,) by path, lens and an even defocus."""
+    """(n,) predicted from path, lens and uniform defocus."""
     common: Array
-    """(n, m) added variance per unit of what every form allows for."""
+    """(n, m) added variance per unit of the nuisances common to all forms."""
     scale_px: float
-    """Robust standard deviation of what that leaves."""
+    """Robust standard deviation of the residuals."""
 
     def fitted(self, form: _Form, rows: Index | None = None, free: bool = True) -> tuple[Array, Array, Array]:
-        """The form's numbers (m,), px², their covariance, and what is left of all edges (n,), px, by a fit to some.
+        """Fit to some edges: the form's numbers (m,), px², their covariance, and the residuals of all edges (n,), px.
 
         free: False keeps the form at 0.
         """
@@ -139,8 +140,8 @@ class _Edges:
         left = _AddedVariance(self.width_px, self.even_px, columns).look(found.state).left
         return found.state[:count], covariance, left
 
-    def missed(self, form: _Form, free: bool = True) -> Array:
-        """Capped squares (n,) of what a fit to other blocks leaves of each width, px²."""
+    def held_out_squares(self, form: _Form, free: bool = True) -> Array:
+        """Capped squared residual (n,) of each width after a fit to the other blocks, px²."""
         left = np.zeros(len(self.width_px))
         for fold in (0, 1):
             inside = np.flatnonzero(form.block % 2 == fold)
@@ -148,19 +149,19 @@ class _Edges:
         return np.asarray(np.minimum(np.abs(left), CAP * self.scale_px) ** 2)
 
     def simplest(self, forms: Sequence[_Form]) -> _Form:
-        """The first of forms that the best one does not clearly beat on blocks that neither saw."""
-        missed = [self.missed(form) for form in forms]
-        best = min(missed, key=lambda one: float(one.mean()))
+        """The first form that the best one does not beat by more than BEATEN_T standard errors on held-out blocks."""
+        held_out_squares = [self.held_out_squares(form) for form in forms]
+        best = min(held_out_squares, key=lambda one: float(one.mean()))
         block = np.unique(forms[0].block, return_inverse=True)[1]
-        more = [np.bincount(block, one - best) for one in missed]  # the best one's is 0
-        beaten = [one.sum() > CLEARLY * np.sqrt(np.sum((one - one.mean()) ** 2)) for one in more]
+        more = [np.bincount(block, one - best) for one in held_out_squares]  # the best one's is 0
+        beaten = [one.sum() > BEATEN_T * np.sqrt(np.sum((one - one.mean()) ** 2)) for one in more]
         return forms[beaten.index(False)]
 
 
 def blur_field(
     seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory, capture: Capture
 ) -> tuple[FieldFinding, CameraProfile] | None:
-    """The field of blur that edges ask for, and the profile with it; None where they ask for none."""
+    """The blur field that the edges support, and the profile with it; None where they support none."""
     widths = seen.edges
     if not seen.edges_determined or profile.intrinsics is None:
         return None
@@ -172,7 +173,7 @@ def blur_field(
     edges = _Edges(widths.width_px, even_px, common, scale)
     outwards = _outwards(seen, profile)
     forms = [*outwards, *_forms(seen, profile, capture)]
-    found = [(scored, form) for form in forms if (scored := _asked(edges, form, len(forms))) is not None]
+    found = [(scored, form) for form in forms if (scored := _significant_score(edges, form, len(forms))) is not None]
     if not found:
         return None
     scored, form = max(found, key=lambda pair: float(pair[0].gain.sum()))
@@ -182,22 +183,22 @@ def blur_field(
     above = form.table - sharpest
     sigma, covariance = np.sqrt(np.maximum(above @ numbers, 0.0)), above @ covariance @ above.T
     lowest = float((sharpest - form.weights.mean(axis=0)) @ numbers)
-    before, after = (float(np.sqrt(edges.missed(form, free).mean())) for free in (False, True))
+    before, after = (float(np.sqrt(edges.held_out_squares(form, free).mean())) for free in (False, True))
     held = HeldOutGain(BLUR, before, after, None)
     if sigma.max() < MIN_SIZE_PX or held.after > (1 - MIN_GAIN) * held.before:
         return None
-    coded = 2 * np.hypot(LENS_SIGMA_PX, sigma) * LENS_STD_PX * (sigma > 0)  # px², of what coding makes of a width
+    coded = 2 * np.hypot(LENS_SIGMA_PX, sigma) * LENS_STD_PX * (sigma > 0)  # px², width variation due to coding
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0) + coded**2) / (2 * np.maximum(sigma, MIN_SIZE_PX))
     stamp = capture.stamp_0_ns if form.covariate == "time" else None
     rows = [tuple((float(value),) for value in column) for column in (sigma, std)]
     field = Field("blur", (form.covariate,), (tuple(form.knots.tolist()),), rows[0], rows[1], stamp, form.logged)
-    others = {other.covariate for one, other in found if _alike(scored, one)} - {form.covariate}
+    others = {other.covariate for one, other in found if _indistinguishable(scored, one)} - {form.covariate}
     rivals = tuple(f"blur over {name}" for name in sorted(others))
-    return _said(field, held, scored.p_value, rivals), _with(profile, field, lowest)
+    return _finding(field, held, scored.p_value, rivals), _with_field(profile, field, lowest)
 
 
-def _asked(edges: _Edges, form: _Form, forms: int) -> Scored | None:
-    """How strongly edges ask for a form; None where chance or other blocks do not bear it out."""
+def _significant_score(edges: _Edges, form: _Form, forms: int) -> Scored | None:
+    """Score of a form on the edges; None where it is not significant on held-out blocks."""
     order = np.argsort(form.block, kind="stable")
     slope = 0.5 / edges.even_px / edges.scale_px
     left = (edges.width_px - edges.even_px) / edges.scale_px
@@ -212,13 +213,13 @@ def _asked(edges: _Edges, form: _Form, forms: int) -> Scored | None:
     if scored is None:
         return None
     if over_time:
-        scored = replace(scored, p_value=min(1.0, 2 * scored.p_value, 2 * forms * _outstanding(left, form.block)))
+        scored = replace(scored, p_value=min(1.0, 2 * scored.p_value, 2 * forms * _outlier_frame_p(left, form.block)))
     log.debug("blur over %s: p %.2g, t %.1f", form.covariate, scored.p_value, t_ratio(scored.gain))
     return scored if scored.significant else None
 
 
-def _outstanding(left: Array, block: Index) -> float:
-    """Probability of any frame standing out so far by chance: a few frames have too few signs for a test by flips."""
+def _outlier_frame_p(left: Array, block: Index) -> float:
+    """Probability that any frame is such an outlier by chance; a few frames have too few signs for the flip test."""
     bounded = np.clip(left, -BOUND, BOUND)
     count = np.maximum(np.bincount(block), 1)
     mean = np.bincount(block, bounded - np.median(bounded)) / np.sqrt(count)
@@ -227,12 +228,12 @@ def _outstanding(left: Array, block: Index) -> float:
     return min(1.0, 2 * len(count) * float(stats.t.sf(most, len(count) - 1)))
 
 
-def _alike(best: Scored, other: Scored) -> bool:
+def _indistinguishable(best: Scored, other: Scored) -> bool:
     return float(other.gain.sum()) > 0.9 * float(best.gain.sum())
 
 
 def _outwards(seen: BlurObservations, profile: CameraProfile) -> list[_Form]:
-    """Blur over the distance from the principal point, as each kind of aberration makes it, and as all do."""
+    """Blur over the distance from the principal point, for each kind of aberration and for all together."""
     edges, lens = seen.edges, profile.intrinsics
     assert lens is not None
     arm = edges.points_px - np.array([lens.cx_px, lens.cy_px])
@@ -269,8 +270,8 @@ def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> 
         yield _Form("focus", knots, np.eye(FOCUS_KNOTS), weights, frame, own, logged)
 
 
-def _with(profile: CameraProfile, field: Field, lowest: float) -> CameraProfile:
-    """The profile with the field; the even defocus is that of the sharpest frames or places then."""
+def _with_field(profile: CameraProfile, field: Field, lowest: float) -> CameraProfile:
+    """The profile with the field; its uniform defocus becomes that of the sharpest frames or image regions."""
     even = float(np.sqrt(max(profile.extensions.defocus_sigma_px**2 + lowest, 0.0)))
     even = even if profile.extensions.defocus_sigma_px else 0.0
     return replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=even)).with_fields(
@@ -278,15 +279,15 @@ def _with(profile: CameraProfile, field: Field, lowest: float) -> CameraProfile:
     )
 
 
-def _said(field: Field, held: HeldOutGain, p_value: float, rivals: tuple[str, ...]) -> FieldFinding:
-    """In words."""
+def _finding(field: Field, held: HeldOutGain, p_value: float, rivals: tuple[str, ...]) -> FieldFinding:
+    """The finding in words."""
     (name,), values = field.covariates, np.array(field.values)[:, 0]
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     shape = curve_shape(field.at(along)[:, 0], name)
-    place = int(np.argmax(values))
-    size = float(values[place])
+    largest = int(np.argmax(values))
+    size = float(values[largest])
     rms = f"edges {held.before:.3g} px → {held.after:.3g} px, held out"
     return FieldFinding(
         (name,), "blur", shape, f"{SENTENCES[name].format(size=f'{size:.2g}', shape=shape)} ({rms})", size, "px",
-        field.std[place][0], held, p_value, rivals, None, REASONS[name], NEXT[name], (field,),
+        field.std[largest][0], held, p_value, rivals, None, REASONS[name], NEXT[name], (field,),
     )  # fmt: skip

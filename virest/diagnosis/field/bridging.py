@@ -1,4 +1,4 @@
-"""What stretches of an untrusted log do to the points, and the rates there that the points tell instead."""
+"""Test the points in untrusted log intervals, and bridge those intervals with rates estimated from the points."""
 
 from __future__ import annotations
 
@@ -25,21 +25,19 @@ from virest.motion.scene_motion import InertialMotion
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LEAST_PAIRS_LEFT = 20
-"""Least number of frame pairs without a doubtful stretch that the ladder needs."""
+"""Minimum number of frame pairs without a doubtful interval that the ladder needs."""
 MAX_P = 1e-3
-"""One-sided, that points in doubtful stretches lie no further off than elsewhere."""
-LEFT_PART, LEFT_RATIO = 0.2, 1.5
-"""A bridge holds where at most this part of the excess is left, or points are off by at most this many times the
-noise."""
-
-
-MOST_DOUBT_PX = 0.5
-"""A bridge from which a blur path may be wrong by more than this part of a pixel is none: the frames are left alone."""
+"""One-sided p value of the hypothesis that residuals in doubtful intervals are no larger than elsewhere."""
+MAX_EXCESS_LEFT, MAX_RMS_RATIO = 0.2, 1.5
+"""Accept a bridge if less than MAX_EXCESS_LEFT of the excess squared residual remains, or if the residual rms is below
+MAX_RMS_RATIO times the noise."""
+MAX_BLUR_STD_PX = 0.5
+"""Reject a bridge whose rate uncertainty exceeds this in blur-path length; its frames are then not corrected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Doubtful:
-    """Pairs of frames with and without doubtful stretches of the log."""
+    """Doubtful log intervals and the frame pairs that they affect."""
 
     stretches: tuple[Stretch, ...]
     hit: Mask
@@ -47,12 +45,12 @@ class Doubtful:
 
     @property
     def sets_aside(self) -> bool:
-        """Whether the ladder can do without the pairs that are hit."""
+        """Whether enough unaffected pairs remain for the ladder."""
         return bool(self.hit.any() and (~self.hit).sum() >= LEAST_PAIRS_LEFT)
 
 
 def doubtful_pairs(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> Doubtful:
-    """Which pairs reach into stretches of the log that do not look like a gyroscope's."""
+    """Find the pairs that overlap log intervals which do not look like gyroscope data."""
     to_imu = (1 + profile.clock_skew, profile.time_offset_s or 0.0)
     found = doubtful_stretches(capture.imu)
     seen = [stretch for stretch in found if touching(observed, [stretch], to_imu).any()]
@@ -60,7 +58,7 @@ def doubtful_pairs(observed: ObservedTracks, capture: Capture, profile: CameraPr
 
 
 def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Doubtful, capture: Capture) -> None:
-    """Judge the pairs that were set aside, and add to a verdict what their points tell of the doubtful stretches."""
+    """Test the excluded pairs, and add to the verdict what their points show about the doubtful intervals."""
     evidence = make_evidence(capture.imu, observed)
     model = replace(found.model, terms=())
     table = evidence.table(model, FINAL_POINTS)
@@ -68,7 +66,7 @@ def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Do
     spread = found.fit.depth_spread_per_m
     before = distances(capture.imu, fit_model(capture.imu, model, (), table), table, spread)
     hit = doubtful.hit[table.pair]
-    p_value = _further_off(before, table, doubtful.hit)
+    p_value = _larger_residual_p(before, table, doubtful.hit)
     if p_value > MAX_P:
         found.notes.append(
             f"{len(doubtful.stretches)} stretches of the inertial log look {doubtful.stretches[0].kind}; "
@@ -109,9 +107,9 @@ def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Do
 
 
 def with_description(found: GeometricVerdict, evidence: Evidence, doubtful: Doubtful, capture: Capture) -> None:
-    """Describe stretches that are too many to be set aside; their frames cannot be judged without them."""
+    """Describe doubtful intervals that affect too many pairs to be excluded from the fits."""
     hit = doubtful.hit[found.table.pair]
-    p_value = _further_off(found.fit.distance, found.table, doubtful.hit) if not hit.all() else None
+    p_value = _larger_residual_p(found.fit.distance, found.table, doubtful.hit) if not hit.all() else None
     if p_value is not None and p_value > MAX_P:
         return
     untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
@@ -136,7 +134,7 @@ def _with_scene(evidence: Evidence, model: Model, table: TrackTable) -> Model:
 def _bridged(
     evidence: Evidence, model: Model, table: TrackTable, stretches: Sequence[Stretch], capture: Capture
 ) -> Model:
-    """The model with rates in the stretches that the points of a table ask for."""
+    """The model with rates in the intervals, fitted to the points of a table."""
     form = bridging_form(stretches, capture.stamp_0_ns, rate_walk(capture.imu))
     fitted = fit_model(evidence.imu, replace(model, scene=model.scene), (form.term,), table)
     return replace(model, profile=fitted.profile)
@@ -145,7 +143,7 @@ def _bridged(
 def _take_over(
     found: GeometricVerdict, observed: ObservedTracks, stretches: Sequence[Stretch], model: Model, capture: Capture
 ) -> list[Stretch]:
-    """Fit everything once more with the bridges in, to all pairs that can be trusted then; which bridges are sure."""
+    """Refit everything with the bridges to all pairs trusted then; return the intervals whose bridges are accurate."""
     evidence = make_evidence(capture.imu, observed)
     to_imu = (1 + model.profile.clock_skew, model.profile.time_offset_s or 0.0)
     table = evidence.table(model, FINAL_POINTS)
@@ -157,45 +155,45 @@ def _take_over(
     fitted = fit_model(capture.imu, whole, whole.terms, table)
     part = fitted.slices[form.name]
     deviations = form.filled(np.zeros(part.stop - part.start), fitted.covariance[part, part])
-    sure = [_blur_doubt_px(fitted.profile, field, evidence.exposure_s) < MOST_DOUBT_PX for field in deviations]
+    accurate = [_blur_std_px(fitted.profile, field, evidence.exposure_s) < MAX_BLUR_STD_PX for field in deviations]
     bridges = {field.knots: field for field in deviations}
-    unsure = {field.knots for field, holds in zip(deviations, sure, strict=True) if not holds}
+    inaccurate = {field.knots for field, holds in zip(deviations, accurate, strict=True) if not holds}
     held = [
         replace(field, std=bridges[field.knots].std) if field.knots in bridges else field
         for field in fitted.profile.fields
-        if field.knots not in unsure
+        if field.knots not in inaccurate
     ]
     found.model = replace(whole, profile=fitted.profile.with_fields(held), scene=fitted.scene)
     found.fit, found.table, found.evidence = fitted, table, evidence
     found.final_rms_px = capped_rms(fitted.distance) * evidence.typical_px
     found.noise_px = evidence.noise_px(fitted)
-    return [stretch for stretch, holds in zip(stretches, sure, strict=True) if holds]
+    return [stretch for stretch, holds in zip(stretches, accurate, strict=True) if holds]
 
 
-def _blur_doubt_px(profile: CameraProfile, bridge: Field, exposure_s: float) -> float:
-    """Standard deviation of the length of a blur path where a bridge is least sure, px."""
+def _blur_std_px(profile: CameraProfile, bridge: Field, exposure_s: float) -> float:
+    """Largest standard deviation of the blur-path length caused by a bridge, px."""
     lens = profile.intrinsics
     assert lens is not None
-    doubt_rad_s = float(np.linalg.norm(bridge.std, axis=1).max())
-    return doubt_rad_s * float(profile.shutter.true_exposure_s(exposure_s)) * lens.fx_px
+    std_rad_s = float(np.linalg.norm(bridge.std, axis=1).max())
+    return std_rad_s * float(profile.shutter.true_exposure_s(exposure_s)) * lens.fx_px
 
 
-def _holds(before: Array, after: Array, rest: float, there: Mask) -> bool:
-    """Whether points in a stretch are nearly where they should be once it is bridged."""
-    was, now = _rms(before[there]), _rms(after[there])
-    return bool(now < LEFT_RATIO * rest or now**2 - rest**2 < LEFT_PART * (was**2 - rest**2))
+def _holds(before: Array, after: Array, rest: float, inside: Mask) -> bool:
+    """Whether bridging removes most of the excess residual of the points in an interval."""
+    was, now = _rms(before[inside]), _rms(after[inside])
+    return bool(now < MAX_RMS_RATIO * rest or now**2 - rest**2 < MAX_EXCESS_LEFT * (was**2 - rest**2))
 
 
 def _rms(distance: Array) -> float:
     return float(np.sqrt(np.mean(distance**2) / 2)) if len(distance) else 0.0
 
 
-def _further_off(distance: Array, table: TrackTable, hit: Mask) -> float:
-    """Probability that pairs that are hit lie no further off than the others: a t test of their medians' logarithms.
+def _larger_residual_p(distance: Array, table: TrackTable, hit: Mask) -> float:
+    """p value of the affected pairs' residuals being no larger than the others': t test on log medians per pair.
 
-    A few pairs that lie far off among many that do not count by how far, which ranks would forget.
+    A rank test would ignore how far a few outlying pairs deviate.
     """
     numbers = np.unique(table.pair)
     medians = np.array([np.median(distance[table.pair == number]) for number in numbers])
-    there, size = hit[numbers], np.log(np.maximum(medians, np.finfo(float).tiny))
-    return float(stats.ttest_ind(size[there], size[~there], alternative="greater").pvalue)
+    inside, size = hit[numbers], np.log(np.maximum(medians, np.finfo(float).tiny))
+    return float(stats.ttest_ind(size[inside], size[~inside], alternative="greater").pvalue)

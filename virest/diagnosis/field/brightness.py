@@ -1,8 +1,8 @@
-"""A field of brightness: light that differs over the picture as no centred vignetting has it, the same in all frames.
+"""A brightness field: light that varies over the frame unlike centred vignetting, and is the same in all frames.
 
-What is left of the patches' grey is regressed on a smooth map of the log light, beside what curve, vignetting and a
-gain for each frame can do.  Each patch's own light is a nuisance, so only patches that cross the picture tell; where
-all move alike, an even slope is a gain of each frame, and stays nought.
+The grey residuals of the patches are regressed on a smooth map of the log light, with the curve, vignetting and a gain
+per frame as nuisances.  Each patch's own light is a nuisance too, so only patches that move across the frame are
+informative.  Where all patches move alike, a linear slope is indistinguishable from a gain per frame, and stays 0.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.linalg import null_space
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.diagnosis.field.screening import ALIKE_PART, MAX_P, MIN_T, Design, score_forms
+from virest.diagnosis.field.screening import MAX_P, MIN_T, RIVAL_GAIN_FRACTION, Design, score_forms
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
 from virest.inference.chance import t_ratio
@@ -27,20 +27,19 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 KNOTS, FINE_KNOTS = 4, 7
 FINER_LEFT = 0.98
-"""A finer map must leave less than this part of what the coarser one leaves on blocks that neither was fitted to."""
+"""A finer map must reduce the held-out residual of the coarser one below this fraction."""
 FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
 MOST_OBSERVATIONS = 15_000
 MIN_SIZE = 0.06
-"""Grey levels (rms): on 19 captures without such a field textured patches and the encoder left up to 0.06, with t
-ratios of at most 1.8."""
+"""Grey levels (rms).  On 19 captures without such a field, texture and encoder left up to 0.06, with t up to 1.8."""
 CAUCHY, CAP = 2.5, 5.0
-"""Noises at which a residual has half its weight, and beyond which it counts as that many."""
+"""Residual with half weight, and residual cap, in noise σ."""
 RIDGE = 1e-3
 CURVE_STEP = 0.02
 MOST_CYCLES = 0.5
-"""By which flicker may run through a capture's frames and still be taken for a shadow."""
-ALIKE = 0.9
-"""Part of the map's variance that a shape must explain to name it."""
+"""Flicker that drifts by less than this many cycles over all frames may be mistaken for a shadow."""
+MIN_EXPLAINED = 0.9
+"""Fraction of the map's variance that a shape must explain to name it."""
 REASONS = (
     "the lens shades off its centre, something stands before it or dirt lies on it, or the phone corrects its shading "
     "as the profile does not"
@@ -53,18 +52,18 @@ NEXT = (
 
 @dataclass(frozen=True, slots=True)
 class LightField:
-    """A map of the light, and how sure it is."""
+    """A map of the light, and its significance."""
 
     field: Field
     p_value: float
     held_out: HeldOutGain
 
     rivals: tuple[str, ...] = ()
-    """Named causes that the patches cannot tell from it."""
+    """Named causes that the patches cannot distinguish from it."""
 
     @property
     def finding(self) -> FieldFinding:
-        """In words."""
+        """The finding in words."""
         size, std = _size(self.field)
         shape = map_shape(self.field)
         rms = f"patches {self.held_out.before:.3g} → {self.held_out.after:.3g} grey levels, held out"
@@ -80,9 +79,9 @@ SLOPE, BAND, MAP = "growing to one side", "changing with the row alone", "a smoo
 
 
 def light_field(observations: PhotometricObservations, profile: CameraProfile, gains: bool = True) -> LightField | None:
-    """The map that the patches ask for beside the profile's light; None where they ask for none.
+    """The map that the patches support in addition to the profile's light; None where they support none.
 
-    gains: whether each frame may be brighter than the others as well.
+    gains: whether each frame may also have its own gain.
     """
     seen = _thinned(observations)
     block = np.unique(seen.frame // FRAMES_IN_BLOCK, return_inverse=True)[1]
@@ -118,7 +117,7 @@ def _fitted(
     """The map with this many knots along each side."""
     zero, basis = _form(profile, count)
     if not profile.extensions.vignetting_corner_loss:
-        # what a centred vignetting would say is no one else's then
+        # without vignetting in the profile, the map may contain its r² pattern
         basis, tangent = null_space(_middle(zero, profile)[None]), tangent[:, 1:]
     left, design = at.residual / seen.noise, -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
     columns = np.concatenate([design, tangent], axis=1)
@@ -133,20 +132,20 @@ def _fitted(
 def instead_of_cause(
     observations: PhotometricObservations, profile: CameraProfile
 ) -> tuple[str, Callable[[CameraProfile], CameraProfile], LightField | None]:
-    """The cause that a map does without, the profile without it, and the map; None for the map where none does."""
+    """The cause that a map may replace, the profile without it, and the map; None for the map if none replaces it."""
     if (found := instead_of_gain(observations, profile)) is not None:
         return "gain_drift", without_gain, found
     return "flicker", without_flicker, instead_of_flicker(observations, profile)
 
 
 def instead_of_flicker(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
-    """The map that explains the patches at least as well as the profile's flicker, where that stands still.
+    """The map that explains the patches at least as well as the profile's flicker, if the flicker is phase-locked.
 
-    A lamp that pulses a whole number of times from frame to frame looks like a shadow over the rows.  None where it
-    does not stand still, or explains more.
+    A light that flickers a whole number of cycles per frame looks like a fixed shadow over the rows.  None where the
+    phase drifts, or the flicker explains more.
     """
     seen = _thinned(observations)
-    if not _stands_still(seen, profile):
+    if not _is_phase_locked(seen, profile):
         return None
     found = light_field(observations, without_flicker(profile))
     if found is None or found.held_out.after > _left_by(seen, profile):
@@ -155,10 +154,10 @@ def instead_of_flicker(observations: PhotometricObservations, profile: CameraPro
 
 
 def instead_of_gain(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
-    """The map, the same in all frames, that explains what the profile's gain of each frame does; None where none does.
+    """The constant map that explains the same residuals as the profile's gain per frame; None where there is none.
 
-    Where all patches move alike, a slope of the light is a gain that follows where the camera looks: a few numbers,
-    the same at all times, that take away nearly as much as one for each frame does are the likelier reason.
+    Where all patches move alike, a slope of the light looks like a gain that follows the viewing direction.  If a few
+    constant numbers remove nearly as much as one gain per frame, they are the likelier reason.
     """
     if not profile.extensions.gain:
         return None
@@ -167,33 +166,33 @@ def instead_of_gain(observations: PhotometricObservations, profile: CameraProfil
         return None
     before = found.held_out.before**2
     by_gain = before - _left_by(_thinned(observations), profile) ** 2
-    if before - found.held_out.after**2 < ALIKE_PART * by_gain:
+    if before - found.held_out.after**2 < RIVAL_GAIN_FRACTION * by_gain:
         return None
     return replace(found, rivals=("gain_drift",))
 
 
 def without_flicker(profile: CameraProfile) -> CameraProfile:
-    """The profile under light that does not pulse."""
+    """The profile without flicker."""
     return replace(profile, extensions=replace(profile.extensions, flicker_amplitude=0.0))
 
 
 def without_gain(profile: CameraProfile) -> CameraProfile:
-    """The profile with all frames alike."""
+    """The profile without a gain per frame."""
     return replace(profile, extensions=replace(profile.extensions, gain=()))
 
 
-def _stands_still(seen: PhotometricObservations, profile: CameraProfile) -> bool:
-    """Whether flicker keeps its phase from frame to frame within half a cycle over all frames."""
+def _is_phase_locked(seen: PhotometricObservations, profile: CameraProfile) -> bool:
+    """Whether the flicker phase drifts by less than half a cycle over all frames."""
     if not profile.extensions.flicker_amplitude or len(seen) < 2:
         return False
     frames, first = np.unique(seen.frame, return_index=True)
-    turned = profile.extensions.flicker_frequency_hz * (seen.stamp_s[first] - seen.stamp_s[first[0]])
-    per_frame = turned[-1] / max(int(frames[-1] - frames[0]), 1)
-    return bool(np.ptp(turned - np.round(per_frame) * (frames - frames[0])) < MOST_CYCLES)
+    cycles = profile.extensions.flicker_frequency_hz * (seen.stamp_s[first] - seen.stamp_s[first[0]])
+    per_frame = cycles[-1] / max(int(frames[-1] - frames[0]), 1)
+    return bool(np.ptp(cycles - np.round(per_frame) * (frames - frames[0])) < MOST_CYCLES)
 
 
 def _left_by(seen: PhotometricObservations, profile: CameraProfile) -> float:
-    """Capped rms of what a profile leaves of the patches beside the nuisances, grey levels."""
+    """Capped residual rms of the patches under a profile, nuisances removed, grey levels."""
     at = predict(seen, profile)
     left, tangent = at.residual / seen.noise, _tangent(seen, profile, at) / seen.noise[:, None]
     scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
@@ -217,7 +216,7 @@ def _thinned(observations: PhotometricObservations) -> PhotometricObservations:
 
 
 def _form(profile: CameraProfile, count: int = KNOTS) -> tuple[Field, Array]:
-    """A map of nought, and its free numbers: nought in the middle (each patch's own light), no vignetting in it."""
+    """A zero map, and the basis of its free numbers: 0 at the centre (each patch's own light), without vignetting."""
     knots = tuple(tuple(np.linspace(0.0, side - 1, count).tolist()) for side in (profile.width, profile.height))
     x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
     radius2 = (x - 0.5 * (profile.width - 1)) ** 2 + (y - 0.5 * (profile.height - 1)) ** 2
@@ -226,7 +225,7 @@ def _form(profile: CameraProfile, count: int = KNOTS) -> tuple[Field, Array]:
 
 
 def _middle(field: Field, profile: CameraProfile) -> Array:
-    """(knots,) weights of the value in the picture's middle."""
+    """(knots,) interpolation weights at the centre of the frame."""
     middle = (0.5 * (profile.width - 1), 0.5 * (profile.height - 1))
     return np.outer(*(cardinal_weights(k, m) for k, m in zip(field.knots, middle, strict=True))).ravel()
 
@@ -238,7 +237,7 @@ def _weights(field: Field, seen: PhotometricObservations) -> Array:
 
 
 def _tangent(seen: PhotometricObservations, profile: CameraProfile, at: Prediction, gains: bool = True) -> Array:
-    """What vignetting, a gain for each frame and the curve can do (n, m), grey levels."""
+    """Effects of vignetting, a gain per frame and the curve (n, m), grey levels."""
     frames = (seen.frame[:, None] == seen.frames[None, : len(seen.frames) * gains]).astype(float)
     factors = -at.respond(np.concatenate([(seen.radius**2)[:, None], frames], axis=1))
     curve = profile.response or ResponseCurve("srgb")
@@ -251,7 +250,7 @@ def _tangent(seen: PhotometricObservations, profile: CameraProfile, at: Predicti
 
 
 def _solved(columns: Array, left: Array, weight: Array, block: Index, count: int) -> tuple[Array, Array]:
-    """The first ``count`` numbers of a ridge regression, and their covariance with blocks as what errs together."""
+    """The first ``count`` numbers of a ridge regression, and their covariance with errors clustered by block."""
     weighted = columns * weight[:, None]
     normal = weighted.T @ columns
     inverse = np.linalg.inv(normal + RIDGE * np.diag(np.maximum(np.diag(normal), 1e-9)))
@@ -266,7 +265,7 @@ def _solved(columns: Array, left: Array, weight: Array, block: Index, count: int
 def _held_out(
     columns: Array, count: int, left: Array, weight: Array, block: Index, seen: PhotometricObservations
 ) -> HeldOutGain:
-    """Fitted on every other block, judged on those between, both ways; the nuisances fitted to all in both."""
+    """Fit on every other block, judge on the rest, both ways; nuisances are refitted on the judged blocks."""
     others = columns[:, count:]
     before, after = np.zeros(len(left)), np.zeros(len(left))
     for fold in (0, 1):
@@ -279,7 +278,7 @@ def _held_out(
 
 
 def _without(columns: Array, left: Array, weight: Array, block: Index) -> Array:
-    """What a regression on nuisances leaves."""
+    """Residuals of a regression on nuisances."""
     return left - columns @ _solved(columns, left, weight, block, columns.shape[1])[0]
 
 
@@ -288,14 +287,14 @@ def _capped_rms(left: Array) -> float:
 
 
 def _size(field: Field) -> tuple[float, float]:
-    """Largest value of the map, and the deviation there."""
+    """Largest absolute value of the map, and its standard deviation."""
     values = np.abs(np.array(field.values)[:, 0])
     place = int(np.argmax(values))
     return float(values[place]), float(field.std[place][0])
 
 
 def map_shape(field: Field) -> str:
-    """What a map of numbers does over the picture."""
+    """Name the shape of a map over the frame."""
     x, y = np.meshgrid(*(np.linspace(k[0], k[-1], 21) for k in field.knots), indexing="ij")
     values = field.at(x, y)[..., 0]
     values = values - values.mean()
@@ -304,7 +303,7 @@ def map_shape(field: Field) -> str:
         return "nothing"
     plane = np.stack([np.ones(x.size), x.ravel() / np.ptp(x), y.ravel() / np.ptp(y)], axis=-1)
     left = values.ravel() - plane @ np.linalg.lstsq(plane, values.ravel(), rcond=None)[0]
-    if float((left**2).sum()) < (1 - ALIKE) * total:
+    if float((left**2).sum()) < (1 - MIN_EXPLAINED) * total:
         return SLOPE
     rows = values - values.mean(axis=0, keepdims=True)
-    return BAND if float((rows**2).sum()) < (1 - ALIKE) * total else MAP
+    return BAND if float((rows**2).sum()) < (1 - MIN_EXPLAINED) * total else MAP

@@ -1,4 +1,4 @@
-"""What forms of fields and named causes do to tracked points: difference quotients through the one model of points."""
+"""Effects of field forms and named causes on tracked points: difference quotients of the point model."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ NAMED = (
     terms_of.K1,
     terms_of.PRINCIPAL_POINT,
 )
-"""Named causes that move points; an exposure's length and a stabiliser are added where they can be told."""
+"""Named causes that move points; exposure time and stabiliser are added where they are identifiable."""
 
 
 @dataclass(frozen=True, slots=True)
 class Whitening:
-    """How differences of points in px become differences in standard deviations."""
+    """Conversion of point differences from px to standard deviations."""
 
     noise_px: Array
     """(n,)."""
     way: Array | None
     """(n, 2) unit vectors along the parallax; None: no relief is allowed for."""
     shrink: Array | None
-    """(n,) part taken away along it."""
+    """(n,) fraction removed along it."""
 
     def of(self, px: Array) -> Array:
         """Whitened (n, 2, k) of (n, 2, k)."""
@@ -57,7 +57,7 @@ class Whitening:
 
 @dataclass(frozen=True, slots=True)
 class PointResiduals:
-    """What a fit leaves of its points, ready for a regression."""
+    """Point residuals of a fit, ready for a regression."""
 
     imu: ImuSamples
     fit: TrackFit
@@ -75,7 +75,7 @@ class PointResiduals:
         return self.whitening.of(np.concatenate(slopes, axis=-1))
 
     def moved_by(self, profile: CameraProfile) -> Array:
-        """By how much another profile moves the points (n, 2), px."""
+        """Displacement (n, 2) of the predicted points under another profile, px."""
         moved = with_profile(self.fit.ground, self.imu, profile)
         ahead = predict(moved, self.table, self.fit.scene, like=self.prediction)
         return ahead.second_px - self.prediction.second_px
@@ -90,7 +90,7 @@ class PointResiduals:
         return np.concatenate(parts, axis=-1)
 
     def _stabiliser(self, cutoff_hz: float) -> Array:
-        """Of a stabiliser that would come on top; at its own cutoff where there is one already."""
+        """Effect of an additional stabiliser; at the profile's own cutoff where it has one already."""
         profile = self.fit.profile
         if profile.extensions.stabilisation_fraction:
             return self.effect((terms_of.STABILISATION,))
@@ -99,7 +99,7 @@ class PointResiduals:
 
 
 def point_residuals(imu: ImuSamples, fit: TrackFit, table: TrackTable) -> PointResiduals:
-    """The residuals of a fit; what lies along the parallax counts as far as the spread of depths lets it."""
+    """The residuals of a fit, down-weighted along the parallax according to the spread of depths."""
     directed = isinstance(fit.scene, DirectedMotion)
     at = predict(fit.ground, table, fit.scene, slopes=fit.scene is not None and not directed)
     way = shrink = None

@@ -1,8 +1,8 @@
-"""Forms that are asked for: which covariates, which knots, and which values are left to the named causes.
+"""The field forms that are tested: their covariates, their knots, and the values that are left to the named causes.
 
-What a named cause says already is kept out by conditions on the values: a delay over rows is nought at the first and
-last row (offset and readout time), a displacement has neither value, scale nor turn at the principal point, and no
-cubic part (principal point, focal length, k1), a rate is nought and flat at rest (bias and scale).
+Constraints on the values exclude what a named cause already models.  A delay over rows is 0 at the first and last row
+(offset and readout time).  A displacement has no value, scale or rotation at the principal point and no cubic part
+(principal point, focal length, k1).  A rate is 0 and flat at rest (bias and scale).
 """
 
 from __future__ import annotations
@@ -26,28 +26,29 @@ FINE_ROW_KNOTS, FINE_PLACE_KNOTS, FINE_RATE_KNOTS = 21, 7, 13
 MOST_KNOTS, MOST_PLACE_KNOTS, MOST_RATE_KNOTS = 41, 10, 25
 PAIR_ROW_KNOTS, PAIR_RADIUS_KNOTS = 3, 3
 LEAST_TIMES, TIME_STEPS = 4, ((0.4, 12), (0.1, MOST_KNOTS))
-"""Seconds between knots over time and the most knots; three frames, for a focus hunts to and fro in half a second."""
-OFTEN = 0.97
-"""Fine knots over a rate reach as far as this part of the readings: beyond, few rows tell a value."""
-NEAR_REST = 3.0
-"""Fine knots over a rate lie by sinh: a twentieth of the reach apart at rest, where a hand is most of the time."""
+"""(knot spacing in s, maximum number of knots) over time, coarse and fine.  0.1 s is 3 frames; a hunting focus has a
+period of 0.5 s."""
+FINE_RATE_QUANTILE = 0.97
+"""Fine knots over a rate cover this quantile of the readings; too few rows lie beyond."""
+SINH_SPACING = 3.0
+"""Fine knots over a rate are spaced by sinh: 1/20 of the range apart near rest, where a hand is most of the time."""
 FRAMES_PER_STEP, MOST_STEPS = 2, 100
-"""How densely in time a sudden change is looked for."""
+"""Frames between the instants at which a sudden change is searched for, and the maximum number of instants."""
 LEAST_REACH_RAD_S = 0.1
 LEAST_FOCUS_CHANGE = 0.05
-"""In dioptres: less moves no lens by a pixel."""
+"""Dioptres; a smaller focus change shifts no point by 1 px."""
 READOUTS = frozenset({"readout_time", f"delay{OVER}row"})
 LENSES = frozenset({"radial_distortion", f"displacement{OVER}x, y"})
 GYROS = frozenset({"gyro_scale", f"rate{OVER}rate"})
-"""Terms that say what of a pair does not change."""
+"""Terms that already model the constant part of a pair."""
 
 
 def possible_forms(
     capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
 ) -> list[FieldForm]:
-    """All forms that a capture's log allows; span_s: first and last time at which points were seen, IMU clock.
+    """All forms that a capture's log allows; span_s: first and last time with observed points, IMU clock.
 
-    known: causes that are in the model and say what the forms need not.
+    known: causes in the model; the forms leave their effect to them.
     """
     knots, fine = (_times(span_s, step_s, most) for step_s, most in TIME_STEPS)
     stamp = capture.stamp_0_ns
@@ -57,7 +58,7 @@ def possible_forms(
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
     places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
     forms = [*places, *drifts]
-    forms += step_forms(capture, coarse_steps_s(span_s, capture))
+    forms += step_forms(capture, _candidate_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms += [_row_form(count) for count in (ROW_KNOTS, FINE_ROW_KNOTS)]
     if (focus := _focus_form(capture)) is not None:
@@ -71,10 +72,10 @@ def possible_forms(
 def forms_of_pairs(
     capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
 ) -> list[FieldForm]:
-    """What two covariates do together: tensor products of curves along each.
+    """Interactions of two covariates: tensor products of a curve along each.
 
-    At the first row, at the principal point and at rest they are nought: what is there belongs to time or focus alone.
-    What does not change over time or focus is theirs, unless a cause or a field in the model (known) says it.
+    They are 0 at the first row, at the principal point and at rest, where the effect depends on time or focus alone.
+    They include the part constant over time or focus, unless a cause or a field in the model (known) models it.
     """
     times = _rounded(_times(span_s, *TIME_STEPS[0]))
     stamp, mean = capture.stamp_0_ns, np.ones((1, len(times)))
@@ -102,10 +103,10 @@ def forms_of_pairs(
 def _product(
     fields: tuple[Field, ...], first: list[Array], mean: Array, steady: frozenset[str], known: frozenset[str]
 ) -> FieldForm:
-    """first: what is free along the first covariate of each field; steady: terms that say what does not change.
+    """first: basis along the first covariate of each field; steady: terms that model the constant part.
 
-    Where one of those is known, the mean (1, knots) over the second covariate is nought.  Of three fields of a rate
-    each moves its own axis.
+    If one of these terms is known, the mean (1, knots) over the second covariate is 0.  Each of the 3 rate fields acts
+    on its own axis.
     """
     changing = null_space(mean) if known & steady else np.eye(mean.shape[1])
     more = 2 * mean.shape[1] - 1
@@ -120,7 +121,7 @@ def _product(
 
 
 def _with_times(field: Field, count: int) -> Field:
-    """The same over this many instants, nought everywhere."""
+    """The same field with this many knots over time and value 0 everywhere."""
     first, times = field.knots
     return _zero(
         field.kind, field.covariates, [np.array(first), np.linspace(times[0], times[-1], count)], field.stamp_0_ns
@@ -128,7 +129,7 @@ def _with_times(field: Field, count: int) -> Field:
 
 
 def _reaches(imu: ImuSamples, profile: CameraProfile, part: float = 1.0) -> list[float]:
-    """Rate (three axes) that this part of the readings stays below, less bias and over scale."""
+    """Quantile ``part`` of the absolute rate on the 3 axes, after bias and scale correction, rad/s."""
     reading = (imu.gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
     return [max(float(most), LEAST_REACH_RAD_S) for most in np.quantile(np.abs(reading), part, axis=0)]
 
@@ -156,7 +157,7 @@ def _row_form(count: int) -> FieldForm:
 
 
 def _place_form(profile: CameraProfile, count: int) -> FieldForm:
-    """Nought at the principal point, with neither scale nor turn there, and orthogonal to a cubic radial part."""
+    """0 at the principal point, without scale or rotation there, and orthogonal to a cubic radial part."""
     lens = profile.intrinsics
     assert lens is not None
     knots = [np.linspace(0, side - 1, count) for side in (profile.width, profile.height)]
@@ -182,9 +183,9 @@ def _place_form(profile: CameraProfile, count: int) -> FieldForm:
 
 
 def _off_centre_form(profile: CameraProfile) -> FieldForm:
-    """A lens that is not centred, in its two numbers: weaker ones show in these than in a map of many.
+    """A decentred lens in 2 numbers, which detect a weaker effect than a map with many.
 
-    Tangential distortion (Brown 1966) about the principal point; cubic splines say squares exactly.
+    Tangential distortion (Brown 1966) about the principal point; cubic splines represent squares exactly.
     """
     lens = profile.intrinsics
     assert lens is not None
@@ -205,9 +206,9 @@ def _off_centre_form(profile: CameraProfile) -> FieldForm:
 def _drift_form(
     kind: str, knots: Array, stamp_0_ns: int | None, known: frozenset[str], local: bool = False
 ) -> FieldForm:
-    """Over time: a focal length from where it begins, rates about their mean (bias), a delay.
+    """Over time: a focal length relative to its start, rates about their mean (bias), or a delay.
 
-    Where an offset or a skew of the clocks is in the model the delay has no mean or slope.
+    If a clock offset or skew is in the model, the delay has no mean or slope, respectively.
     """
     count, field = len(knots), _zero(kind, (TIME,), [knots], stamp_0_ns)
 
@@ -229,20 +230,20 @@ def _drift_form(
 
 
 def step_forms(capture: Capture, at_s: Array) -> list[FieldForm]:
-    """A focal length that is another from one instant on, for each of some instants (n,)."""
+    """A sudden change of the focal length, one form for each instant (n,)."""
     edges = [np.array([t - STEP_EDGE_S / 2, t + STEP_EDGE_S / 2]) for t in at_s]
     fields = [_zero("scale", (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
     return [FieldForm((f,), np.array([[0.0], [1.0]]), float(t)) for f, t in zip(fields, at_s, strict=True)]
 
 
-def coarse_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
-    """Instants at which a sudden change is looked for."""
+def _candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
+    """Instants at which a sudden change is searched for."""
     frames = sum(span_s[0] <= frame.time_s <= span_s[1] for frame in capture.frames)
     return np.linspace(*span_s, min(frames // FRAMES_PER_STEP, MOST_STEPS) + 2)[1:-1]
 
 
 def _focus_form(capture: Capture) -> FieldForm | None:
-    """Over the logged focus distance, from where the capture begins."""
+    """Over the logged focus distance, relative to the start of the capture."""
     log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
     values = np.array([value for _, value in log])
     if len(log) < 0.5 * len(capture.frames) or np.ptp(values) < LEAST_FOCUS_CHANGE:
@@ -254,7 +255,7 @@ def _focus_form(capture: Capture) -> FieldForm | None:
 
 
 def _rate_form(imu: ImuSamples, profile: CameraProfile) -> FieldForm:
-    """Each axis over its own reading: nought and flat at rest."""
+    """Each axis over its own reading: 0 and flat at rest."""
 
     def conditions(knots: tuple[float, ...], reading: Array) -> Array:
         least = 0.01 * knots[-1]
@@ -267,9 +268,9 @@ def _rate_form(imu: ImuSamples, profile: CameraProfile) -> FieldForm:
 def _fine_rate_form(
     imu: ImuSamples, profile: CameraProfile, known: frozenset[str], count: int = FINE_RATE_KNOTS
 ) -> FieldForm:
-    """The same with more knots near rest, where a gyroscope may stick: flat nowhere.
+    """The same with more knots near rest, where a gyroscope may stick, and without the flatness constraint.
 
-    Where a scale is in the model, a value in proportion to the log's readings is left to it.
+    If a gyroscope scale is in the model, the part proportional to the readings is left to it.
     """
 
     def conditions(knots: tuple[float, ...], reading: Array) -> Array:
@@ -280,9 +281,9 @@ def _fine_rate_form(
     def again(count: int) -> Recipe:
         return lambda _profile, now: _fine_rate_form(imu, profile, now, count)
 
-    steps = np.sinh(NEAR_REST * np.linspace(-1.0, 1.0, count)) / np.sinh(NEAR_REST)
+    steps = np.sinh(SINH_SPACING * np.linspace(-1.0, 1.0, count)) / np.sinh(SINH_SPACING)
     more = 2 * count - 1
-    made = _over_rates(imu, profile, steps, conditions, OFTEN)
+    made = _over_rates(imu, profile, steps, conditions, FINE_RATE_QUANTILE)
     return replace(made, build=again(count), refine=again(more) if more <= MOST_RATE_KNOTS else None)
 
 
@@ -290,9 +291,9 @@ def _over_rates(
     imu: ImuSamples, profile: CameraProfile, steps: Array, conditions: Callable[[tuple[float, ...], Array], Array],
     part: float = 1.0,
 ) -> FieldForm:  # fmt: skip
-    """Each axis over its own reading; steps: knots as parts of how far a part of the readings reaches.
+    """Each axis over its own reading; steps: knots as fractions of the quantile ``part`` of the readings.
 
-    conditions: rows on the values there.
+    conditions: rows of linear constraints on the knot values.
     """
     fields, bases = [], []
     for axis, (name, reach) in enumerate(zip(RATES, _reaches(imu, profile, part), strict=True)):
@@ -306,7 +307,7 @@ def _over_rates(
 
 
 def _force_form() -> FieldForm:
-    """Rates in proportion to the specific force: three by three numbers, by the value at FORCE_REACH_M_S2."""
+    """Rates proportional to the specific force: 3 × 3 numbers, as values at FORCE_REACH_M_S2."""
     fields = tuple(_zero("rate", (name,), [np.array([-FORCE_REACH_M_S2, FORCE_REACH_M_S2])]) for name in FORCES)
     odd = np.array([[-1.0], [1.0]]) / np.sqrt(2)
     return FieldForm(fields, block_diag(*[np.kron(odd, np.eye(3))] * 3))

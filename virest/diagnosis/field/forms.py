@@ -1,4 +1,4 @@
-"""A form of a field: a vector of free numbers, in which its values at the knots are linear, as a term of a fit."""
+"""A field form: knot values that are linear in a vector of free numbers, usable as a term of a fit."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from virest.inference.track_fit import Term
 Array = NDArray[np.float64]
 Moved = Callable[[CameraProfile], Array]
 Recipe = Callable[[CameraProfile, frozenset[str]], "FieldForm"]
-"""Of a profile, and of the names of the terms that are in the model."""
+"""Builds a form from a profile and the names of the terms in the model."""
 SENSORS = {**dict.fromkeys(RATES, "rate"), **dict.fromkeys(FORCES, "acceleration")}
-"""What the axes of a sensor are called together."""
+"""Common name of the axes of a sensor."""
 STEP_EDGE_S = 1e-3
 """Width of a sudden change."""
 FORCE_REACH_M_S2 = 20.0
-"""Two g: what a phone in a hand stays below."""
+"""About 2 g: a hand-held phone stays below this."""
 STD = {"delay": 0.01, "displacement": 30.0, "scale": 0.2, "rate": 1.0}
-"""Prior of a free number: ten times what a phone would show.  It only holds numbers that nothing tells."""
+"""Prior σ of a free number, 10 times the usual size in phones: it only regularises undetermined numbers."""
 QUOTIENT = {"delay": 1e-4, "displacement": 0.1, "scale": 1e-4, "rate": 2e-3}
 """Step of the difference quotients, in the unit of the values."""
 TIME, OVER = "time", " over "
@@ -35,26 +35,26 @@ class FieldForm:
     """One or several fields that are fitted together."""
 
     fields: tuple[Field, ...]
-    """With the value nought everywhere."""
+    """With value 0 everywhere."""
     basis: Array
     """(values of all fields, numbers): values at the knots per free number; columns are orthonormal."""
     step_s: float | None = None
     """Time of a sudden change; None: the form is smooth."""
     local: bool = False
-    """Whether its knots lie as close in time as blocks: frames say nothing of others."""
+    """Whether its knots are as dense in time as blocks, so that frames cannot predict others."""
     build: Recipe | None = None
-    """Makes the form for another profile and other terms in the model; None: it depends on neither."""
+    """Builds the form for another profile and other terms in the model; None: it depends on neither."""
     refine: Recipe | None = None
-    """Makes the same with more knots; None: that has as many as it may have."""
+    """Builds the same with more knots; None: the maximum is reached."""
 
     @property
     def kind(self) -> str:
-        """As of its fields."""
+        """Kind of its fields."""
         return self.fields[0].kind
 
     @property
     def name(self) -> str:
-        """What it is called: kind and covariates, and where it changes suddenly."""
+        """Kind, covariates and, if sudden, the instant."""
         sudden = "" if self.step_s is None else f", a step at {self.step_s:.2f} s"
         return self.family + sudden
 
@@ -65,26 +65,26 @@ class FieldForm:
 
     @property
     def covariates(self) -> tuple[str, ...]:
-        """Of its fields; the three axes of a sensor under one name."""
+        """Covariates of its fields; the 3 axes of a sensor share one name."""
         return tuple(dict.fromkeys(SENSORS.get(name, name) for name in self.fields[0].covariates))
 
     @property
     def over_time(self) -> bool:
-        """Whether it is one value a frame, known only where it was fitted."""
+        """Whether it has one value per frame, known only where it was fitted."""
         return bool(set(self.covariates) & {TIME, "focus"})
 
     def is_dense(self, step_s: float) -> bool:
-        """Whether knots over time lie closer than this: what frames say of others between them is little."""
+        """Whether its knots over time are closer than this, so that frames hardly predict those between them."""
         knots = self.fields[0].knots[-1]
         return TIME in self.covariates and self.step_s is None and (knots[-1] - knots[0]) / (len(knots) - 1) < step_s
 
     @property
     def is_pair(self) -> bool:
-        """Whether it is what two covariates do together beyond what each does."""
+        """Whether it is the interaction of two covariates beyond the effect of per_value."""
         return self.fields[0].is_pair
 
     def values(self, numbers: Array) -> list[Array]:
-        """Values (knots, components) of each field."""
+        """Values (knots, components) of per_value field."""
         flat = self.basis @ numbers
         ends = np.cumsum([np.size(field.values) for field in self.fields])
         return [
@@ -104,7 +104,7 @@ class FieldForm:
         )
 
     def change(self, profile: CameraProfile, numbers: Array) -> CameraProfile:
-        """The profile with these numbers added to what its fields say."""
+        """The profile with these numbers added to its fields."""
         held = list(profile.fields)
         for field, values in zip(self.fields, self.values(numbers), strict=True):
             place = next((k for k, known in enumerate(held) if _adds_to(field, known)), None)
@@ -117,15 +117,15 @@ class FieldForm:
 
     @staticmethod
     def held_in(profile: CameraProfile, field: Field) -> Field:
-        """What a profile holds in a field's place; the field itself where that is nothing."""
+        """The profile's counterpart of a field; the field itself where there is none."""
         return next((known for known in profile.fields if _adds_to(field, known)), field)
 
     def finer(self, profile: CameraProfile, known: frozenset[str]) -> FieldForm | None:
-        """The same with about twice the knots, or half as many more each way; None where there is no such form."""
+        """The same with about twice the knots, or PLACE_KNOTS − 1 more along per_value side; None at the maximum."""
         return None if self.refine is None else self.refine(profile, known)
 
     def about(self, profile: CameraProfile, known: frozenset[str]) -> FieldForm:
-        """The same kept apart from another profile's lens, and from other terms of a model."""
+        """The same form built for another profile's lens and other terms in the model."""
         if self.build is None:
             return self
         made = self.build(profile, known)
@@ -141,25 +141,25 @@ class FieldForm:
         return Term(self.name, self.change, (step,) * count, (std,) * count, (std,) * count, slopes)
 
     def _displaced(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> Array:
-        """Slopes (n, 2, k) of a displacement u: u(p₂) − J u(p₁), and what shifts both points alike tells J."""
+        """Slopes (n, 2, k) of a displacement u: u(p₂) − J u(p₁); J follows from shifting both points equally."""
         held = self.held_in(profile, self.fields[0])
         shifts = np.eye(2) * QUOTIENT[self.kind]
         others = [f for f in profile.fields if f.kind != self.kind]
         both = [profile.with_fields([*others, held.with_values(np.array(held.values) + shift)]) for shift in shifts]
         jacobian = np.eye(2) - np.stack([moved_by(shifted) for shifted in both], axis=-1) / QUOTIENT[self.kind]
         before, after = (_weights(self.fields[0], held.undisplaced(p)) for p in (table.first_px, table.second_px))
-        each = np.einsum("nk,ij->nikj", after, np.eye(2)) - np.einsum("nk,nij->nikj", before, jacobian)
-        return np.asarray(each.reshape(len(before), 2, -1) @ self.basis)
+        per_value = np.einsum("nk,ij->nikj", after, np.eye(2)) - np.einsum("nk,nij->nikj", before, jacobian)
+        return np.asarray(per_value.reshape(len(before), 2, -1) @ self.basis)
 
 
 def _weights(field: Field, points_px: Array) -> Array:
-    """What each knot's value counts (n, knots) at pixels (n, 2)."""
+    """Interpolation weights (n, knots) of the knot values at pixels (n, 2)."""
     across, down = (cardinal_weights(k, c) for k, c in zip(field.knots, points_px.T, strict=True))
     return np.asarray(across[:, :, None] * down[:, None, :]).reshape(len(points_px), -1)
 
 
 def _adds_to(field: Field, known: Field) -> bool:
-    """Whether two fields are one, or only one of their kind may be held."""
+    """Whether two fields are the same, or a profile can hold only one of their kind."""
     alike = (known.kind, known.covariates) == (field.kind, field.covariates)
     return alike and (field.is_single or known.knots == field.knots)
 

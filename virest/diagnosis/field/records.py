@@ -1,4 +1,4 @@
-"""What a search for fields hands on."""
+"""Results of the search for fields."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class FittedField:
 
     form: FieldForm
     rivals: tuple[str, ...]
-    """Forms that this capture cannot tell from it."""
+    """Forms that this capture cannot distinguish from it."""
     p_value: float
     """For the whole set of forms."""
     stability: float | None
-    """Part of the draws of blocks in which it, or a rival, is the best; None where it was not chosen among forms."""
+    """Fraction of block resamples in which it, or a rival, is the best; None where it was not chosen among forms."""
     before_px: float
     """Held-out rms."""
     after_px: float
     fit: TrackFit
-    """Of everything together."""
+    """Joint fit of all terms."""
 
     @property
     def fields(self) -> tuple[Field, ...]:
@@ -41,18 +41,18 @@ class FittedField:
 
 @dataclass(frozen=True, slots=True)
 class Distrusted:
-    """Stretches of the inertial log that do not follow the pictures."""
+    """Intervals of the inertial log that do not follow the frames."""
 
     stretches: tuple[Stretch, ...]
     bridged: tuple[bool, ...]
-    """Whether the points tell the rates there."""
+    """Whether the rates there were estimated from the points."""
     p_value: float | None
-    """That points there lie no further off than elsewhere; None: there is no elsewhere."""
+    """For the hypothesis that residuals there are no larger than elsewhere; None: all pairs are affected."""
     before_px: float
-    """Rms of the points of frames that reach into a stretch."""
+    """Residual rms of the points of affected pairs."""
     after_px: float
-    """The same with rates told by other points of these frames."""
+    """The same with rates estimated from the other points of these pairs."""
     noise_px: float
-    """Rms of the points elsewhere."""
+    """Residual rms of the points elsewhere."""
     profile: CameraProfile
     """With the bridges."""

@@ -1,7 +1,7 @@
-"""The residuals of any calibration, criticised: where they are no chance, and along what they run.
+"""Criticise the residuals of any calibration: find significant structure and the covariates it follows.
 
-Residuals are split into a sum of curves over the covariates that were recorded, form by form, as long as a form gains
-on blocks that it was not fitted to (group-sparse forward selection; Lozano, Swirszcz & Abe 2009).
+Residuals are decomposed into a sum of curves over the recorded covariates.  Forms are added one by one while they gain
+on held-out blocks (group-sparse forward selection; Lozano, Swirszcz & Abe 2009).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ VELOCITY = ("vx", "vy")
 ORDER = ("frame", "time")
 MOST_ROWS, LEAST_ROWS = 20_000, 100
 KNOTS, PLACE_KNOTS, PAIR_KNOTS, MOST_PAIRS = 6, 4, 4, 10
-SAME_PART = 1e-6
+MIN_VARIATION = 1e-6
 BLOCKS, LEAST_BLOCKS = 40, 8
 MAX_FINDINGS = 6
-MOST_PX = 1e6
-"""No picture is so large."""
+MAX_PX = 1e6
+"""No frame is this large; larger values are an error of units."""
 MIN_SIZE_PX = 0.01
-"""Smaller structure changes no calibration."""
+"""Smaller structure does not affect a calibration."""
 CAUCHY = 2.4
 MAD = 0.6745
 SHIFT = "points are shifted by up to {size} {shape} of {name}, the same everywhere in the frame"
@@ -56,7 +56,7 @@ class TableFinding:
     """Held-out rms of the residuals, px per coordinate."""
     after: float
     noise: float
-    """The rms that is left in the end."""
+    """Rms after all findings."""
     p_value: float
     confounded: tuple[str, ...]
     knots: tuple[tuple[float, ...], ...]
@@ -67,7 +67,7 @@ class TableFinding:
 
 @dataclass(frozen=True, slots=True)
 class Criticism:
-    """What was found in a table of residuals."""
+    """All effects found in a table of residuals."""
 
     rows: int
     used: int
@@ -77,7 +77,7 @@ class Criticism:
     """What remains after all findings."""
     findings: tuple[TableFinding, ...]
     forms: tuple[str, ...]
-    """Everything that was asked."""
+    """All forms that were tested."""
     false_alarm_rate: float = MAX_P
     """Of the whole set of forms."""
 
@@ -103,8 +103,8 @@ class _Form:
 def criticise(columns: Mapping[str, Array]) -> Criticism:
     """Criticise residuals: x, y (px), dx, dy (px), and any further numeric columns, (n,) each.
 
-    vx, vy (px/s), where given, are the speed of the point in the frame: a delay over the row can then be told.  frame
-    and time order the rows: blocks are stretches of them; without both the rows are taken in the order they come in.
+    vx, vy (px/s), where given, are the image velocity of the point; they make a delay over the row identifiable.  frame
+    and time order the rows, and blocks are intervals of them; without both, the file order is used.
     Raises CaptureError for too few rows.
     """
     columns, rows = _cleaned(columns)
@@ -132,7 +132,7 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
                 break
         else:
             break
-        form = open_forms[selection.best.place]
+        form = open_forms[selection.best.index]
         tangent = np.concatenate([tangent, form.design], axis=-1)
         after = float(np.sqrt(max(scale**2 - (selection.size * scale) ** 2, 0.0)))
         found.append((form, selection.best.p_value, selection.rivals, scale, after))
@@ -140,10 +140,10 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
     left_px = _scale(current)
     weight = 1 / (1 + (current**2).sum(axis=-1) / (CAUCHY * left_px) ** 2)
     numbers, covariance = _fitted(tangent, left, weight, block)
-    findings, place = [], 2
+    findings, start = [], 2
     for form, p_value, rivals, before, after in found:
-        part = slice(place, place + form.design.shape[2])
-        place = part.stop
+        part = slice(start, start + form.design.shape[2])
+        start = part.stop
         findings.append(_finding(form, numbers[part], covariance[part, part], p_value, rivals, before, after, left_px))
     return Criticism(rows, len(left), rms_px, left_px, tuple(findings), tuple(form.name for form in (*forms, *pairs)))
 
@@ -156,7 +156,7 @@ def _cleaned(columns: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
     table = {name: np.asarray(values, float) for name, values in columns.items()}
     table = {name: values for name, values in table.items() if name in NEEDED or np.isfinite(values).mean() > 0.5}
     for name in NEEDED:
-        if (largest := float(np.nanmax(np.abs(table[name]), initial=0.0, where=np.isfinite(table[name])))) > MOST_PX:
+        if (largest := float(np.nanmax(np.abs(table[name]), initial=0.0, where=np.isfinite(table[name])))) > MAX_PX:
             raise CaptureError(f"a value of {largest:.3g} px in column {name}", hint="all values are in pixels")
     keep = np.all([np.isfinite(values) for values in table.values()], axis=0)
     if keep.sum() < LEAST_ROWS:
@@ -173,7 +173,7 @@ def _cleaned(columns: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
 
 
 def _blocks(columns: Mapping[str, Array], count: int) -> Index:
-    """Number of the block (n,) of each row: stretches of frames, of time, or of the file."""
+    """Block number (n,) of each row: intervals of frames, of time, or of the file."""
     key = next((columns[name] for name in ORDER if name in columns), np.arange(count, dtype=float))
     rank = np.unique(key, return_inverse=True)[1]
     total = int(rank.max()) + 1
@@ -201,9 +201,9 @@ def _forms(columns: Mapping[str, Array]) -> list[_Form]:
 
 
 def _pairs(columns: Mapping[str, Array]) -> list[_Form]:
-    """What two covariates do together; the distance from the middle goes with each other one as a scale.
+    """Interactions of two covariates; the distance from the centre is paired with each covariate as a scale.
 
-    Of two that are the same all over a frame nothing is asked: what a frame's points share is a function of both.
+    Pairs that are both constant within a frame are skipped: any per-frame value is a function of both.
     """
     x, y = columns["x"], columns["y"]
     arm = np.stack([a - 0.5 * (a.min() + a.max()) for a in (x, y)], axis=-1)
@@ -226,13 +226,13 @@ def _pairs(columns: Mapping[str, Array]) -> list[_Form]:
 
 
 def _varies_within(values: Array, group: Index) -> bool:
-    """Whether a column is not the same all over each group of rows."""
+    """Whether a column varies within groups of rows."""
     mean = np.bincount(group, values) / np.maximum(np.bincount(group), 1)
-    return bool(np.ptp(values - mean[group]) > SAME_PART * np.ptp(values))
+    return bool(np.ptp(values - mean[group]) > MIN_VARIATION * np.ptp(values))
 
 
 def _curve(values: Array, count: int) -> tuple[tuple[float, ...], Array] | None:
-    """Knots over a column and what each counts (n, knots); None where it hardly varies."""
+    """Knots over a column and their interpolation weights (n, knots); None where it hardly varies."""
     knots = tuple(np.unique(np.linspace(values.min(), values.max(), count)).tolist())
     return None if len(knots) < count else (knots, cardinal_weights(knots, values))
 
@@ -250,7 +250,7 @@ def _shift(names: tuple[str, ...], knots: tuple[tuple[float, ...], ...], weights
 def _along(
     kind: str, names: tuple[str, ...], knots: tuple[tuple[float, ...], ...], weights: Array, way: Array
 ) -> _Form:
-    """Shifts along ways (n, 2), by one number a knot."""
+    """Shifts along directions ``way`` (n, 2), one number per knot."""
     return _Form(kind, names, knots, way[:, :, None] * weights[:, None, :], 1)
 
 
@@ -294,7 +294,7 @@ def _finding(
     values = numbers.reshape(-1, form.parts)
     centre = np.eye(len(values))
     if form.kind != "displacement":
-        # of two covariates what they do beyond the sum of what each does
+        # for two covariates, keep only the interaction
         centre = reduce(
             lambda one, two: np.asarray(np.kron(one, two)), [np.eye(len(k)) - 1 / len(k) for k in form.knots]
         )
@@ -316,7 +316,7 @@ def _finding(
         shape = curve_shape(
             curve[:, int(np.argmax(np.ptp(curve, axis=0)))], "time" if form.over_time else form.covariates[0]
         )
-    sentence, reasons, following = _said(form, shape, size)
+    sentence, reasons, following = _texts(form, shape, size)
     beside = f"; {' and '.join(rivals)} would explain it equally well" if rivals else ""
     return TableFinding(
         form.kind, form.covariates, shape, f"{sentence} (residuals {before:.3g} px → {after:.3g} px, held out){beside}",
@@ -325,7 +325,7 @@ def _finding(
     )  # fmt: skip
 
 
-def _said(form: _Form, shape: str, size: float) -> tuple[str, str, str]:
+def _texts(form: _Form, shape: str, size: float) -> tuple[str, str, str]:
     """Sentence, likely reasons and the next measurement."""
     name = " and the ".join(form.covariates)
     if len(form.knots) > 1 and form.kind != "displacement":

@@ -1,7 +1,7 @@
-"""The search for fields after the ladder: screen, fit by the one forward model, judge, and let go of stand-ins.
+"""Search for fields after the ladder: screen, fit with the forward model, judge, and remove redundant causes.
 
-Field by field: the form that the residuals ask for enters the model and is fitted together with the causes that are
-in; it stays if blocks of time that the fit did not see gain.  Then causes that only stood in for it leave.
+Each step adds the form that best explains the residuals and fits it together with the causes in the model.  The form
+stays if it improves held-out time blocks.  Causes that it makes redundant are then removed.
 """
 
 from __future__ import annotations
@@ -40,40 +40,40 @@ Index = NDArray[np.intp]
 MAX_FIELDS = 3
 SEARCH_POINTS, JUDGE_POINTS = 6000, 4000
 PAIRS_IN_BLOCK = 3
-"""Neighbouring pairs share a frame, and so its tracking errors: blocks of three share them at their ends only."""
+"""Neighbouring pairs share a frame and its tracking errors; blocks of 3 pairs share them only at their ends."""
 MIN_SIZE_PX = 0.025
-"""Structure below 0.02 px may be tracking's own bias; a smaller one only enters in place of a named cause."""
+"""A form with a smaller gain enters only if it replaces a named cause: tracking bias reaches 0.02 px."""
 MIN_BLOCKS = 8
 DEPTH = "scene_depth"
-"""A camera's path before a near plane says much that a gyroscope's errors do."""
+"""Translation in front of a near plane is confounded with gyroscope errors."""
 SCALE_OVER_TIME = f"scale{OVER}time"
-"""A step, or a curve that a step was compared with, is in the model: no other step is looked for."""
-LASTING_PART = 0.5
-"""Least part of the excess loss about a sudden change that goes by what the frames before and after say of it."""
+"""Once a form of this family is in the model, no further sudden change is searched for."""
+MIN_EXCESS_REMOVED = 0.5
+"""Minimum fraction of the excess loss at a sudden change that a fit to the other blocks must remove."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """A model on blocks of time that it was not fitted to."""
+    """Losses of a model on held-out time blocks or points."""
 
     losses: Array
     """(n,) of the points."""
     block: Index | None
-    """(n,) number of the block of time that errs together; None: the points were judged one by one."""
+    """(n,) number of the time block, whose errors are correlated; None: points were held out individually."""
     rms: float
     """In units of the typical noise."""
 
     @property
     def block_loss(self) -> Array:
-        """(blocks,) mean loss of a point, or (n,) the points' own."""
+        """(blocks,) mean loss per point, or (n,) the losses of the points."""
         if self.block is None:
             return self.losses
         return np.bincount(self.block, self.losses) / np.maximum(np.bincount(self.block), 1)
 
 
 def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -> GeometricVerdict:
-    """The ladder's end with the fields that its residuals ask for; the same where they ask for none."""
-    # bridges of the log stay as they are: hundreds of numbers that no field shares
+    """Add the fields that the residuals support to the ladder's verdict; unchanged where they support none."""
+    # keep the bridges of the log fixed: they have hundreds of parameters that no field shares
     terms = tuple(term for term in found.model.terms if OVER not in term.name)
     state, fitted = _Description(replace(found.model, terms=terms), tuple(found.accepted), ()), found.fit
     fields: list[FittedField] = []
@@ -114,20 +114,20 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
 
 @dataclass(frozen=True, slots=True)
 class _Description:
-    """A model, and what it says: causes and forms of fields."""
+    """A model with its accepted causes and field forms."""
 
     model: Model
     accepted: tuple[Accepted, ...]
     forms: tuple[FieldForm, ...]
 
     def is_dense(self, period_s: float) -> bool:
-        """Whether the knots of a form lie as close as blocks of frames that follow each other by this."""
+        """Whether any form has knots as dense as the blocks at this frame period."""
         return any(form.is_dense(2 * PAIRS_IN_BLOCK * period_s) for form in self.forms)
 
     def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _Description:
-        """The same without some causes, their values back where the profile had them.
+        """The same without some causes, whose parameters return to their nominal values.
 
-        Forms that keep clear of these, as a displacement of the principal point, begin anew.
+        Forms that depend on these causes, such as a displacement on the principal point, restart from 0.
         """
         model = self.model
         for entry in leaving:
@@ -151,7 +151,7 @@ class _Description:
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """A model on held-out blocks and on held-out points, each worked out once, where it is asked for."""
+    """Held-out losses of a model on blocks and on points, each computed once on demand."""
 
     evidence: Evidence
     model: Model
@@ -159,7 +159,7 @@ class _Judged:
     _known: dict[bool, HeldOut] = field(default_factory=dict, repr=False)
 
     def held_out(self, by_point: bool) -> HeldOut:
-        """On points, or on blocks."""
+        """Losses on held-out points, or on held-out blocks."""
         if by_point not in self._known:
             self._known[by_point] = _held_out(self.evidence, self.model, self.fitted, by_point)
         return self._known[by_point]
@@ -168,7 +168,7 @@ class _Judged:
 def _best_step(
     judged: _Judged, found: GeometricVerdict, state: _Description, alternatives: Sequence[_Asked]
 ) -> tuple[_Asked, _Entered, _Description] | None:
-    """Of some forms the one that predicts held-out blocks best, in the model; None where none gains anything."""
+    """Add the form that predicts held-out blocks best; None where no form gains."""
     steps = [step for one in alternatives if (step := _step(judged, found, state, one)) is not None]
     return min(steps, key=lambda step: float(step[1].after.losses.mean()), default=None)
 
@@ -176,15 +176,15 @@ def _best_step(
 def _step(
     judged: _Judged, found: GeometricVerdict, state: _Description, asked: _Asked
 ) -> tuple[_Asked, _Entered, _Description] | None:
-    """A form that was asked for, in the model, and all that stays beside it; None where it gains nothing.
+    """Add a requested form and remove what it makes redundant; None where it gains nothing.
 
-    To take a cause's place a form must be the better rival; to be said beside all causes it must gain more surely.
+    A form that replaces a cause needs a lower significance than one that is added to all causes.
     """
     evidence, entered = judged.evidence, _entered(judged, asked)
     if entered is None:
         return None
     more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
-    after = _without_stand_ins(evidence, found, more)
+    after = _without_redundant_causes(evidence, found, more)
     gained_px = np.sqrt(max(entered.before.rms**2 - entered.after.rms**2, 0.0)) * evidence.typical_px
     small = asked.selection is not None and gained_px < MIN_SIZE_PX
     return None if (small or asked.instead) and len(after.accepted) == len(state.accepted) else (asked, entered, after)
@@ -192,13 +192,13 @@ def _step(
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """A form that residuals ask for: all of them together, or those between two frames."""
+    """A form supported by all residuals together, or by those between two frames."""
 
     form: FieldForm
     selection: Selection | None = None
     sudden: SuddenChange | None = None
     instead: bool = False
-    """Whether it may only enter where a cause leaves: what is there is said one way or the other."""
+    """Whether it may enter only if it replaces a cause."""
 
     @property
     def p_value(self) -> float:
@@ -212,10 +212,10 @@ class _Asked:
 
 
 def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> Iterator[tuple[_Asked, ...]]:
-    """The forms that the residuals of a model ask for, and how sure that is; those asked at once are alternatives.
+    """Yield the forms that a model's residuals support, as groups of alternatives, with their significance.
 
-    A focal length that settles quickly grows most between two frames too, and a sudden change is a curve of sorts.
-    Pairs of covariates, and curves over a few frames, come last and beside all that the plain forms can do.
+    A fast-settling focal length and a sudden change look alike, so both are tried.  Covariate pairs and curves over a
+    few frames come last and are tested beside everything that the plain forms can explain.
     """
     table = evidence.table(model, SEARCH_POINTS)
     fitted = fit_model(evidence.imu, model, model.terms, table)
@@ -243,7 +243,7 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     selection = search.best(scored)
     instead = selection is None and any(OVER not in name for name in in_model)
     if (selection := search.best(scored, RIVAL_T) if instead else selection) is not None:
-        form = smooth[selection.best.place]
+        form = smooth[selection.best.index]
         if form.step_s is not None:
             scale = lasting_change(seen, tangent, search.effect(form))
             form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
@@ -253,32 +253,32 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     smooth = list({form.family: form for form in reversed(alone) if not form.local and form.step_s is None}.values())
     tangent = np.concatenate([tangent, *map(search.effect, smooth)], axis=-1)
     if (selection := search.best(search.scored(tangent, forms))) is not None:
-        yield (_Asked(forms[selection.best.place], selection),)
+        yield (_Asked(forms[selection.best.index], selection),)
     elif sudden is not None:
-        # one that comes back: of a few frames, whose signs are too few for a test by flips
+        # a temporary change covers too few frames for the sign-flip test
         yield from ((_Asked(form, sudden=sudden),) for form in forms if form.local and form.kind == "scale")
 
 
 @dataclass(frozen=True, slots=True)
 class _Search:
-    """Residuals, and how forms are asked for."""
+    """Residuals, and the settings with which forms are scored."""
 
     seen: PointResiduals
     block: Index
     blind_s: float
-    """How near to a sudden change points are not asked.  Between two frames it moves them by many times their noise, so
-    that an instant that is a frame off would be ruled out by the points that tell it best."""
+    """Ignore points closer in time to a sudden change than this.  The change moves them by many times their noise, so
+    the most informative points would reject an instant that is wrong by one frame."""
     asked: int
-    """How many forms are asked for in all."""
+    """Total number of forms tested."""
     _effects: dict[int, tuple[FieldForm, Array]] = field(default_factory=dict, repr=False)
-    """By the identity of their form, which is kept so that no other takes its number."""
+    """Keyed by id(form); the form is stored too, so that its id is not reused."""
 
     def best(self, scored: Sequence[Scored], least_t: float = MIN_T) -> Selection | None:
-        """The form that residuals ask for, if any."""
+        """The form that the residuals support, if any."""
         return select(scored, float(self.seen.weight.sum()), least_t=least_t)
 
     def scored(self, tangent: Array, forms: Sequence[FieldForm]) -> list[Scored]:
-        """Scores of forms beside a tangent space (n, 2, m), best gain first; of the forms of one field the best."""
+        """Scores of forms beside a tangent space (n, 2, m), best gain first; only the best form of each family."""
         designs = [Design(form.name, self.effect(form), form.over_time, form.local) for form in forms]
         best: dict[str, Scored] = {}
 
@@ -289,7 +289,7 @@ class _Search:
         for entry in score_forms(
             seen.left, seen.weight, tangent, designs, self.block, seen.table.pair, asked=self.asked
         ):
-            family = forms[entry.place].family
+            family = forms[entry.index].family
             if family not in best or worth(entry) > worth(best[family]):
                 best[family] = entry
         whole = seen.weight * (seen.left**2).sum(axis=-1)
@@ -306,7 +306,7 @@ class _Search:
         return sorted(best.values(), key=lambda entry: -float(entry.gain.sum()))
 
     def effect(self, form: FieldForm) -> Array:
-        """Whitened change (n, 2, k) of the points per number of a form; worked out once."""
+        """Whitened change (n, 2, k) of the points per free number of a form; computed once."""
         if id(form) not in self._effects:
             self._effects[id(form)] = form, self._effect(form)
         return self._effects[id(form)][1]
@@ -325,7 +325,7 @@ class _Search:
 
 @dataclass(frozen=True, slots=True)
 class _Entered:
-    """A model with a form in it, and what held-out blocks say without and with it."""
+    """A model with a form added, and the held-out losses without and with it."""
 
     model: Model
     form: FieldForm
@@ -334,7 +334,7 @@ class _Entered:
 
 
 def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
-    """The model with a form in it, with as many knots as pay; None where held-out blocks do not gain."""
+    """Add a form with as many knots as improve held-out data; None where held-out blocks do not gain."""
     evidence, model, fitted, form = judged.evidence, judged.model, judged.fitted, asked.form
     extended = replace(model, terms=(*model.terms, form.term))
     before, after = judged.held_out(form.local), _held_out(evidence, extended, fitted, form.local)
@@ -343,10 +343,10 @@ def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
     least_t = RIVAL_T if asked.instead else MIN_T
     holds = _holds_over_time(gain) if form.over_time and not form.local else t_ratio(gain) > least_t
     if asked.sudden is not None and not form.local:
-        # most of the gain lies in one block; that of the others tells the change, and it must hold there
+        # the fit to the other blocks determines the change, and must remove the excess in the block that contains it
         there = asked.sudden.pair // PAIRS_IN_BLOCK
         excess = max(before.block_loss[there] - float(np.median(before.block_loss)), 0.0)
-        holds = bool(gain[there] > LASTING_PART * excess)
+        holds = bool(gain[there] > MIN_EXCESS_REMOVED * excess)
     least_gain = 0.0 if asked.instead else MIN_GAIN
     if gain.mean() < least_gain * before.block_loss.mean() or after.rms > before.rms or not holds:
         return None
@@ -354,15 +354,15 @@ def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
 
 
 def _holds_over_time(gain: Array) -> bool:
-    """Whether what a form over time gains (blocks,) is no chance: of all blocks, or by far in a few."""
+    """Whether the gain (blocks,) of a form over time is significant: over all blocks, or strongly in a few."""
     return t_ratio(gain) > MIN_LOCAL_T or beyond_noise(gain) > MIN_T
 
 
 def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackFit) -> _Entered:
-    """The same with twice the knots, as often as held-out points gain.
+    """Double the knots repeatedly while held-out points gain.
 
-    A form over time is judged on other points of the frames that it was fitted to: fine knots lie as close as blocks.
-    Where twice the knots gain nothing over time or rows, four times as many may: of what goes to and fro between two.
+    A form over time is judged on held-out points of the fitted frames, since fine knots are as dense as blocks.  If
+    doubling gains nothing over time or rows, quadrupling is tried too: an oscillation between two knots needs it.
     """
     by_point = entered.form.over_time
     judged_so = by_point == entered.form.local
@@ -384,7 +384,7 @@ def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackF
 
 
 def _without_form(model: Model, form: FieldForm) -> Model:
-    """The model without a form, whose values go back to nought."""
+    """The model without a form, whose values return to 0."""
     fields = form.filled(np.zeros(form.basis.shape[1]))
     kept = [f for f in model.profile.fields if not any(f.is_in_place_of(own) for own in fields)]
     terms = tuple(term for term in model.terms if term.name != form.name)
@@ -392,7 +392,7 @@ def _without_form(model: Model, form: FieldForm) -> Model:
 
 
 def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool = False) -> HeldOut:
-    """Fit on every other block of a few pairs, judge on those between, and the other way round.
+    """Fit on every other block of a few pairs, judge on the remaining blocks, and vice versa.
 
     by_point: on every other point of all pairs instead.
     """
@@ -406,57 +406,57 @@ def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool
     return HeldOut(np.asarray(loss(left, 1.0)), None if by_point else block, capped_rms(left))
 
 
-def _without_stand_ins(evidence: Evidence, found: GeometricVerdict, state: _Description) -> _Description:
-    """Let go of causes that are of no use on held-out blocks, now that a field is in.
+def _without_redundant_causes(evidence: Evidence, found: GeometricVerdict, state: _Description) -> _Description:
+    """Remove causes that no longer improve held-out blocks once a field has been added.
 
-    Two that only compensate for each other, such as a turn and a principal point, are of use until both are gone.
+    Two causes that compensate for each other, such as a rotation and a principal point, must be removed together.
     """
     while True:
         model = state.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, JUDGE_POINTS))
         state = replace(state, model=replace(model, profile=fitted.profile, scene=fitted.scene))
         judged = _Judged(evidence, state.model, fitted)
-        if (form := _idle_form(judged, state)) is not None:
+        if (form := _redundant_form(judged, state)) is not None:
             log.debug("stood in for another form: %s", form.name)
             kept = tuple(known for known in state.forms if known is not form)
             state = replace(state, model=_without_form(state.model, form), forms=kept)
             continue
-        leaving = _stand_ins(judged, found, state)
+        leaving = _redundant_causes(judged, found, state)
         if not leaving:
             return state
         log.debug("stood in for a field: %s", [entry.name for entry in leaving])
         state = state.without(found, leaving)
 
 
-def _needs_more(judged: _Judged, by_point: bool, less: Model) -> bool:
-    """Whether held-out blocks, or points, are better off with what a smaller model lacks, a cause or a form."""
+def _loses_without(judged: _Judged, by_point: bool, less: Model) -> bool:
+    """Whether the cause or form that a smaller model lacks improves held-out blocks, or points."""
     before, after = _held_out(judged.evidence, less, judged.fitted, by_point), judged.held_out(by_point)
     gain = before.block_loss - after.block_loss
     part = float(gain.mean() / before.block_loss.mean())
     return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
 
 
-def _idle_form(judged: _Judged, state: _Description) -> FieldForm | None:
-    """A form that the newest leaves nothing to say to, if any."""
+def _redundant_form(judged: _Judged, state: _Description) -> FieldForm | None:
+    """An older form that the newest one makes redundant, if any."""
     by_point = state.is_dense(judged.evidence.period_s)
     less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
-    return next((form for form, model in less if not _needs_more(judged, by_point, model)), None)
+    return next((form for form, model in less if not _loses_without(judged, by_point, model)), None)
 
 
-def _stand_ins(judged: _Judged, found: GeometricVerdict, state: _Description) -> tuple[Accepted, ...]:
-    """The cause, or the two, that a model can do without; nothing where it needs all."""
+def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _Description) -> tuple[Accepted, ...]:
+    """The cause, or pair of causes, that the model does not need; empty where it needs all."""
     fitting = [entry for entry in state.accepted if entry.effect is not None and entry.effect.term is not None]
     depth = [(entry,) for entry in state.accepted if entry.name == DEPTH]
     weakest: list[tuple[Accepted, ...]] = []
     if fitting:
-        doubts = {entry.name: _doubt(judged.evidence, found, judged.fitted, entry) for entry in fitting}
-        weakest = [(max(fitting, key=lambda entry: doubts[entry.name]),)]
+        p_values = {entry.name: _p_value_of(judged.evidence, found, judged.fitted, entry) for entry in fitting}
+        weakest = [(max(fitting, key=lambda entry: p_values[entry.name]),)]
     for leaving in (*depth, *weakest, *combinations(fitting, 2)):
-        if not _needs_more(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
+        if not _loses_without(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
             return leaving
     return ()
 
 
-def _doubt(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:
+def _p_value_of(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:
     assert entry.effect is not None
     return p_of(fitted, entry.effect, fitted.profile, found.nominal.profile, evidence.typical_px)

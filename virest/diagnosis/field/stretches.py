@@ -1,7 +1,7 @@
-"""Stretches of the inertial log that do not follow the camera: which frames they reach into, and bridges across them.
+"""Intervals of the inertial log that do not follow the camera: the frames they affect, and bridges across them.
 
-They are kept out of the ladder, judged by the points that fall into them, and bridged by rates that the points tell:
-nought at both ends, smooth between.
+They are excluded from the ladder, tested with the points inside them, and bridged by rates estimated from these
+points.  A bridge is 0 at both ends and smooth in between.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from virest.inference.observed_tracks import ObservedTracks
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 KNOT_STEP_S = 0.03
-"""Of a bridge: about a frame, for a frame's points tell little more than its turn."""
+"""Knot spacing of a bridge: about one frame, since a frame's points determine little more than its rotation."""
 
 
 def touching(observed: ObservedTracks, stretches: Iterable[Stretch], to_imu: tuple[float, float]) -> Mask:
-    """Which pairs (pairs,) reach into a stretch; to_imu: clock rate and offset from the camera's stamps to the log."""
+    """Which pairs (pairs,) overlap an interval; to_imu: clock rate and offset from the camera's stamps to the log."""
     rate, offset_s = to_imu
     span = 0.05 + float(observed.exposure_s.max(initial=0.0))
     begin = np.array([observed.stamp_s[pair.first] for pair in observed.pairs]) * rate + offset_s
@@ -37,17 +37,17 @@ def touching(observed: ObservedTracks, stretches: Iterable[Stretch], to_imu: tup
 
 
 def bridging_form(stretches: Iterable[Stretch], stamp_0_ns: int, walk: Array) -> FieldForm:
-    """Rates over time within the stretches, nought at their ends, on the axes that are not trusted.
+    """Rates over time within the intervals, 0 at their ends, on the untrusted axes.
 
-    walk: (3,) rad/s/√s, :func:`rate_walk`.  Beforehand a rate is a Brownian bridge between the ends: what no row sees
-    goes straight between what rows see, with the deviation of a hand's turns.
+    walk: (3,) rad/s/√s, :func:`rate_walk`.  The prior of a rate is a Brownian bridge between the ends: unobserved parts
+    are interpolated linearly, with the standard deviation of the motion of the hand.
     """
     fields, bases = [], []
     for stretch in stretches:
-        lasting_s = stretch.to_s - stretch.from_s
-        inner = max(round(lasting_s / KNOT_STEP_S), 1)
-        time_s = np.linspace(0.0, lasting_s, inner + 2)[1:-1]
-        bridge = np.minimum.outer(time_s, time_s) - np.outer(time_s, time_s) / lasting_s
+        duration_s = stretch.to_s - stretch.from_s
+        inner = max(round(duration_s / KNOT_STEP_S), 1)
+        time_s = np.linspace(0.0, duration_s, inner + 2)[1:-1]
+        bridge = np.minimum.outer(time_s, time_s) - np.outer(time_s, time_s) / duration_s
         axes = list(stretch.axes)
         knots = tuple(float(t) for t in np.round(np.linspace(stretch.from_s, stretch.to_s, inner + 2), 6))
         fields.append(Field("rate", ("time",), (knots,), ((0.0,) * 3,) * len(knots), (), stamp_0_ns))
@@ -57,13 +57,13 @@ def bridging_form(stretches: Iterable[Stretch], stamp_0_ns: int, walk: Array) ->
 
 
 def rate_walk(imu: ImuSamples) -> Array:
-    """How far each axis' rate (3,) walks in a bridge's step, rad/s/√s: root mean square over the whole log."""
+    """Random-walk density of each axis' rate (3,) over one KNOT_STEP_S, rad/s/√s: rms over the whole log."""
     time_s = imu.time_s[imu.time_s <= imu.time_s[-1] - KNOT_STEP_S]
     later = np.stack([np.interp(time_s + KNOT_STEP_S, imu.time_s, rate) for rate in imu.gyro_rad_s.T], axis=-1)
     return np.asarray(np.sqrt(np.mean((later - imu.gyro_rad_s[: len(time_s)]) ** 2, axis=0) / KNOT_STEP_S))
 
 
 def axis_names(stretches: Iterable[Stretch]) -> str:
-    """The axes of some stretches, as people read them."""
+    """Readable names of the axes of some intervals."""
     axes = sorted({axis for stretch in stretches for axis in stretch.axes})
     return ", ".join(AXES[axis] for axis in axes)

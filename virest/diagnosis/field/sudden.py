@@ -1,7 +1,7 @@
-"""A focal length that is another from one instant on: a phone that switches its lens.
+"""Sudden changes of the focal length: a phone that switches its lens.
 
-Between the two frames on either side the picture grows or shrinks by many times what tracking errs, more than in any
-other pair of frames; a robust fit takes these points for outliers.  What comes after shows whether it stays.
+Between the two frames around the change, the scale changes by many times the tracking noise, more than between any
+other pair; a robust fit rejects these points as outliers.  Later frames show whether the change lasts.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
 
 Array = NDArray[np.float64]
-CHANCE = 1e-4
-"""Family-wise false-alarm rate: of any pair of a capture growing this much by chance."""
+FALSE_ALARM_RATE = 1e-4
+"""Family-wise false-alarm rate over all pairs of a capture."""
 LEAST_POINTS, LEAST_PAIRS = 8, 15
 INSTANTS, REACH = 97, FRAMES_PER_STEP + 1.0
-"""Instants that are tried, over this many frames before and after: a first look passes over as many about a change,
-and lies half as many off itself."""
+"""Number of instants tried, and the search range in frames before and after: the coarse search ignores FRAMES_PER_STEP
+frames around a change, and its instants are off by up to half of that."""
 CAUCHY = 2.5
 """In standard deviations."""
 _ITERATIONS = 8
@@ -32,18 +32,18 @@ _ITERATIONS = 8
 
 @dataclass(frozen=True, slots=True)
 class SuddenChange:
-    """A pair of frames between which the picture grew."""
+    """A pair of frames between which the scale changed."""
 
     pair: int
     at_s: float
     """Between the two, IMU clock from stamp_0."""
     scale: float
-    """Part by which the focal length is longer afterwards."""
+    """Relative increase of the focal length."""
     p_value: float
 
 
 def sudden_change(seen: PointResiduals) -> SuddenChange | None:
-    """The pair that grew most, where that is no chance."""
+    """The pair with the largest change of scale; None where it is not significant."""
     lens, table = seen.fit.profile.intrinsics, seen.table
     assert lens is not None
     arm = seen.prediction.second_px - np.array([lens.cx_px, lens.cy_px])
@@ -57,7 +57,7 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     most = int(np.argmax(np.abs(growth - middle)))
     ratio = abs(growth[most] - middle) / max(spread, 1e-12)
     p_value = min(2 * len(pairs) * float(stats.t.sf(ratio, len(pairs) - 1)), 1.0)
-    if p_value > CHANCE:
+    if p_value > FALSE_ALARM_RATE:
         return None
     inside = table.pair == pairs[most]
     profile = seen.fit.profile
@@ -68,7 +68,7 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
 
 
 def _growth(arm: Array, off: Array) -> float:
-    """Part (robust) by which points (n, 2) at arms (n, 2) from the centre went outwards, beside a common shift."""
+    """Robust relative expansion of points with residuals off (n, 2) at arm (n, 2) from the centre, beside a shift."""
     design = np.concatenate([np.concatenate([arm[:, :1], arm[:, 1:]]), np.repeat(np.eye(2), len(arm), axis=0)], axis=1)
     flat = np.concatenate([off[:, 0], off[:, 1]])
     weight = np.ones(len(flat))
@@ -83,17 +83,17 @@ def _growth(arm: Array, off: Array) -> float:
 
 
 def lasting_change(seen: PointResiduals, tangent: Array, effect: Array) -> float:
-    """The value of a form of one number that the points ask for, beside all that the tangent space can do."""
+    """Least-squares value of a form with one free number, fitted together with the tangent space."""
     root = np.repeat(np.sqrt(seen.weight), 2)
     design = np.concatenate([effect, tangent], axis=-1).reshape(len(root), -1) * root[:, None]
     return float(np.linalg.lstsq(design, seen.left.ravel() * root, rcond=None)[0][0])
 
 
 def best_instant(seen: PointResiduals, capture: Capture, at_s: float, scale: float, period_s: float) -> FieldForm:
-    """The form of a sudden change of a given size at the instant that the points about it suit best."""
+    """The form of a sudden change of a given size at the best-fitting instant near at_s."""
     forms = step_forms(capture, at_s + np.linspace(-1, 1, INSTANTS) * REACH * period_s)
     step = scale / float(forms[0].basis[-1, 0])
     whole = [seen.left - step * seen.effect((form.term,))[..., 0] for form in forms]
     losses = np.array([np.log1p((left**2).sum(axis=-1) / CAUCHY**2).sum() for left in whole])
-    alike = np.flatnonzero(losses <= losses.min() + 1.0)  # any instant between two frames is as good
-    return forms[int(alike[len(alike) // 2])]
+    equally_good = np.flatnonzero(losses <= losses.min() + 1.0)  # all instants between two frames fit equally well
+    return forms[int(equally_good[len(equally_good) // 2])]

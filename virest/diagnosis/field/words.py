@@ -1,4 +1,4 @@
-"""Fields in words: what the values do along their covariate, what may be behind it, and what would tell.
+"""Describe fields in words: the shape along their covariate, likely reasons, and the next measurement.
 
 A pattern is kind × covariates × shape.  Shapes come from least-squares fits to the field itself.
 """
@@ -18,30 +18,30 @@ from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
 from virest.inference.doubtful_log import CLIPPED
 
 Array = NDArray[np.float64]
-ALIKE = 0.95
+MIN_EXPLAINED = 0.95
 """Part of a field's variance that a shape must explain to name it."""
 STEP_SPAN, STEP_PART = 0.25, 0.8
-"""A step: this part of the change within this part of the range."""
-TURNED_PART = 0.1
-"""Of the change: a curve that levels off turns back by no more than this."""
+"""A curve is a step if more than STEP_PART of its total change lies within STEP_SPAN of its range."""
+MAX_REVERSAL = 0.1
+"""A curve that levels off reverses by less than this fraction of its total change."""
 JUMP_WIDTH = 0.1
-"""In half the range: a spline of forty knots makes no sharper jump."""
-SHAPE_PART = 0.9
-"""The same for a displacement over the picture."""
+"""As a fraction of half the range: a spline with 40 knots cannot jump faster."""
+MIN_EXPLAINED_OVER_FRAME = 0.9
+"""The same for a displacement over the frame."""
 OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
 SAMPLES = 101
-STUCK_PART = 0.5
+STICKING_FRACTION = 0.5
 INERTIAL = "inertial_rows"
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """What is said of one pattern."""
+    """Texts for one pattern."""
 
     sentence: str
     reasons: str
     next: str
-    """Which measurement would tell the reasons apart."""
+    """The measurement that would distinguish the reasons."""
 
 
 PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
@@ -122,9 +122,9 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     size, std = _size(fields)
     pattern = PATTERNS[form.kind, form.covariates]
     factor, unit = UNIT_SCALES[form.kind]
-    said = f"{size * factor:.3g} {unit}"
+    amount = f"{size * factor:.3g} {unit}"
     sentence = pattern.sentence.format(
-        size=said,
+        size=amount,
         shape=shape,
         where=_where(fields[0]),
         lateness=_lateness(fields[0]),
@@ -152,7 +152,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
 
 
 def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
-    """Stretches of the log: what they look like, how far points are off there, and whether they are bridged."""
+    """Describe untrusted log intervals: their kind, the point residuals there, and whether they are bridged."""
     first = entry.stretches[0]
     total_s = sum(stretch.to_s - stretch.from_s for stretch in entry.stretches)
     several = len(entry.stretches) > 1
@@ -173,9 +173,9 @@ def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
         reasons = "rows were lost and a program interpolated the gap, or the sensor's queue stalled"
         following = "look at the raw log for rows with equal steps, and record with less load on the phone"
     bridged = "bridged from the points" if all(entry.bridged) else "not corrected by process"
-    said = f"{sentence} (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out; {bridged})"
+    description = f"{sentence} (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out; {bridged})"
     if not any(entry.bridged):
-        said = f"{sentence} (point residual {entry.before_px:.3g} px there; {bridged})"
+        description = f"{sentence} (point residual {entry.before_px:.3g} px there; {bridged})"
     bridges = tuple(
         f for f in entry.profile.fields if f.kind == "rate" and f.covariates == ("time",) and f.belongs_to_one_capture
     )
@@ -184,7 +184,7 @@ def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
         ("rate",) if first.kind == CLIPPED else ("time",),
         INERTIAL,
         first.kind,
-        said,
+        description,
         size,
         "rad/s",
         None,
@@ -200,7 +200,7 @@ def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
 
 
 def shape_of(field: Field) -> str:
-    """What the values do along one covariate, or over the picture."""
+    """Name the shape of the values along one covariate, or over the frame."""
     if field.covariates == ("x", "y"):
         return _shape_over_picture(field)
     if len(field.covariates) > 1:
@@ -214,13 +214,13 @@ def shape_of(field: Field) -> str:
 
 
 def shape_of_pair(values: Array, names: tuple[str, ...]) -> str:
-    """What values (SAMPLES, SAMPLES, components) at even steps of two covariates do along each of them.
+    """Name the shape of values (SAMPLES, SAMPLES, components), at even steps of two covariates, along each covariate.
 
-    That is said of the product of two curves that is nearest to them.
+    The shape is that of the nearest product of two curves.
     """
     part = values[..., int(np.argmax(np.ptp(values, axis=(0, 1))))]
     along, sizes, over = np.linalg.svd(part, full_matrices=False)
-    if sizes[0] ** 2 < ALIKE * float((sizes**2).sum()):
+    if sizes[0] ** 2 < MIN_EXPLAINED * float((sizes**2).sum()):
         return f"no product of curves of the {' and the '.join(SENSORS.get(n, n) for n in names)}"
     curves = zip((along[:, 0], over[0]), names, strict=True)
     each = (f"{curve_shape(c, n)} of the {SENSORS.get(n, n)}" for c, n in curves)
@@ -233,23 +233,23 @@ def is_sudden(field: Field) -> bool:
 
 
 def curve_shape(curve: Array, covariate: str = "") -> str:
-    """What a curve (SAMPLES,) at even steps of its covariate does."""
+    """Name the shape of a curve (SAMPLES,) sampled at even steps of its covariate."""
     u, over_time = np.linspace(-1, 1, SAMPLES), covariate == "time"
     if not float(np.var(curve)):
         return "nothing"
-    if _unexplained(curve, [u]) < 1 - ALIKE:
+    if _unexplained(curve, [u]) < 1 - MIN_EXPLAINED:
         return "a straight line"
     if not over_time and _is_step(curve):
         return "a step"
     if covariate == "row" and _is_sawtooth(curve, u):
         return "even blocks with a jump between them"
-    if _unexplained(curve, [u, u**2]) < 1 - ALIKE:
+    if _unexplained(curve, [u, u**2]) < 1 - MIN_EXPLAINED:
         rises, falls = (float(np.clip(way * np.diff(curve), 0, None).sum()) for way in (1, -1))
-        return "levelling off" if over_time and min(rises, falls) < TURNED_PART * np.ptp(curve) else "a parabola"
+        return "levelling off" if over_time and min(rises, falls) < MAX_REVERSAL * np.ptp(curve) else "a parabola"
     slope = np.abs(np.diff(curve))
     if over_time and slope[: SAMPLES // 4].sum() > 2 * slope[-SAMPLES // 4 :].sum():
         return "levelling off"
-    if _unexplained(curve, [u, u**3]) < 1 - ALIKE:
+    if _unexplained(curve, [u, u**3]) < 1 - MIN_EXPLAINED:
         return "an S"
     return "a curve"
 
@@ -268,9 +268,9 @@ def _unexplained(curve: Array, columns: list[Array]) -> float:
 
 
 def _is_sawtooth(curve: Array, u: Array) -> bool:
-    """Whether the curve is one straight slope but for a jump."""
+    """Whether the curve is a single slope with one jump."""
     jumps = (np.clip((u - at) / JUMP_WIDTH, 0, 1) for at in u[SAMPLES // 10 : -SAMPLES // 10])
-    return min(_unexplained(curve, [u, jump]) for jump in jumps) < 1 - ALIKE
+    return min(_unexplained(curve, [u, jump]) for jump in jumps) < 1 - MIN_EXPLAINED
 
 
 def _is_step(curve: Array) -> bool:
@@ -282,7 +282,7 @@ def _is_step(curve: Array) -> bool:
 
 
 def _shape_over_picture(field: Field) -> str:
-    """Which of a lens's simple faults explains a displacement: off centre, other scales along x and y, or neither."""
+    """Name the simple lens error that explains a displacement: decentring, linear, radial, or none of these."""
     x, y = np.meshgrid(*(np.linspace(k[0], k[-1], 21) for k in field.knots), indexing="ij")
     middle = [0.5 * (k[0] + k[-1]) for k in field.knots]
     half = 0.5 * (field.knots[0][-1] - field.knots[0][0])
@@ -295,7 +295,7 @@ def _shape_over_picture(field: Field) -> str:
         columns = [(one, nothing), (nothing, one), *columns]
         design = np.stack([np.stack(pair, -1).ravel() for pair in columns], axis=-1)
         left = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
-        return bool((left**2).sum() < (1 - SHAPE_PART) * (values**2).sum())
+        return bool((left**2).sum() < (1 - MIN_EXPLAINED_OVER_FRAME) * (values**2).sum())
 
     r2, nothing = u * u + v * v, np.zeros_like(u)
     off_centre = [(2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v)]
@@ -309,7 +309,7 @@ def _shape_over_picture(field: Field) -> str:
 
 
 def lens_words(shape: str) -> str:
-    """What a displacement of this shape says of the lens."""
+    """The lens error that a displacement of this shape indicates."""
     return {
         OFF_CENTRE: "a lens that is not centred (tangential distortion)",
         LINEAR: "the picture is scaled, turned, stretched or sheared",
@@ -320,7 +320,7 @@ def lens_words(shape: str) -> str:
 def _size(fields: tuple[Field, ...]) -> tuple[float, float | None]:
     """Largest value and the deviation at the knot next to it.
 
-    Of a displacement or rates the length, of a focal length the range, of proportions to a force the value per m/s².
+    Displacements and rates: vector length; focal length: range; acceleration sensitivity: value per m/s².
     """
     best, std = 0.0, None
     for field in fields:
@@ -351,20 +351,24 @@ def _where(field: Field) -> str:
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     if len(field.knots) > 1:
         return ""
-    place = float(np.argmax(np.abs(field.at(along)).max(axis=-1))) / (SAMPLES - 1)
+    position = float(np.argmax(np.abs(field.at(along)).max(axis=-1))) / (SAMPLES - 1)
     return (
-        "in the middle" if 1 / 3 <= place <= 2 / 3 else "in the first third" if place < 1 / 3 else "in the last third"
+        "in the middle"
+        if 1 / 3 <= position <= 2 / 3
+        else "in the first third"
+        if position < 1 / 3
+        else "in the last third"
     )
 
 
 def _at_rates(field: Field) -> str:
-    """Where along a rate an error begins: at a quarter of the reach one that grows with rates is next to nothing."""
+    """Where an error over a rate begins: one that grows with the rate is negligible below a quarter of the range."""
     if field.covariates[0] not in RATES or len(field.covariates) > 1:
         return ""
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     size = np.linalg.norm(field.at(along), axis=1)
     early = float(size[np.abs(along) < 0.25 * along[-1]].max())
-    return "already near rest: it sticks there" if early > STUCK_PART * float(size.max()) else "at high rates"
+    return "already near rest: it sticks there" if early > STICKING_FRACTION * float(size.max()) else "at high rates"
 
 
 def _lateness(field: Field) -> str:
