@@ -19,7 +19,7 @@ from virest.diagnosis.cross_validation import Judged
 from virest.diagnosis.findings import ParameterChange
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_findings import _widened
-from virest.diagnosis.geometric_ladder import _either
+from virest.diagnosis.geometric_ladder import _better_end
 from virest.diagnosis.geometric_verdict import Accepted
 
 TESTS = Path(__file__).resolve().parent.parent
@@ -83,7 +83,7 @@ def test_ends_that_held_out_points_do_not_tell_apart_are_rivals(swapped: bool, m
     """Which end is told does not depend on which was reached first; the other's cause is named beside it."""
     evidence, (one, other) = ends(monkeypatch, (0.5 + WOBBLE, 0.5 - WOBBLE))
     first, second = (other, one) if swapped else (one, other)
-    found = _either(evidence, first, second)
+    found = _better_end(evidence, first, second)
     assert [entry.name for entry in found.accepted] == ["clock_skew", "principal_point"]
     rivals = {entry.name: [rival.name for rival in entry.rivals] for entry in found.accepted}
     assert rivals == {"clock_skew": [], "principal_point": ["stabilisation"]}
@@ -98,7 +98,7 @@ def test_of_two_rivals_the_one_that_held_out_points_are_better_off_with_is_told(
     good, bad = 0.5 + WOBBLE, 0.504 + 1.3 * WOBBLE
     evidence, (one, other) = ends(monkeypatch, (bad, good) if swapped else (good, bad))
     first, second = (other, one) if swapped else (one, other)
-    found = _either(evidence, first, second)
+    found = _better_end(evidence, first, second)
     assert [entry.name for entry in found.accepted] == ["clock_skew", "stabilisation"]
     assert [rival.name for rival in found.accepted[1].rivals] == ["principal_point"]
 
@@ -106,7 +106,7 @@ def test_of_two_rivals_the_one_that_held_out_points_are_better_off_with_is_told(
 def test_the_better_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where every block prefers one end there is no rival."""
     evidence, (one, other) = ends(monkeypatch, (0.5 + 0.1 * WOBBLE, 0.7 - 0.1 * WOBBLE))
-    assert _either(evidence, one, other) is one
+    assert _better_end(evidence, one, other) is one
     assert one.rival is None
 
 

@@ -1,4 +1,4 @@
-"""Whether a cause that moves points is more than chance, beside those that are in the model."""
+"""Significance of a cause that moves points, given the causes already in the model."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fitted_with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackF
 def significant(
     evidence: Evidence, candidate: Candidate, before: CameraProfile, gain: Array
 ) -> tuple[Model | None, float]:
-    """The model with the candidate in it, if its value is significant, and the probability that it is nought.
+    """(model with the candidate if its value is significant, else None; p-value of the value zero).
 
     A word has no value: its probability is that of so even a gain (blocks,) by chance.
     """
@@ -57,7 +57,7 @@ def significant(
 def p_value_of(
     evidence: Evidence, fitted: TrackFit, candidate: Candidate, found: CameraProfile, before: CameraProfile
 ) -> float:
-    """Probability that a candidate's value is nought; 1 where no phone is like that."""
+    """P-value of a candidate's value against zero; 1 where no phone has such a value."""
     assert candidate.effect is not None
     return p_if_plausible(evidence, fitted, candidate.effect, found, before)
 
@@ -65,7 +65,7 @@ def p_value_of(
 def p_if_plausible(
     evidence: Evidence, fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile
 ) -> float:
-    """Probability that an effect's value is nought; 1 where it ends at, or beyond, what a phone can be."""
+    """P-value of an effect's value against zero; 1 where it ends at or beyond the bounds of real phones."""
     if not is_plausible(evidence, effect, found, effect.total_change(before, found)):
         return 1.0
     return p_of(fitted, effect, found, before, evidence.typical_px)
@@ -83,7 +83,7 @@ def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float
 
 
 def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
-    """Whether a phone can be like that: a cause at or beyond these bounds compensates for another."""
+    """Whether a phone can have such a value: a cause at or beyond these bounds compensates for another."""
     if effect.name in evidence.impossible(found):
         return False
     if effect.name == "stabilisation":

@@ -1,4 +1,4 @@
-"""Where the ladder of what moves points ended: the causes that entered, the model with them, and its fits."""
+"""The geometric ladder's end: the accepted causes, the model with them, and its fits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Accepted:
 
 @dataclass(slots=True)
 class GeometricVerdict:
-    """Where the ladder ended."""
+    """The geometric ladder's end."""
 
     model: Model
     fit: TrackFit

@@ -1,4 +1,4 @@
-"""Profiles across isolated steps of pictures, in grey levels: what pictures alone tell of what was done to edges."""
+"""Profiles across isolated steps of frames, in grey levels: evidence of edge processing without a camera model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Picture = NDArray[np.uint8]
 
 REACH_PX, STEP_PX = 9.0, 0.5
 PLATEAU_PX = 5.0
-"""Beyond this a profile must be flat; an unsharp mask of 2 px has faded by then."""
+"""A profile must be flat beyond this distance, at which an unsharp mask of 2 px has faded."""
 MAX_PLATEAU_RMS = 0.04
 """Of the plateaus about their levels, as part of the step."""
 MIN_STEP_LEVELS = 30.0

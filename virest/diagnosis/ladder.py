@@ -1,7 +1,7 @@
-"""`virest diagnose`: what the model gets wrong on a capture, why, and what each cause gains where it was not fitted.
+"""`virest diagnose`: what the model gets wrong on a capture, the causes, and each cause's gain on held-out data.
 
-First what moves points (tracked from frame to frame), for brightness and blur are only comparable once points are where
-they should be; then brightness, then blur.  What is left is tested for structure.
+Geometry comes first, because brightness and blur are comparable only once points are where the model puts them; then
+brightness, then blur.  The remaining residuals are tested for structure.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from virest.motion.scene_motion import InertialMotion
 
 Progress = Callable[[str, float], None]
 MOST_TRAVEL_PX = 0.35
-"""A tenth of the shortest blur whose mixing of light is looked at: such travel turns no path by more than that."""
+"""A tenth of the shortest blur that the curve is estimated from: such travel rotates no blur path by more than that."""
 
 
 def diagnose_capture(
@@ -328,14 +328,14 @@ def _asks_for_fields(points: TrackedPoints, found: GeometricVerdict) -> bool:
 
 
 def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> bool:
-    """Whether blur depends on more than turns: then what blur mixes says little about the curve."""
+    """Whether blur depends on more than rotation: mixing by blur then says little about the curve."""
     extensions = profile.extensions
     moved = bool(extensions.stabilisation_fraction or extensions.defocus_sigma_px)
     return moved or travel_blur_px(geometric) > MOST_TRAVEL_PX
 
 
 def travel_blur_px(geometric: GeometricVerdict) -> float:
-    """How far the camera's travel moves points within an exposure, px; of the nearest and quickest, one in ten."""
+    """How far the camera's translation moves points within an exposure, px: the 90th percentile over points and frames."""
     fitted, table = geometric.fit, geometric.table
     if geometric.model.scene is None:
         return 0.0

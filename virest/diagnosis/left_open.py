@@ -1,10 +1,10 @@
-"""What the deviations of causes leave out while points stay astray: causes that did not enter.
+"""Variance that a covariance misses while residuals exceed the noise: causes that did not enter.
 
-A fit's covariance holds if the model is right.  Where tracked points remain far from where the model puts them, it is
-not.  Each value then depends on which further cause one would believe in, and on where the descent began: robust losses
-of points that follow no model have many lows.  Each cause that a phone can have is therefore fitted beside those in the
-model, and the model is fitted again from either side; by how much that moves the values, beyond what the cause's own
-freedom explains, enters their variance.
+A fit's covariance holds if the model is right.  Where residuals stay far above the tracking noise, it is not.  Each
+value then depends on which further cause is assumed, and on where the descent began, since robust losses of points that
+follow no model have many minima.  Each cause that a phone can have is therefore fitted beside those in the model, and
+the model is fitted again from either side.  The shift of the values, beyond what the cause's own freedom explains,
+enters their variance.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
 ASIDE = 3.0
-"""Standard deviations on either side at which the model's own fit begins again."""
+"""The model's own fit is repeated from this many standard deviations on either side."""
 Plausible = Callable[[Evidence, GeometricEffect, CameraProfile, Array], bool]
 
 
@@ -36,9 +36,9 @@ def variance_left_open(
     plausible: Plausible,
     each: ParallelMap,
 ) -> dict[str, Array]:
-    """Variance (k,) by which the values of effects in a model depend on causes that are not, by the effects' names.
+    """Variance (k,) of the values of a model's effects due to causes outside the model, by effect name.
 
-    further: causes that may be added, at all places where their fits may begin.  plausible: whether a phone can be so.
+    further: causes that may be added, at all their starting points.  plausible: whether a phone can have such a value.
     """
     table = evidence.table(model, SCREEN_POINTS)
     base = fit_model(evidence.imu, model, model.terms, table)
@@ -58,7 +58,7 @@ def variance_left_open(
 
 
 def _aside(model: Model, effects: Sequence[GeometricEffect], fitted: TrackFit) -> list[Model]:
-    """The model with each value of its causes moved to either side, and all other values as those go with it."""
+    """The model with each value of its causes moved to either side, all others following by their covariance."""
     starts = []
     for effect in effects:
         assert effect.term is not None

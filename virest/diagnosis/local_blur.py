@@ -1,13 +1,13 @@
-"""What local blur the pictures show, against what the profile predicts (forward_model, section 9 (c)).
+"""Local blur as measured in the frames and as the profile predicts it (forward_model, section 9 (c)).
 
-Two measurements that complete each other:
+Two complementary measurements:
 
-- *spectra* of the same patch in two frames: their ratio knows the motion only, so it finds the exposure time;
-- *edges* along which the picture hardly moved: their width knows lens and defocus only.
+- *spectra* of the same patch in two frames: their ratio depends on motion alone, so it gives the exposure time;
+- *edges* along which the image hardly moved: their width depends on lens and defocus alone.
 
-A decoded movie is not what the sensor saw.  H.264 predicts a picture from the one before and codes only part of the
-difference, so a picture also shows some of the blur of its predecessors (MEMORY, fitted freely), and what quantisation
-fills in damps the ratios (DAMPING, known to DAMPING_STD).  Both were measured on movies of known blur.
+A decoded movie differs from what the sensor recorded.  H.264 predicts a frame from the one before and codes only part
+of the difference, so a frame also shows some of the blur of its predecessors (MEMORY, fitted freely); quantisation
+damps the ratios (DAMPING, known to DAMPING_STD).  Both were measured on movies of known blur.
 """
 
 from __future__ import annotations
@@ -59,32 +59,32 @@ Mask = NDArray[np.bool_]
 Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
 
 LENS_SIGMA_PX = 0.70
-"""Width of a sharp edge in a decoded picture: lens, pixel and coding; defocus is what lies beyond."""
+"""Width of a sharp edge in a decoded frame, from lens, pixel and coding; defocus is the excess."""
 LENS_STD_PX = 0.13
-"""How far that varies: coding at 0.15 bit a pixel alone widens edges from 0.70 to 0.85 px."""
+"""Its spread: coding at 0.15 bit a pixel alone widens edges from 0.70 to 0.85 px."""
 DAMPING = (0.92, 0.84)
-"""Part of a log ratio that survives the coding, in each ring of frequencies."""
+"""Part of a log ratio that survives coding, in each ring of frequencies."""
 DAMPING_STD = 0.13
 """Its spread: more is lost under defocus, less at 1 bit a pixel and for strong edges."""
 STARVED_BITS, STARVED_STD = 0.1, 0.35
-"""Bits a pixel at which half of that is lost besides, and by how much (in the logarithm) scenes differ in it.  At 0.1
-to 0.15 bit a pixel 0.5 to 0.9 of what survives at more came through, at 0.2 bit 0.9."""
+"""Bits a pixel at which another half is lost, and how much scenes differ in it (natural logarithm).  At 0.1 to 0.15 bit
+a pixel 0.5 to 0.9 of what survives at higher rates was left, at 0.2 bit 0.9."""
 STILL_PX = 0.4
 """Edges across which the path's standard deviation is below this are measured."""
 MIN_TRANSFER = 0.25
 """Bins whose |K|² is predicted below this are noise."""
 PARTS = 4
-"""In which the frames may be measured side by side."""
+"""Number of parts in which the frames may be measured in parallel."""
 PAIR_FRAMES = 4
-"""Frames between the two of a pair: the hand has turned, the patch is still in view."""
+"""Distance of the two frames of a pair: the camera has rotated, the patch is still in view."""
 MIN_EDGES = 40
 MIN_ACCEPTED = 0.004
-"""Part of the strong slopes that must be isolated steps: in a scene of smooth things next to none is."""
+"""Least part of the strong gradients that are isolated steps: in a smooth scene next to none are."""
 MIN_RATIOS = 400
 MIN_CONTRAST = 0.06
-"""Least rms of the predicted log ratios: frames that moved alike say nothing about the exposure."""
+"""Least rms of the predicted log ratios: frames with equal motion do not determine the exposure."""
 BLOCKS = 8
-"""Time blocks; what lies in one shares its errors."""
+"""Number of time blocks; measurements within a block share errors."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The local blur that the pictures show: widths of isolated edges, in pixels (forward_model, section 9 (c)).
+"""Local blur measured as widths of isolated edges, in pixels (forward_model, section 9 (c)).
 
 A straight step of light is spread across its normal by everything that blurs: the lens, defocus, and the part of the
 motion path that lies along the normal.  Variances of blurs that follow each other add up, so the width of an edge is
@@ -9,9 +9,9 @@ An edge is measured in linear light, where blurs act, by fitting a step spread b
 to its profile.  It counts only if both plateaus reach ISOLATION widths from its middle and nothing else disturbs the
 profile: textures, thin lines and shading fail that test, whereas steps pass it however blurred they are.
 
-Few steps stand alone over a long way, so whoever takes for each edge the shortest way that holds its own width takes
-those that seem narrow.  All edges of a capture are therefore looked at over a way that holds what is usual there and
-SPREAD more (:func:`evenly_isolated`).
+Few steps are isolated over a long reach, so taking for each edge the shortest reach that holds its own width would
+favour edges that seem narrow.  All edges of a capture are therefore measured over one reach, SPREAD times what their
+usual width asks for (:func:`evenly_isolated`).
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ Picture = NDArray[np.uint8]
 STEP_PX = 0.5
 """Between two samples of a profile."""
 REACHES_PX = (4.0, 5.5, 7.5, 10.0, 14.0, 16.5, 19.0)
-"""Half lengths of the profiles that are tried, shortest first."""
+"""Half lengths of the tried profiles, shortest first."""
 ISOLATION = 4.0
 """Plateaus must reach this many widths, and a pixel, from the edge's middle."""
 SPREAD = 1.2
-"""Edges this many times as wide as is usual are still measured over the reach that all of a capture share: widths of
-one scatter by 4 to 14 % about the usual one (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
+"""Edges this many times as wide as usual are still measured over the reach that all edges of a capture share.  Widths
+in one capture scatter by 4 to 14 % (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
 OTHERS_WIDER = 2.0
-"""Other pictures of a capture may be up to this many times as soft: so far a picture's edges are looked at."""
+"""Other frames of a capture may be up to this many times as soft, so reaches are tried up to that width."""
 LEAST_WIDTH_PX = 0.05
 _FIT_STEPS, _FURTHER_STEPS = 12, 3
-"""Of the descent, from a guess and from what a shorter part of the same step gave."""
+"""Iterations of the descent from a guess, and from the fit over a shorter reach of the same step."""
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeWidths:
-    """Widths of edges, and where, when and under which conditions they were seen.
+    """Widths of edges with their positions, times and conditions.
 
     Before :func:`isolated_edges` one row for each edge and reach that holds it, afterwards one row an isolated edge.
     """
@@ -126,17 +126,17 @@ def observe_picture(
 
 
 def shared_reach_px(width_px: Array) -> float:
-    """Over which edges of these widths (n,) should all be measured."""
+    """The one reach over which edges of these widths (n,) are all measured."""
     return ISOLATION * SPREAD * float(np.median(width_px)) + 1.0 if len(width_px) else 0.0
 
 
 def share_a_reach(edges: EdgeWidths) -> bool:
-    """Whether isolated edges were all measured over one reach at least, as :func:`evenly_isolated` wants it."""
+    """Whether all isolated edges were measured over at least one common reach (:func:`evenly_isolated`)."""
     return bool(np.all(edges.reach_px >= min(shared_reach_px(edges.width_px), REACHES_PX[-1])))
 
 
 def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
-    """Each edge over its shortest reach from the least on, if its profile there is a step's."""
+    """Each edge over its shortest reach not below the least, if its profile there is a step."""
     far = seen.select(seen.reach_px >= least_reach_px)
     order = np.lexsort((far.reach_px, far.number, far.frame))
     edge = np.stack([far.frame, far.number], axis=-1)[order]
@@ -145,10 +145,10 @@ def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
 
 
 def evenly_isolated(seen: EdgeWidths, least: int) -> EdgeWidths:
-    """The isolated edges over one reach, which is SPREAD times what the usual width asks for; wider ones over theirs.
+    """The isolated edges over one common reach, SPREAD times what the usual width asks for; wider ones over their own.
 
-    Whether an edge of about the usual width counts then depends on what stands beside it, and not on its own width.
-    Where fewer than the least number are isolated over so long a reach, each has its own.
+    Whether an edge of about the usual width counts then depends on its surroundings, not on its own width.  Where
+    fewer than the least number are isolated over that reach, each has its own.
     """
     found, reach_px = isolated_edges(seen), 0.0
     while len(found) >= max(least, 1):
@@ -190,7 +190,7 @@ def _levels_of(grey: Array, reach_px: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class WidthFit:
-    """Steps fitted to profiles over every reach that holds them; width 0: another thing than a step."""
+    """Steps fitted to profiles over every reach that holds them; width 0: not a step."""
 
     row: NDArray[np.intp]
     """(n,) which profile."""

@@ -35,15 +35,15 @@ Mask = NDArray[np.bool_]
 
 _EXPOSURE_SCALES = (0.05, 20.0)
 SHIFT_STD_S = 0.004
-"""How far the rows' times may be off after the geometry was fitted; a shift is a nuisance of every fit."""
+"""Standard deviation of the rows' times after the geometric fit; their shift is a nuisance parameter of every fit."""
 PATH_STD = 0.03
 """Relative error of the predicted path's length that focal length and gyroscope scale leave."""
 EDGE_STD = 0.04
-"""Part by which a capture's edges are all told too narrow or too wide, as the scene has soft ones and the encoder takes
-detail away: ``python -m virest.app.bench --only edges`` prints it for a defocus of 2 to 3.5 px."""
+"""Relative error that all edge widths of a capture share, from soft edges of the scene and detail lost to the encoder:
+``python -m virest.app.bench --only edges`` prints it for a defocus of 2 to 3.5 px."""
 OWN_REACH_STD = 0.06
-"""The same where too few edges stand alone over one reach, and each was measured over its own: over 12 simulated
-captures −0.048 in the mean, standard deviation 0.036."""
+"""The same where too few edges are isolated over one reach, so that each is measured over its own: −0.048 in the mean
+over 12 simulated captures, standard deviation 0.036."""
 _NUISANCE = np.array([LENS_SIGMA_PX, 0.0])
 _NUISANCE_STD = np.array([LENS_STD_PX, SHIFT_STD_S])
 _NUISANCE_LOW = np.array([0.35, -0.03])
@@ -67,10 +67,10 @@ class BlurEffect(Protocol):
         """The profile with the effect's parameters set."""
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
-        """Whether the capture can tell the effect at all."""
+        """Whether the capture determines the effect at all."""
 
     def possible(self, values: Array) -> bool:
-        """Whether fitted values are an estimate, and not the end of what they may be."""
+        """Whether fitted values are an estimate rather than a bound of the fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class ExposureTime:
         return float(np.sqrt(np.mean(own**2))) > MIN_CONTRAST
 
     def possible(self, values: Array) -> bool:
-        """Paths that would have no length, or any, explain nothing: something else is wrong."""
+        """Blur paths of zero or unlimited length explain nothing: something else is wrong."""
         low, high = _EXPOSURE_SCALES
         return low < float(values[0]) < high
 
@@ -111,7 +111,7 @@ class Defocus:
     parameters: tuple[str, ...] = ("sigma_px",)
 
     def starts(self, observations: BlurObservations, profile: CameraProfile) -> list[Array]:
-        """What the sharper half of the edges have beyond the lens."""
+        """Excess width of the sharper half of the edges over the lens's."""
         width = float(np.quantile(observations.edges.width_px, 0.4)) if len(observations.edges) else LENS_SIGMA_PX
         return [np.array([np.sqrt(max(width**2 - LENS_SIGMA_PX**2, 0.04))])]
 
@@ -125,7 +125,7 @@ class Defocus:
         return observations.edges_determined
 
     def possible(self, values: Array) -> bool:
-        """No defocus at all is an estimate too."""
+        """Always: zero defocus is a valid estimate."""
         return True
 
 
@@ -161,9 +161,9 @@ def fit(
 ) -> BlurFit:
     """Fit the effects' values and the nuisances, which have priors, robustly.
 
-    use: mask over the residuals.  Effects that the capture does not determine, or whose values run to the end of what
-    they may be, keep their values, with infinite deviations.  The covariance is a sandwich over time blocks: what lies
-    in one block shares its errors.
+    use: mask over the residuals.  Effects that the capture does not determine, or whose values reach a bound, keep
+    their values, with infinite deviations.  The covariance is a sandwich over time blocks, within which errors are
+    correlated.
     """
     use = np.ones(len(observations), bool) if use is None else use
     known = tuple(e.determined(observations, profile, trajectory) for e in effects)
@@ -180,7 +180,7 @@ def _fit(
     use: Mask,
     known: tuple[bool, ...],
 ) -> BlurFit:
-    """As :func:`fit`, for those effects that are known to be determined."""
+    """As :func:`fit`, for effects that are known to be determined."""
     free = [e for e, yes in zip(effects, known, strict=True) if yes]
     evidence = _Widths(observations, profile, trajectory, free, use)
     found = descend(evidence, np.concatenate([*(e.starts(observations, profile)[0] for e in free), _NUISANCE]))
@@ -266,8 +266,8 @@ class _Widths:
     def covariance(self, found: System[Array, Residuals]) -> Array:
         """H⁻¹ (Σ g g' over time blocks + prior) H⁻¹ of all values, and what unknown damping and widths add.
 
-        The damping is not fitted: beside the length of the path it would be told by the ratios' curvature alone,
-        which coding changes too.  Nor is what all widths have in common, which is what a defocus does.
+        The damping is not fitted: beside the path length only the ratios' curvature determines it, which coding changes
+        too.  Nor is an error common to all widths, which acts like a defocus.
         """
         observations, edge = self.observations, self.observations.is_edge
         block = time_blocks(observations.time_s)[self.use]

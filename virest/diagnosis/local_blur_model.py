@@ -1,7 +1,7 @@
-"""What the profile predicts for the local blur: the one forward model's paths, across edges and in spectra.
+"""Local blur as the profile predicts it: blur paths of the forward model, across edges and in spectra.
 
-A fit asks for the paths of some hundred frames again and again, so they are worked out for all frames together, from
-the trajectory and the moving lens that `image_formation.kernels` uses as well; a test holds the two to each other.
+A fit needs the paths of some hundred frames many times, so they are computed for all frames together, from the
+trajectory and the moving lens that `image_formation.kernels` also uses; a test compares the two.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from virest.motion.trajectory import Trajectory
 Array = NDArray[np.float64]
 _NODES = 4
 _INSTANTS = 5
-"""Of an exposure (Gauss-Legendre): exact for paths that bend like a fourth-order polynomial."""
+"""Gauss-Legendre nodes of an exposure: exact for paths that are polynomials of fourth order in time."""
 _RATIOS = np.linspace(0.0, 6.0, 25)
 LEAST_ANGLE = 1e-3
 """Below it sin q / q is 1 to single precision."""
 
 
 def fitted_width(motion_px: Array, defocus_px: Array | float, lens_px: float) -> Array:
-    """Width that the fit of an edge reports for a straight path and a Gaussian after one another.
+    """Width that the fit of an edge reports for the convolution of a straight path and a Gaussian.
 
     motion_px: standard deviation of the path across the edge.  A path alone is a ramp, not a Gaussian, so the fitted
     width is not quite the root of the summed variances; the ratio of the two is tabled by fitting such profiles.
@@ -116,7 +116,7 @@ def predicted_ratios(ratios: SpectrumRatios, profile: CameraProfile, trajectory:
 def covariates(
     stamp_s: Array, exposure_s: Array, points_px: Array, profile: CameraProfile, trajectory: Trajectory
 ) -> dict[str, Array]:
-    """What a structure in the residuals may run along: row, time, radius, rate, exposure, path length and angle."""
+    """Covariates of the residuals: row, time, radius, rate, exposure, path length and angle."""
     width, height = profile.width, profile.height
     clock, chords = RowClock(profile), np.empty((len(stamp_s), 2))
     for rows in _by_frame(stamp_s):
@@ -143,7 +143,7 @@ def _by_frame(stamp_s: Array) -> list[NDArray[np.intp]]:
 
 @lru_cache(maxsize=4)
 def _nodes(width: int, height: int) -> tuple[Array, Array]:
-    """Places (n, 2), and what turns values there into coefficients of :func:`_monomials`."""
+    """Nodes (n, 2), and the matrix that maps values there to coefficients of :func:`_monomials`."""
     part = (np.arange(_NODES) + 0.5) / _NODES
     points = np.stack(np.meshgrid(part * width, part * height), -1).reshape(-1, 2)
     return points, np.asarray(np.linalg.pinv(_monomials(points, width, height)), float)

@@ -1,8 +1,8 @@
 """Relative blur: the same patch of the scene in two frames, as ratios of its power spectra (forward_model, section 9).
 
-In linear light a tile's power is |K|² |lens|² |scene|² and a floor of noise.  Between two frames that show the same
-patch the scene, the lens and defocus cancel: log P1/P2 = log |K1|²/|K2|².  What is left is the motion alone, and it
-needs no edges and no belief about the scene, only frames that moved unequally.
+In linear light a tile's power is |K|² |lens|² |scene|² plus a noise floor.  In the ratio of two frames that show the
+same patch the scene, the lens and defocus cancel: log P1/P2 = log |K1|²/|K2|².  The ratio depends on motion alone; it
+needs neither edges nor a prior for the scene, only frames with unequal motion.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ Picture = NDArray[np.uint8]
 
 SIDE_PX = 64
 MEMORY = 3
-"""Frames whose blur a decoded picture may show: its own and, through H.264's prediction, those before it."""
+"""Number of frames whose blur a decoded frame may show: its own and, through H.264's prediction, those before it."""
 SPACING_PX = 48
 BANDS_PER_PX = (0.055, 0.08, 0.11)
 """Edges of the rings of frequency, cycles a pixel: above the window's own width, below what H.264 quantises away."""
 SECTORS = 6
 SCENE_POWER = 2.5
-"""Power of a scene falls about like this power of the frequency: 2 for natural texture, 3 for edges."""
+"""A scene's power falls with about this power of the frequency: 2 for natural texture, 3 for edges."""
 MAX_BACK_PX = 0.3
 """A tile whose tracked middle does not come back to within this is dropped."""
 MIN_FLOOR_LEVELS = 2.0
-"""Least error of a decoded picture, grey levels: quantisation makes more of it than the smooth parts show."""
+"""Least error of a decoded frame, grey levels: quantisation adds more than smooth regions show."""
 SIGNAL_TO_FLOOR = 8.0
 """Least power of a ring's sector over the floor, in the mean of both frames."""
 
@@ -117,7 +117,7 @@ def ring_of_bin() -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """A picture with the log of its frame and of the MEMORY − 1 before it."""
+    """A picture with the metadata of its frame and of the MEMORY − 1 frames before it."""
 
     picture: Picture
     recent: tuple[Frame, ...]

@@ -1,14 +1,14 @@
-"""Brightness of the same scene patches in many frames, and what a profile predicts for it (forward_model, section 9).
+"""Brightness of the same scene patches in many frames, measured and as a profile predicts it (forward_model, section 9).
 
 Model of one observation of a patch with unknown light L, in grey levels of 255:
 ``grey = E(L · product · vignetting(r) · flicker(t) · gain)``, E the profile's curve with its gamma and black level,
 ``product`` the logged exposure × ISO.  L is a nuisance: each evaluation profiles it out, patch by patch, in grey
 levels, where the noise is even.  In light, a steeper curve would shrink the residuals and so explain anything.
 
-A video encoder of few bits does not pass small changes of brightness on at once: in a patch that is flat and moves it
-repeats its last picture and corrects a part of the difference.  Decoded grey: ``y[k] = x[k] + memory (y[k−1] − x[k])``,
-y = x in frames coded on their own.  At 0.25 bits a pixel memory is about 0.25, and flicker of 100 Hz in 30 frames a
-second appears a third weaker and 0.2 rad late.  The memory belongs to the movie; fits find it along with the rest.
+A video encoder at a low bit rate delays small changes of brightness: in a flat moving patch it repeats its last picture
+and corrects a part of the difference.  Decoded grey: ``y[k] = x[k] + memory (y[k−1] − x[k])``, y = x in intra-coded
+frames.  At 0.25 bits a pixel memory is about 0.25, and flicker of 100 Hz at 30 frames a second appears a third weaker
+and 0.2 rad late.  The memory is a property of the movie; fits estimate it with the other values.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LOG_LIGHT = np.arange(-9.5, 0.75, 0.002)
 """Grid of the tabulated curve, natural logarithm of the light."""
 _LIGHT_STEPS = 3
 _LEAST_SLOPE = 0.02
-"""Grey levels per unit of log light below which an observation says nothing about light."""
+"""Grey levels per unit of log light below which an observation does not determine its light."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class PhotometricObservations:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What a profile makes of observations, the patches' light profiled out."""
+    """A profile's prediction of the observations, the patches' light profiled out."""
 
     residual: Array
     """(n,) measured − predicted, grey levels of 255."""
@@ -171,15 +171,15 @@ def predict(observations: PhotometricObservations, profile: CameraProfile, weigh
 
 
 def remembered(observations: PhotometricObservations, grey: Array) -> Array:
-    """What the encoder makes of true brightnesses (n,) or (n, k): each patch follows with its memory.
+    """Decoded brightnesses for true ones (n,) or (n, k): each patch follows with the encoder's memory.
 
-    Linear in ``grey``.  A patch that was not seen for some frames forgets accordingly; its first sight is exact.
+    Linear in ``grey``.  The memory of a patch fades over frames that do not show it; its first observation is exact.
     """
     return _remembered(_kept(observations), grey)
 
 
 def _kept(observations: PhotometricObservations) -> list[Array]:
-    """What is left of a lag after 1, 2, 4 … observations of its patch, (n,) each; none where nothing is remembered."""
+    """Part of a lag left after 1, 2, 4 … observations of its patch, (n,) each; empty without memory."""
     memory, patch, frame = observations.memory, observations.patch, observations.frame
     if memory == 0.0 or len(patch) == 0:
         return []
@@ -211,7 +211,7 @@ def residuals(observations: PhotometricObservations, profile: CameraProfile) -> 
 def normalised_rms(observations: PhotometricObservations, profile: CameraProfile) -> tuple[float, float]:
     """(RMS of residuals, RMS of their noise), grey levels, robust: residuals beyond 5 noises count as 5.
 
-    Every patch spends one observation on its light; both figures are of the rest.
+    Each patch's light takes one degree of freedom, which both figures account for.
     """
     limit = 5 * observations.noise
     left = np.clip(residuals(observations, profile), -limit, limit)

@@ -15,11 +15,11 @@ from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import ROW_MIDDLE
 
 _SCAN_OBSERVATIONS = 7_000
-"""Enough to find a frequency; larger temporaries are fetched from the system anew each time, ten times slower."""
+"""Enough to find a frequency; larger temporary arrays are allocated anew each time, ten times slower."""
 _SCAN_STEP_CYCLES = 0.3
-"""Scan step times the capture's length."""
+"""Scan step as a product with the capture's length, cycles."""
 _LEAST_SINC = 0.03
-"""An exposure of nearly whole periods leaves less of the flicker than this: not looked for."""
+"""An exposure of nearly whole periods leaves less of the flicker than this: such frequencies are not searched."""
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 
@@ -130,7 +130,7 @@ class Vignetting(_OneValue):
 
 @dataclass(frozen=True, slots=True)
 class Flicker:
-    """Lamps that pulse."""
+    """Flickering lamps."""
 
     name: str = "flicker"
     parameters: tuple[str, ...] = ("amplitude", "frequency_hz", "phase_rad")
@@ -223,7 +223,7 @@ def photometric_effects(observations: PhotometricObservations, movie_frames: int
 
 @dataclass(frozen=True, slots=True)
 class FlickerScan:
-    """How much of the residuals a sine of each frequency takes away."""
+    """Reduction of the residuals by a sine of each frequency."""
 
     frequency_hz: Array
     power: Array

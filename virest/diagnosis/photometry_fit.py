@@ -1,7 +1,7 @@
-"""Fit photometric effects, state how well they are known, and judge them where they were not fitted.
+"""Fits of photometric effects, their covariances, and their gains on held-out observations.
 
-Residuals are in units of their noise, each patch's light eliminated.  They are not independent: those of one stretch of
-time share their frames' registration and coding, those of one place its texture.  Covariances count both (Cameron,
+Residuals are in units of their noise, each patch's light eliminated.  They are not independent: those of one time block
+share their frames' registration and coding, those of one patch its texture.  Covariances cluster by both (Cameron,
 Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
 """
 
@@ -35,37 +35,37 @@ from virest.inference.time_blocks import halves, varied_blocks
 _MAX_STARTS = 8
 _FIRST_MEMORY, _MEMORY_SPREAD, _MOST_MEMORY = 0.2, 0.2, 0.6
 _PRIOR_SCALES = 10.0
-"""Weak knowledge that keeps what the data leave open where it was: this many typical changes."""
+"""Standard deviation of a weak prior, in typical changes: it holds values that the data do not determine."""
 _SMALL_STEP = 1e-3
 _MEMORY_STEP = 0.01
 _TRIAL_OBSERVATIONS = 6_000
 _PER_FRAME = 100
-"""Observations of a frame that its own value is fitted to; more cost much and tell little."""
+"""Observations of a frame that its own value is fitted to; more add cost and little precision."""
 MEMORY_DOUBT = 0.25
-"""One memory for a movie is a rough model of an encoder: this part of what it changes in a value counts as unsure."""
+"""One memory for a movie is a rough model of an encoder: this part of its effect on a value enters the deviation."""
 LAG_DOUBT = 0.2
-"""Part of a sudden change of a whole frame's brightness that an encoder at 0.25 bits a pixel may leave out."""
+"""Part of a sudden change of a whole frame's brightness that an encoder at 0.25 bits a pixel may omit."""
 SHARED_ERRORS = 3.0
 """Patches of one frame share errors of registration and coding, which their scatter does not show: gains of frames that
 were alike came out 1.3 to 3 times further off than it says, on movies of 1 to 0.25 bits a pixel."""
 LATE_FRAMES, CURVE_DOUBT = 0.5, 0.02
-"""What gains may make of changes of the logarithm of exposure × ISO that are none of their own: an encoder is about so
-many frames late beyond its memory, and a curve is that far off in its slope and in its bend."""
+"""Errors that changes of log exposure × ISO may cause in gains: an encoder's delay beyond its memory, in frames, and
+the error of a curve's slope and curvature."""
 NEIGHBOURS = 3.0
-"""Changes from frame to frame of which one counts: each shares a frame with the next."""
+"""One in so many changes from frame to frame counts as independent: each shares a frame with the next."""
 BLOCKS_S = 0.3
-"""About the length of a block of frames: longer than a hand's sway keeps its direction, and than the encoder's memory
-of a picture that moves."""
+"""Typical length of a block of frames: longer than the correlation of hand shake and than the encoder's memory of a
+moving picture."""
 BLOCK_LENGTHS = (1.0, 0.7, 1.25, 0.85, 1.4)
 """Of the blocks in turn, times BLOCKS_S."""
 RESOLUTION = {"vignetting": 0.006, "flicker": 0.004, "response_curve": 0.01, "black_level": 0.002, "gain_drift": 0.003}
-"""Part of every standard deviation: smaller values are not told from what encoders and slightly textured patches do,
-whatever the statistics say."""
+"""A part of every standard deviation: smaller values cannot be told from effects of encoders and slightly textured
+patches, whatever the statistics say."""
 
 
 @dataclass(frozen=True, slots=True)
 class PhotometricFit:
-    """Values of effects and what they are worth."""
+    """Values of effects and their covariance."""
 
     effects: tuple[PhotometricEffect, ...]
     values: Array
@@ -158,8 +158,8 @@ def judge(
 ) -> HeldOutGain:
     """Fit on one half, judge on the other, and the reverse.  beside: effects that are in already.
 
-    by_side: halves are the picture's sides instead of blocks of time: what a shadow makes a cause say on one does not
-    hold on the other.  None: for effects with a value per frame, which no other frame knows.
+    by_side: the halves are sides of the frame instead of time blocks: what a shadow mimics on one side does not hold
+    on the other.  None: for effects with a value per frame, which no other frame determines.
     """
     by_side = any(effect.per_frame for effect in effects) if by_side is None else by_side
     both = _sides(observations) if by_side else halves(time_blocks(observations))
@@ -199,11 +199,10 @@ def significance(fit: PhotometricFit, effect_name: str, observations: Photometri
 
 
 def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covariance: Array) -> float:
-    """Probability that frames' gains are nothing but errors, and what curve and encoder make of exposure × ISO.
+    """P-value of frames' gains against errors and what curve and encoder make of exposure × ISO.
 
-    Frames of one stretch of time share their errors: each stretch counts once.  From one frame to the next what they
-    share cancels, so quick changes are looked at on their own; neighbouring ones have a frame in common, and a third of
-    them counts.
+    Frames of one time block share errors, so each block counts once.  Shared errors cancel from one frame to the next,
+    so fast changes are tested separately; neighbouring changes have a frame in common, so a third of them counts.
     """
     product = _per_frame(observations, observations.log_product)
     rounding = _per_frame(observations, observations.log_product_std)
@@ -228,7 +227,7 @@ def _quick_changes(log_gain: Array, spread: Array) -> float:
 
 
 def _lag_of_gains(log_gain: Array, exposed: Array) -> Array:
-    """What an encoder's lag behind the gains' own changes adds to their covariance: without gains there is none."""
+    """Covariance that an encoder's lag behind the gains' own changes adds; zero without gains."""
     own = np.abs(log_gain - _frames_before(log_gain, 1))
     centre = np.eye(len(own)) - 1 / len(own)
     return np.asarray(centre @ np.diag(LAG_DOUBT**2 * ((own + exposed) ** 2 - exposed**2)) @ centre)
@@ -244,14 +243,14 @@ def _per_frame(observations: PhotometricObservations, values: Array) -> Array:
 
 
 def _seen_twice(held: PhotometricObservations) -> PhotometricObservations:
-    """Without patches that are held out once only: one observation alone has no residual."""
+    """The mask without patches that are held out only once: a single observation has no residual."""
     return held.subset(np.bincount(held.patch)[held.patch] >= 2)
 
 
 def _fitted_part(
     observations: PhotometricObservations, effects: Sequence[PhotometricEffect]
 ) -> PhotometricObservations:
-    """What a fit looks at: all, or with values per frame enough for each."""
+    """The observations that a fit uses: all, or enough of each frame for effects with values per frame."""
     if any(effect.per_frame for effect in effects):
         return _thinned(observations, _PER_FRAME * len(observations.frames))
     return observations
@@ -287,7 +286,7 @@ def _parts(effects: Sequence[PhotometricEffect]) -> Iterator[tuple[PhotometricEf
 
 @dataclass(frozen=True, slots=True)
 class _Brightness:
-    """Observations, and what stays the same through a descent; values (k + 1,) of the effects, then the memory."""
+    """Observations and the constants of a descent; values (k + 1,): the effects', then the memory."""
 
     observations: PhotometricObservations
     profile: CameraProfile
@@ -412,7 +411,7 @@ def _pulse_resolution(observations: PhotometricObservations, profile: CameraProf
 
 
 def _changes(observations: PhotometricObservations, effects: Sequence[PhotometricEffect], values: Array) -> Array:
-    """How far each frame's brightness is from the frame before's, by its own value and by exposure × ISO.
+    """Change of each frame's brightness from the frame before, by its own value and by exposure × ISO.
 
     0 for all other values and the memory.
     """

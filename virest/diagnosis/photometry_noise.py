@@ -1,8 +1,8 @@
-"""How well the brightness of a patch is measured, found without the camera model.
+"""Noise of patches' brightness, measured without the camera model.
 
-Each frame gets a free smooth field of place, row and brightness, and each patch a brightness of its own, whatever the
-cause; both are found together, so that a patch seen only while the exposure was long is no odd one among the others.
-What remains is noise: of the sensor, of the encoder, and of looking beside the patch.
+Each frame gets a free smooth field of position, row and brightness, and each patch a brightness of its own, whatever
+the cause.  Both are estimated together, so that a patch seen only during long exposures is not an outlier.  The rest is
+noise: of the sensor, of the encoder, and of registration.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from virest.diagnosis.photometry import Array, Indices, PhotometricObservations
 from virest.inference.robust import MEDIAN_TO_STD
 
 _MOST_ROW_KNOTS = 17
-"""Lamps pulse two or three times in a readout: this many knots follow them."""
+"""Lamps pulse two or three times in a readout, which this many knots represent."""
 _PLACES_PER_TERM = 3.0
 """A field has at most one term for this many places of its frame: the three colours of a place are not independent."""
 _PRIOR_COUNT = 6.0
@@ -115,7 +115,7 @@ def _design(
 def _basis(observations: PhotometricObservations, chosen: Indices, level: Array) -> Array:
     """A cubic in brightness, and brightness times (a quadratic in place + hats along the readout).
 
-    As many of them as the frame's places can bear.
+    The number of terms is limited by the frame's number of patches.
     """
     size = max(observations.width, observations.height)
     x = (observations.x_px[chosen] - observations.width / 2) / size

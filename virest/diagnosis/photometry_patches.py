@@ -1,9 +1,9 @@
-"""Find flat patches in key frames and see how bright they are in other frames.
+"""Flat patches of key frames and their brightness in other frames.
 
-Where a patch went is predicted by the rotation between its rows' times, and corrected by what is seen: corners followed
-from the key frame (pyramidal Lucas-Kanade on locally normalised pictures, so that brightness changes do not move them)
-give a smooth field of deviations.  So offset, readout, focal length and parallax of the profile may be wrong by many
-pixels; what they leave is small against the flat surround of a patch.
+A patch's position is predicted by the rotation between its rows' times and corrected by measurement: corners tracked
+from the key frame (pyramidal Lucas-Kanade on locally normalised frames, which brightness changes do not move) give a
+smooth field of deviations.  Offset, readout, focal length and parallax of the profile may thus be wrong by many pixels;
+the remaining error is small against the flat surround of a patch.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class PatchSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Key:
-    """A key frame and what is looked for in others."""
+    """A key frame with the patches and corners that other frames are searched for."""
 
     frame: Frame
     normal: Picture
@@ -136,7 +136,7 @@ def _halved(picture: Picture | None) -> Picture | None:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What is needed of one picture."""
+    """Smoothed versions of one picture."""
 
     mean: NDArray[np.float32]
     """(h, w, 3) mean over the patch's square."""
@@ -231,7 +231,7 @@ def _seen_patches(
 
 
 def predicted_points(points_px: Array, key: Frame, frame: Frame, camera: TurningCamera | None) -> Array:
-    """Where points (n, 2) of one frame are seen in another by rotation alone, each at its own row's mid-exposure.
+    """Positions in another frame of points (n, 2) by rotation alone, each at its own row's mid-exposure.
 
     camera: None: where they were.
     """
@@ -252,7 +252,7 @@ class Follower:
 def seen_elsewhere(
     at: Follower, other: Follower, camera: TurningCamera, points_px: Array
 ) -> NDArray[np.float32] | None:
-    """Where points (..., 2) of one frame are seen in another, (..., 2), corrected by corners; None: not registered."""
+    """Positions (..., 2) in another frame of points (..., 2), corrected by corners; None: not registered."""
     settings = PatchSettings()
     looks = [_look(cv2.cvtColor(one.gray, cv2.COLOR_GRAY2RGB), settings) for one in (at, other)]
     key = _make_key(at.frame, looks[0], 0, settings)
@@ -313,7 +313,7 @@ def _smooth_basis(points_px: Array, width: int, height: int) -> Array:
 def _read(key: _Key, points_px: Array, frame: Frame, look: _Look, settings: PatchSettings) -> Array:
     """Table (n, 8): place, frame, x, y, three means and the spread of the patches that lie well inside.
 
-    A patch with much more contrast than in its key frame shows something else too.
+    A patch with much more contrast than in its key frame is dropped: it shows something else.
     """
     height, width = look.normal.shape
     edge = settings.surround_px * _scale(width, height) / 2

@@ -1,7 +1,7 @@
-"""The ladder for what changes brightness and blur, after the points' causes are in the profile.
+"""The ladders for brightness and blur, climbed once the geometric causes are in the profile.
 
-Brightness of patches seen again and again: curve, black level, vignetting, flicker, gain.  Where exposure × ISO stays
-the same, the curve shows only in how blur mixes light.  Blur: exposure and defocus, from edges and from spectra.
+Brightness of patches seen in many frames gives curve, black level, vignetting, flicker and gain.  At constant
+exposure × ISO the curve shows only in how blur mixes light.  Blur of edges and spectra gives exposure and defocus.
 """
 
 from __future__ import annotations
@@ -49,20 +49,19 @@ Picture = NDArray[np.uint8]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 MAX_RUNGS = 3
 WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130
-"""Brightness is judged in every frame of a short capture, and in one stretch of a longer one: patches hang together
-from frame to frame."""
+"""Brightness is measured in every frame of a capture of up to the first number of frames, and in one run of the second
+number in a longer one: patches are followed from frame to frame."""
 MAX_GAIN_FRAMES = 3000
 """A gain for each frame is fitted in captures of up to this many frames."""
 SAME_SPREAD = 0.05
-"""Stretches whose log exposure × ISO spreads alike to this tell the curve alike."""
+"""Runs whose standard deviations of log exposure × ISO agree to this determine the curve equally well."""
 MIN_OBSERVATIONS = 300
 CURVE: dict[str, PhotometricEffect] = {"response_curve": ResponseGamma(), "black_level": BlackLevel()}
 MOST_KEPT = 0.45
-"""An encoder that keeps this part of the last picture keeps more of dark patches than of bright ones, whatever the
-curve:
-a black level would only absorb that."""
+"""An encoder that keeps this part of the last picture keeps more of dark patches than of bright ones under any curve,
+which a black level would only absorb."""
 VARIED_LIGHT = 0.25
-"""Log exposure × ISO must spread this much for the curve to be read from brightness; else mixing tells it."""
+"""Least spread of log exposure × ISO for estimating the curve from brightness; below it, mixing by blur gives it."""
 UNEVEN = (
     "brightness changes from frame to frame, unevenly across the frame: a moving shadow "
     "or light from one side; no cause was named for it"
@@ -79,7 +78,7 @@ Mixed = tuple[MixingEstimate, HeldOutGain]
 
 @dataclass(slots=True)
 class PictureVerdict:
-    """Where this ladder ended."""
+    """The end of the ladders for brightness and blur."""
 
     profile: CameraProfile
     findings: list[Finding] = field(default_factory=list)
@@ -102,9 +101,9 @@ class PictureVerdict:
 
 
 def light_stretch(frames: Sequence[Frame]) -> list[Frame]:
-    """Frames to judge brightness by: all of few, else the stretch of neighbours over which exposure × ISO varies most.
+    """Frames for the brightness ladder: all of a short capture, else the run over which exposure × ISO varies most.
 
-    Among stretches that are alike in this the one nearest to the middle.
+    Of runs that agree in this it is the one nearest to the middle.
     """
     if len(frames) <= WHOLE_LIGHT_FRAMES:
         return list(frames)
@@ -124,7 +123,7 @@ def climb_light(
     rgb: Reader,
     each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
-    """Find what changes brightness, on a stretch of a long capture; a gain for each frame then in all of it."""
+    """Find the causes of brightness changes, on a run of a long capture; gains per frame then on the whole capture."""
     looked = light_stretch(frames)
     found = climb_photometry(capture, looked, profile, trajectory, rgb, each)
     if len(looked) == len(frames):
@@ -259,7 +258,7 @@ def _still_needed(
     accepted: list[PhotometricEffect],
     fitted: PhotometricFit,
 ) -> tuple[list[PhotometricEffect], PhotometricFit]:
-    """Without causes that a later one made superfluous: free gains take up whatever else changes frames' brightness."""
+    """The causes without those that a later one made superfluous: free gains absorb other changes of frames' brightness."""
     for effect in accepted[:-1]:
         if not LIGHT_LEVELS.significant(significance(fitted, effect.name, observations)[1]):
             accepted = [other for other in accepted if other is not effect]
@@ -323,7 +322,7 @@ def judge_curve(
     pictures: Reader,
     each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
-    """Gamma or black level from how blur mixes light, where nothing else tells them; paths must be right by now."""
+    """Gamma or black level from how blur mixes light, where nothing else determines them; needs correct blur paths."""
     verdict = PictureVerdict(profile)
     if observations is None or not light_varies(observations):
         usable = [frame for frame in frames if frame.exposure_s]

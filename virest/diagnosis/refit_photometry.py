@@ -1,14 +1,14 @@
-"""What brightness says under the profile as finally found, and what is left open of the curve counted in.
+"""Refit of the photometric values under the final profile, with the uncertainty of curve and exposure included.
 
-The ladder fits vignetting, flicker and gains before blur has told the exposure and, at constant exposure × ISO, the
-curve.  A curve with gamma g shows a factor v on the light about as one without shows v^g: at constant exposure the
-brightness of patches fits as well, and a corner that keeps 0.5 of the light is taken for one that keeps 0.41 where g is
-1.3.  So all these values are fitted again under the profile as found, and their covariance gets ``P S Pᵀ``, P their
-change with the curve and the exposure (photometry_fit.pulls), S what is not known of those (as Schmidt 1966 did for
-parameters that a filter considers but does not estimate).
+The ladder fits vignetting, flicker and gains before blur gives the exposure and, at constant exposure × ISO, the curve.
+A curve with gamma g shows a factor v on the light about as one without shows v^g: at constant exposure the brightness
+of patches fits equally well, and where g is 1.3, a corner that keeps 0.5 of the light is taken for one that keeps 0.41.
+All these values are therefore fitted again under the final profile.  Their covariance gets ``P S Pᵀ``, P their change
+with the curve and the exposure (photometry_fit.pulls), S the uncertainty of those: they are consider parameters in the
+sense of Schmidt 1966.
 
-A change of the curve that was looked for and not named is not excluded: S is then its second moment about the
-profile's value, from what was measured and from how far a curve may be off.
+A change of the curve that was not found significant is not excluded: S is then its second moment about the profile's
+value, from the measurement and from how far a curve may be off.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, pull
 from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, frames_of, light_varies, sentence_of, values_of
 
 STATED_DOUBT = np.array([0.15, 0.02])
-"""How far a curve that a profile states may be off: logarithm of gamma, black level."""
+"""Standard deviation of a curve that a profile states: logarithm of gamma, black level."""
 UNKNOWN_DOUBT = np.array([0.3, 0.04])
 """The same of the default for an unknown curve."""
 _STEP = 1e-3

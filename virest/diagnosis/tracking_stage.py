@@ -51,7 +51,7 @@ NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 
 
 
 def frames_to_follow(capture: Capture, profile: CameraProfile) -> list[int]:
-    """Movie indices, ascending: every stamped frame, or the start-up and the runs with most motion of a long capture."""
+    """Movie indices, ascending: every stamped frame; of a long capture the start-up and the runs with most motion."""
     stamped = [frame.index for frame in capture.frames if NO_STAMP not in frame.skip_codes]
     if len(stamped) <= WHOLE_FRAMES:
         return stamped
