@@ -335,7 +335,7 @@ def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> boo
 
 
 def travel_blur_px(geometric: GeometricVerdict) -> float:
-    """How far the camera's translation moves points within an exposure, px: the 90th percentile over points and frames."""
+    """Path length of points by the camera's translation within an exposure, px: its 90th percentile over all points."""
     fitted, table = geometric.fit, geometric.table
     if geometric.model.scene is None:
         return 0.0

@@ -1,4 +1,4 @@
-"""Brightness of the same scene patches in many frames, measured and as a profile predicts it (forward_model, section 9).
+"""Brightness of scene patches in many frames, measured and as a profile predicts it (forward_model, section 9).
 
 Model of one observation of a patch with unknown light L, in grey levels of 255:
 ``grey = E(L · product · vignetting(r) · flicker(t) · gain)``, E the profile's curve with its gamma and black level,
