@@ -4,6 +4,7 @@ import inspect
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_type_hints
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from virest.app.api_records import CalibratedFacts, CalibrationFacts, Simulation
 from virest.app.simulate import simulate_command
 from virest.camera.response import ResponseCurve
 from virest.errors import CalibrationError, CaptureError, SettingsError
+from virest.simulation.phone_isp import make_isp
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "leaves"
 FRAME = 5
@@ -131,16 +133,25 @@ def test_calibrating_gives_the_record_and_writes_only_what_is_asked_for(
         "walk", width=256, height=192, frames=18, seed=2, rate_rad_s=1.5, exposure_ms=6.0, effects=["time_offset=0.02"]
     )
     assert simulated["frames"] == 18
-    assert set(simulated) == set(SimulationFacts.__annotations__)
+    optional = {"auto_exposure_ev", "exposure_range_ms", "iso_range", "isp"}
+    assert set(simulated) == set(SimulationFacts.__annotations__) - optional
     before = sorted(tmp_path.rglob("*"))
     found = virest.calibrate("walk")
-    assert set(found) == {"with", *CalibrationFacts.__annotations__} - {"written"}
+    assert set(found) == set(get_type_hints(CalibrationFacts)) - {"written"}
     assert set(found["values"][0]) == set(CalibratedFacts.__annotations__)
     offset = next(value for value in found["values"] if value["name"] == "time_offset_s")
     assert offset["value"] == pytest.approx(0.02, abs=5e-4)
     with pytest.raises(SettingsError, match="did you mean 'focal'"):
         virest.calibrate("walk", extra=["focl"])
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_exposed_and_developed_capture_has_the_declared_facts(tmp_path: Path) -> None:
+    """Auto-exposure and the phone's own processing add facts, all of which a type checker knows."""
+    simulated = virest.simulate(
+        tmp_path / "phone", width=128, height=96, frames=3, auto_exposure_ev=2.0, isp=make_isp("phone")
+    )
+    assert set(simulated) == set(SimulationFacts.__annotations__)
 
 
 def test_a_capture_that_does_not_tell_is_an_error(tmp_path: Path) -> None:

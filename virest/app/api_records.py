@@ -26,7 +26,11 @@ class CalibratedFacts(TypedDict):
     rough: bool
 
 
-class CalibrationFacts(TypedDict):
+_ExtraValues = TypedDict("_ExtraValues", {"with": list[str]})
+"""The values that ``--with`` names; its key is a word of Python's own."""
+
+
+class CalibrationFacts(_ExtraValues):
     """What ``virest calibrate --json`` prints."""
 
     capture: str
@@ -83,6 +87,12 @@ class SimulationFacts(TypedDict):
     readout_direction: str
     seed: int
     blur_px: float
+    auto_exposure_ev: NotRequired[float]
+    """With auto-exposure, as the two below."""
+    exposure_range_ms: NotRequired[list[float]]
+    iso_range: NotRequired[list[int]]
+    isp: NotRequired[Mapped]
+    """Strengths of the phone's own processing that are on."""
     effects: list[Mapped]
 
 

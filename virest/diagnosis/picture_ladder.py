@@ -258,7 +258,7 @@ def _still_needed(
     accepted: list[PhotometricEffect],
     fitted: PhotometricFit,
 ) -> tuple[list[PhotometricEffect], PhotometricFit]:
-    """The causes without those that a later one made superfluous: free gains absorb any change of a frame's brightness."""
+    """The causes without those that a later one made superfluous: free gains absorb any change of brightness."""
     for effect in accepted[:-1]:
         if not LIGHT_LEVELS.significant(significance(fitted, effect.name, observations)[1]):
             accepted = [other for other in accepted if other is not effect]
