@@ -52,13 +52,17 @@ def wait_for(condition: Callable[[], bool], process: "subprocess.Popen[str]", se
 
 @pytest.fixture
 def start(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
-    """Start the program in a process group of its own, as a terminal does."""
+    """Start the program in a process group of its own, as a terminal does.
+
+    A shell's background jobs ignore Ctrl-C, and so would what the tests start from one: a terminal's programs do not.
+    """
 
     def popen(*arguments: object) -> "subprocess.Popen[str]":
         command = [sys.executable, "-m", "virest", *map(str, arguments)]
         return subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True
-        )
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )  # fmt: skip
 
     return popen
 

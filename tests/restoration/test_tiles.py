@@ -239,7 +239,9 @@ def _with_lamp_tamed(recorded: NDArray[np.float32], kernel: NDArray[np.float32])
 def _filtered_with_lamps(deconvolution: TileDeconvolution, recorded: NDArray[np.float32]) -> NDArray[np.float32]:
     ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
     projected = deconvolution.back_projected(recorded)
-    return deconvolution.restore_highlights(deconvolution.blend(deconvolution.solutions(projected, ratio, ratio)))
+    return deconvolution.restore_highlights(
+        deconvolution.blend(deconvolution.solutions(projected, deconvolution.inside_or_at_border(ratio, ratio)))
+    )
 
 
 def test_a_tamed_tile_knows_a_clipped_lamp_from_its_streak() -> None:
@@ -350,7 +352,11 @@ def test_a_picture_blurred_along_another_path_tells_what_the_first_lost() -> Non
 
     def error(deconvolution: TileDeconvolution) -> float:
         ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
-        restored = deconvolution.blend(deconvolution.solutions(deconvolution.back_projected(first), ratio, ratio))
+        restored = deconvolution.blend(
+            deconvolution.solutions(
+                deconvolution.back_projected(first), deconvolution.inside_or_at_border(ratio, ratio)
+            )
+        )
         return float(np.mean((restored - sharp)[20:-20, 20:-20] ** 2))
 
     together = error(_joined(first, across, second, down))

@@ -57,7 +57,8 @@ ROUNDING, RELATIVE, DEVIATIONS = 1.5, 0.05, 3.0 * math.sqrt(2.0)
 """Tolerance of a repeated figure, in units of its last digit, of itself or of the standard deviation beside it.
 
 Processors round differently, and one grey level in a simulated movie changes every track that is found in it: two
-processors printed tracking noises that are 3.6 % apart. Two estimates differ by √2 deviations; three of these are allowed.
+processors printed tracking noises that are 3.6 % apart. Two estimates differ by √2 deviations; three of these are
+allowed.
 """
 DEVIATION_HEAD = "±"
 INSIGNIFICANT = re.compile(r"no significant residual: \S+")
