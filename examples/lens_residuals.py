@@ -1,4 +1,4 @@
-"""Residuals of a calibration whose lens sits off centre, for `virest criticise`: 40 frames of 60 points, as CSV.
+"""Simulated residuals of a calibration with an off-centre lens, for `virest criticise`: 40 frames of 60 points, as CSV.
 
 $ python examples/lens_residuals.py > residuals.csv
 """
