@@ -270,7 +270,7 @@ def coder_noise(observed: Array, step: float) -> Array:
 
 
 def falling_power(frequency: Array, signal: Array, ring: int) -> Array:
-    """S extrapolated from one ring, falling as f⁻³, as a picture of edges softened by a lens does."""
+    """S extrapolated from one ring as f⁻³: the law of edges, and nearly that of texture softened by the lens."""
     return np.asarray(signal[ring] * (frequency[ring] / frequency) ** _DETAIL_SLOPE)
 
 
