@@ -1,4 +1,4 @@
-"""What neighbouring frames show of the prediction, and of the gain, asked once for a capture."""
+"""Compare neighbouring frames once per capture, to correct the prediction and confirm the gain."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def with_neighbours_asked(
     lumas: Mapping[int, NDArray[np.uint8]],
     steps: Mapping[int, float],
 ) -> RestorationPlan:
-    """What neighbouring frames show that the predicted turns lack, and how much of a promised gain they confirm.
+    """The plan with the phone's sharpening, the missing rotation and the confirmed gain, from neighbouring frames.
 
-    lumas: of the frames of the runs.  steps: of the coder's quantiser, by number; missing: not known.
+    lumas: of the runs' frames, by index.  steps: the coder's quantiser step by frame index; missing: unknown.
     """
     profile = plan.profile
     if not lumas or profile.intrinsics is None:
@@ -66,7 +66,7 @@ def with_neighbours_asked(
 
 
 def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[RestorationPlan, dict[int, Sight]]:
-    """With the phone's sharpening, where edges show one, and what the frames are without it."""
+    """The plan with the phone's sharpening, if edges show one, and the frames with it undone."""
     if plan.settings.deblur == "none":
         return plan, dict(sights)
     usable = [(one.picture, one.motion) for one in sights.values() if one.usable and one.motion is not None]

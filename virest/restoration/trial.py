@@ -1,4 +1,4 @@
-"""One frame's luma, quickly restored: what its neighbours are asked to judge at planning."""
+"""Restore one frame's luma quickly at planning, for comparison with its neighbours."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from virest.restoration.tile_layout import THIN_MARGIN
 from virest.restoration.tile_methods import tile_hyper_laplacian
 
 ANCHOR = 0.5
-"""Rows are restored to the middles of their exposures, at which neighbours are seen."""
+"""Fraction of the exposure at which rows are restored: mid-exposure, as in the comparison with neighbours."""
 
 
 def tried(
@@ -36,9 +36,9 @@ def tried(
     refined: RefinedMotion | None,
     coding_step: float | None,
 ) -> tuple[Image, Image] | None:
-    """Restore a luma (height, width); None where it is left alone.
+    """Restore a luma (height, width); None if it would not be deblurred.
 
-    Returns its light as recorded and as restored, of the size at which neighbours are compared.
+    Returns its linear light as recorded and as restored, at the reduced size at which neighbours are compared.
     """
     height, width = luma.shape
     centres_px = tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px

@@ -330,9 +330,7 @@ def _brought(view: NeighbourView, second: Image, times: int, apart: Array) -> Im
 def _turn(
     view: NeighbourView, tops_lefts: NDArray[np.intp], times: int, shift: Array, precision: Array
 ) -> PairTurn | None:
-    """Fit one rotation rate to the tiles' shifts, with Huber's weights; None if too few tiles are usable, or the fit is
-    ill-conditioned.
-    """
+    """Fit one rotation rate to the tiles' shifts with Huber's weights; None: too few tiles, or ill-conditioned."""
     used = precision > 0
     if np.count_nonzero(used) < LEAST_TILES:
         return None
