@@ -26,7 +26,7 @@ from virest.restoration.blurred import CLIPPED_LEVELS
 from virest.restoration.statistics.records import ROUNDING_POWER
 from virest.restoration.statistics.ring_fit import RingCells
 from virest.restoration.statistics.rings import RINGS, SIDE
-from virest.restoration.statistics.tile_power import MANY_TILES, cut, evenly_steep, passed_power, windowed_power
+from virest.restoration.statistics.tile_power import MANY_TILES, cut, light_in_grey_levels, passed_power, windowed_power
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ LEAST_PATH_PX = 1.5
 BEST_PATH_PX = SIDE / 5
 """Best path length, px: it cancels many frequencies and still fits into a tile."""
 LEAST_FRAMES = 4
-BELIEVED = 1 / 3
+EVIDENCE_FRACTION = 1 / 3
 """Fraction of all evidence, from the lowest frequency up, that is used."""
 MODEL_STD = 0.1
 """Standard deviation of ln scale for correct profiles, from lenses, curves and paths that vary over a tile."""
@@ -98,7 +98,7 @@ def tile_powers(luma: NDArray[np.uint8], curve: ResponseCurve) -> TilePowers | N
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
     corners = _least_clipped(luma, corners[:: -(-len(corners) // MOST_TILES)], curve)
     tiles = (cut(luma, (int(top), int(left))) for top, left in corners)
-    power = [windowed_power(evenly_steep(cv2.LUT(tile, curve.linear_table()), curve)) for tile in tiles]
+    power = [windowed_power(light_in_grey_levels(cv2.LUT(tile, curve.linear_table()), curve)) for tile in tiles]
     return TilePowers(corners[:, ::-1].astype(float) + (SIDE - 1) / 2, np.stack(power))
 
 
@@ -107,10 +107,10 @@ def path_scale(frames: Iterable[tuple[RowMotion, TilePowers]], bits_per_px: floa
     evidence = np.array([found for motion, tiles in frames if (found := _evidence(motion, tiles)) is not None])
     if len(evidence) < LEAST_FRAMES:
         return None
-    best = _best(_believed(evidence.sum(axis=0)))
+    best = _best(_low_ring_evidence(evidence.sum(axis=0)))
     rng = np.random.default_rng(len(evidence))
     drawn = rng.integers(0, len(evidence), (RESAMPLED, len(evidence)))
-    scatter = float(np.std([_best(_believed(evidence[numbers].sum(axis=0))) for numbers in drawn]))
+    scatter = float(np.std([_best(_low_ring_evidence(evidence[numbers].sum(axis=0))) for numbers in drawn]))
     starved = (STARVED_BITS / bits_per_px) ** 3
     return PathScale(float(np.exp(best)), float(np.hypot(scatter, MODEL_STD * (1 + starved))), len(evidence))
 
@@ -171,10 +171,10 @@ def _ring_evidence(cells: Sequence[RingCells], seen: NDArray[np.float32]) -> Arr
     return np.asarray(np.maximum(found, 0.0))
 
 
-def _believed(evidence: Array) -> Array:
-    """(scales,) sum of the evidence (scales, RINGS) over the lowest rings, which hold the fraction BELIEVED of it."""
+def _low_ring_evidence(evidence: Array) -> Array:
+    """(scales,) sum of the evidence (scales, RINGS) over the lowest rings that hold EVIDENCE_FRACTION of the total."""
     reached = np.cumsum(evidence.max(axis=0))
-    last = int(np.searchsorted(reached, BELIEVED * reached[-1]))
+    last = int(np.searchsorted(reached, EVIDENCE_FRACTION * reached[-1]))
     return np.asarray(evidence[:, : last + 1].sum(axis=1))
 
 
@@ -189,7 +189,7 @@ def _best(evidence: Array) -> float:
     return float(np.interp(i + step, np.arange(len(SCALES)), np.log(SCALES)))
 
 
-def telling(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
+def frames_to_measure(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
     """At most MOST_FRAMES frames, evenly spaced among the half whose paths are nearest to BEST_PATH_PX."""
     if not numbers:
         return ()
@@ -198,7 +198,7 @@ def telling(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
     return tuple(near[:: -(-len(near) // MOST_FRAMES)])
 
 
-def kept_powers(
+def store_powers(
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
     wanted: Iterable[int],
     curve: ResponseCurve,

@@ -167,7 +167,7 @@ def luma_of(light: list[Image]) -> Image:
     return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, 1 - LUMA_RED - LUMA_BLUE, 0.0))
 
 
-def as_kept(light: Image, blurred: BlurredPicture) -> Image:
+def with_vignetting(light: Image, blurred: BlurredPicture) -> Image:
     """Light with the restored picture's vignetting applied."""
     if blurred.kept is None:
         return light

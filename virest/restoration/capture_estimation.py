@@ -37,7 +37,7 @@ from virest.inference.unsharp_mask import MOST_FRAMES
 from virest.inference.visual_inertial import align, choose_runs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
-from virest.restoration.blur_length_check import TilePowers, kept_powers, path_scale, telling
+from virest.restoration.blur_length_check import TilePowers, frames_to_measure, path_scale, store_powers
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.conflict_plan import (
     MAX_FOCAL_SPREAD,
@@ -47,8 +47,8 @@ from virest.restoration.conflict_plan import (
     settle,
 )
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
-from virest.restoration.neighbour_plan import with_neighbours_asked
-from virest.restoration.neighbours.survey import kept_lumas, survey_runs
+from virest.restoration.neighbour_plan import with_neighbour_survey
+from virest.restoration.neighbours.survey import store_lumas, survey_runs
 from virest.restoration.plan_notes import NoteCode, PlanNote
 from virest.restoration.settings import RestorationSettings
 
@@ -90,7 +90,7 @@ def _planned(
     steps: Mapping[int, float],
 ) -> RestorationPlan:
     plan = RestorationPlan(
-        profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
+        profile, settings, _default_notes(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
     )
     frames = tuple(
         replace(f, skip_reason=None) if settings.keep_start_up and f.only_startup else f
@@ -105,16 +105,16 @@ def _planned(
     powers: dict[int, TilePowers] = {}
     curve = profile.response or ResponseCurve("srgb")
     path_px = _rough_paths_px(capture, profile, chosen)
-    looked_at = telling(list(path_px), np.array(list(path_px.values()))) if settings.deblur != "none" else ()
+    measured = frames_to_measure(list(path_px), np.array(list(path_px.values()))) if settings.deblur != "none" else ()
     surveyed, lumas = survey_runs(path_px, path_px), dict[int, NDArray[np.uint8]]()
     wanted = sorted(chosen.union(runs))
     guide = find_guide(capture, profile, read_gray, wanted)
     kept = {n for run in surveyed for n in run}.union(sorted(path_px, key=path_px.__getitem__)[:MOST_FRAMES])
-    pictures = kept_lumas(read_gray(wanted), kept, lumas)
-    all_pairs = track_pairs(kept_powers(pictures, looked_at, curve, powers), guide=guide)
+    pictures = store_lumas(read_gray(wanted), kept, lumas)
+    all_pairs = track_pairs(store_powers(pictures, measured, curve, powers), guide=guide)
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
-        plan = _filled(plan, capture.imu, observe_tracks(capture, tracked, profile))
+        plan = _with_estimates(plan, capture.imu, observe_tracks(capture, tracked, profile))
     alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
@@ -141,13 +141,13 @@ def _planned(
             )
             if estimate.determined:
                 offset_s, std_s = estimate.time_offset_s, estimate.std_s
-            plan = _with_doubt(plan, profile.time_offset_s, offset_s, std_s)
+            plan = _with_offset_conflict(plan, profile.time_offset_s, offset_s, std_s)
     if plan.refusal is not None:
         return plan
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
-    plan = _with_seen_paths(plan, profile, capture, powers)
-    return with_neighbours_asked(plan, capture, surveyed, lumas, steps)
+    plan = _with_blur_length_check(plan, profile, capture, powers)
+    return with_neighbour_survey(plan, capture, surveyed, lumas, steps)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
@@ -186,7 +186,7 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     if std_s > MAX_OFFSET_STD_S:
         return plan
     if given.time_offset_s is not None:
-        return _with_doubt(plan, given.time_offset_s, offset_s, std_s)
+        return _with_offset_conflict(plan, given.time_offset_s, offset_s, std_s)
     source = "tracked points against gyroscope and accelerometer"
     profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
     values, spread = bias[0], np.hypot(bias[1], BIAS_FLOOR_RAD_S)
@@ -197,7 +197,7 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
 
 
-def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
+def _with_offset_conflict(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
     """Note a difference between the frames' time offset and the profile's, if it is significant."""
     if abs(offset_s - given_s) < max(OFFSET_DOUBT_S, 3 * std_s):
         return plan
@@ -219,7 +219,7 @@ def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[i
     return dict(zip((f.index for f in frames), (focal_px * at_frames * exposure_s).tolist(), strict=True))
 
 
-def _with_seen_paths(
+def _with_blur_length_check(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, powers: Mapping[int, TilePowers]
 ) -> RestorationPlan:
     """Note blur paths of another length than predicted, and set ``contradicted`` so that harmful steps are skipped.
@@ -251,8 +251,8 @@ def _with_seen_paths(
         logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
         to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
         offset_s += (1 - found.scale) * to_middle_s
-        doubt_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
-        if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < doubt_s:
+        tolerance_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
+        if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < tolerance_s:
             offset_s = given.time_offset_s
             plan = plan.without(NoteCode.OTHER_OFFSET)
     shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
@@ -287,7 +287,7 @@ def _with_translations(plan: RestorationPlan, capture: Capture, alignment: Visua
         plan = plan.noted(NoteCode.TRANSLATION, text)
     translations = {index: _translation(motion, profile.depth_m) for index, motion in known.items()}
     scaled = [motion for motion in known.values() if not motion.unscaled]
-    notes = (*plan.notes, _account(scaled, alignment)) if scaled else plan.notes
+    notes = (*plan.notes, _translation_note(scaled, alignment)) if scaled else plan.notes
     return replace(plan, notes=notes, translations=translations)
 
 
@@ -323,7 +323,7 @@ def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTran
     )
 
 
-def _account(known: list[FrameMotion], alignment: VisualInertialAlignment) -> str:
+def _translation_note(known: list[FrameMotion], alignment: VisualInertialAlignment) -> str:
     depth, std = (np.median([getattr(m.depth, name) for m in known]) for name in ("depth_m", "std_m"))
     speed = np.sqrt(np.mean([(m.velocity_m_s**2).sum() for m in known]))
     std_m_s = alignment.velocity_std_m_s(np.array([m.reference_s for m in known]))
@@ -376,7 +376,7 @@ def resting_points(
     return lens.lens.project(lens.rays(points_px, time_s))
 
 
-def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
+def _default_notes(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
     """A note for each unknown value, which is set to its documented default."""
     notes = []
     if profile.response is None:
@@ -390,7 +390,7 @@ def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
     return tuple(notes)
 
 
-def _filled(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTracks) -> RestorationPlan:
+def _with_estimates(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTracks) -> RestorationPlan:
     """The plan with time offset, gyroscope bias and focal length estimated from tracked points, or refused."""
     estimate = estimate_time_offset(observed, imu, plan.profile)
     plan = _with_focal(plan, estimate)

@@ -61,7 +61,7 @@ def measured_share(blurred: BlurredPicture) -> Image | None:
     return cv2.blur(np.clip(share, 0, 1), (side, side))
 
 
-def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
+def unmeasured_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     """1 where a channel is dark, or clipped, all along the blur path around a pixel; None per channel: nowhere."""
     if all(mask is None for mask in (*blurred.dark, *blurred.clipped)):
         return [None] * len(blurred.light)
@@ -73,12 +73,12 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     return masks
 
 
-def unseen_kept(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: BlurredPicture) -> RowRenderer:
+def keep_unmeasured(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: BlurredPicture) -> RowRenderer:
     """The restored picture, but with the recorded grey levels (height, width, 3) where nothing was measured.
 
     These include levels beyond the curve's ends, from noise and the codec, that no light would give.
     """
-    masks = unseen_masks(blurred)
+    masks = unmeasured_masks(blurred)
     if all(mask is None for mask in masks):
         return sharp
 

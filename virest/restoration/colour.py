@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from virest.image_formation.blur import Image
-from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
+from virest.restoration.blurred import BlurredPicture, luma_of, with_vignetting
 from virest.restoration.encoding import grey_levels
 from virest.restoration.neighbours.joint import HALF, NeighbourPicture
 from virest.restoration.row_chunks import RowRenderer
@@ -44,7 +44,7 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
     scale = COARSE_COLOUR_SCALE if coarse else COLOUR_SCALE
     small = _shrunk(sharp, blurred, scale)
     small_grey, *differences = _grey_differences(blurred, small, *_sharp_differences(blurred, small, settings, scale))
-    slopes = _slopes_on(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
+    slopes = _regression_slopes(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
     rests = [cv2.subtract(d, cv2.multiply(s, small_grey)) for d, s in zip(differences, slopes, strict=True)]
 
     def full(planes: list[Image]) -> Image:
@@ -52,7 +52,7 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
         return cv2.resize(cv2.merge(planes), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
 
     factors, rest = full([cv2.add(slope, 1.0) for slope in slopes]), full(rests)
-    luma = grey_levels(as_kept(sharp, blurred), blurred.curve)
+    luma = grey_levels(with_vignetting(sharp, blurred), blurred.curve)
     if luma.shape != (height, width):
         luma = cv2.resize(luma, (width, height), interpolation=cv2.INTER_CUBIC)
 
@@ -79,7 +79,8 @@ def _sharp_differences(
     side = 2 * int(np.ceil(blurred.longest_px / scale)) + NEARBY_SIDE
     noise = blurred.statistics.noise_levels / blurred.slopes(1, scale * side, luma.shape[::-1])
     slopes = [
-        cv2.blur(slope, (side, side)) for slope in _slopes_on(luma, differences, cv2.multiply(noise, noise), side)
+        cv2.blur(slope, (side, side))
+        for slope in _regression_slopes(luma, differences, cv2.multiply(noise, noise), side)
     ]
     ratios = noise_to_signal(deconvolution, settings, blurred.chroma, scale)
 
@@ -107,7 +108,7 @@ def _neighbour_differences(neighbour: NeighbourPicture, scale: int) -> tuple[Ima
     return luma, [cv2.subtract(plane, luma) for plane in (red, blue)]
 
 
-def _slopes_on(luma: Image, differences: list[Image], noise_power: Any, side: int) -> list[Image]:
+def _regression_slopes(luma: Image, differences: list[Image], noise_power: Any, side: int) -> list[Image]:
     """Local slopes of the differences over the luma, within ``side`` × ``side`` pixels; 0 if the luma is only noise.
 
     He, Sun and Tang 2013 (doi:10.1109/TPAMI.2012.213), the guided filter's local linear model.
@@ -136,7 +137,7 @@ def _grey_differences(blurred: BlurredPicture, luma: Image, red: Image, blue: Im
     green_luma = 1 - LUMA_RED - LUMA_BLUE
     green = cv2.addWeighted(red, -LUMA_RED / green_luma, blue, -LUMA_BLUE / green_luma, 0.0)
     grey, *channels = (
-        grey_levels(as_kept(light, blurred), blurred.curve)
+        grey_levels(with_vignetting(light, blurred), blurred.curve)
         for light in (luma, *(cv2.add(luma, difference) for difference in (red, green, blue)))
     )
     return [grey, *(cv2.subtract(channel, grey) for channel in channels)]

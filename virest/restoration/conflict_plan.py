@@ -46,7 +46,7 @@ def settle(
     observed = observe_tracks(capture, pairs, profile)
     found = settle_conflict(observed, capture.imu, profile, offset_known=offset_known, focal_known=focal_known)
     if found.contradicted and not found.taken and not offset_known:
-        begun = _begun(observed, capture, profile)
+        begun = _at_coarse_offset(observed, capture, profile)
         if begun is not None:
             again = settle_conflict(observed, capture.imu, begun, offset_known=False, focal_known=focal_known)
             found = again if again.after_px < found.after_px else found
@@ -55,7 +55,7 @@ def settle(
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     if offset_known:
         plan = replace(plan, profile=found.profile, refusal=None)
-        return plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_rest(found)), followed
+        return plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_remaining_note(found)), followed
     open_yet = plan.refuses(NoteCode.TIME_OFFSET, NoteCode.NOT_FOLLOWING, NoteCode.FOCAL_LENGTH)
     if not found.taken and not (followed and (open_yet or found.contradicted)):
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
@@ -75,7 +75,7 @@ def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
     plan = replace(plan.without(NoteCode.TIME_OFFSET), profile=profile, refusal=None)
     if std_s > MAX_OFFSET_STD_S:
         plan = plan.refused(NoteCode.TIME_OFFSET, f"time offset only known to ± {std_s * 1e3:.1f} ms")
-    plan = plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_rest(found))
+    plan = plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_remaining_note(found))
     return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
 
 
@@ -92,14 +92,14 @@ def _unexplained(found: Settled) -> str:
     )
 
 
-def _rest(found: Settled) -> tuple[str, ...]:
+def _remaining_note(found: Settled) -> tuple[str, ...]:
     if found.after_px < CONTRADICTED * found.noise_px:
         return ()
     left = f"{found.after_px:.2f} px off (tracking noise {found.noise_px:.2f} px)"
     return (f"tracked points still lie {left}: virest diagnose may find why",)
 
 
-def _begun(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
+def _at_coarse_offset(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
     """The profile at the offset where the rotations of frames and gyroscope agree best, at any focal length.
 
     Several clock skews are tried; the offset is that at the middle of the pairs.  None if rotations agree nowhere, or

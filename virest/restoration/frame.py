@@ -21,13 +21,13 @@ from virest.image_formation.light import FrameLight, equivalent_length_px, frame
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
-from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture
-from virest.restoration.clipped_light import measured_share, unseen_kept
+from virest.restoration.blurred import BlurredPicture, blurred_picture, with_vignetting
+from virest.restoration.clipped_light import keep_unmeasured, measured_share
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
-from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
+from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_harms, straightening_harms
 from virest.restoration.neighbours.confirmation import ConfirmedGain
-from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, still_part
+from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, static_part
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.parameters import (
     Deblurring,
@@ -43,7 +43,7 @@ from virest.restoration.shutter import perspective_map, rounded, rowwise_map, va
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
-from virest.restoration.taken_part import blurred_part, share_map, too_little_to_gain, trusted_share
+from virest.restoration.taken_part import blurred_part, no_gain_reason, share_map, trusted_share
 from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
@@ -118,13 +118,13 @@ def restore_frame(
     if refined is not None:
         motion = refined.motion
         if seen is not None and refined.further is not None:
-            seen = _exposed_as(motion, seen)
+            seen = _with_observed_exposure(motion, seen)
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     found = degradation_parameters(motion, trajectory)
     longest_px = float(equivalent_length_px(found.blur.longest_px, most_defocus_px(motion.profile)))
     method, why_not = deblur_method(motion, settings, longest_px)
-    if seen is not None and method != "none" and deblurring_loses(motion, seen):
+    if seen is not None and method != "none" and deblurring_harms(motion, seen):
         method, why_not = "none", (OTHER_BLUR,)
     straighten = settings.shutter != "none"
     anchor = 0.5 if straighten or settings.reference == "frame-middle" or method == "none" else 0.0
@@ -134,14 +134,14 @@ def restore_frame(
     deblurring: Deblurring | None = None
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-        place_std_px = refined.place_std_px() if refined is not None and straighten else 0.0
-        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, place_std_px, light, coding_step)
+        position_std_px = refined.position_std_px() if refined is not None and straighten else 0.0
+        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, position_std_px, light, coding_step)
         restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
-        restored = _relit(picture, curve, light)
+        restored = _without_flicker(picture, curve, light)
     clock.lap("deblur")
     source = _source_map(motion, settings, anchor, deblurring is not None) if straighten else None
-    if seen is not None and source is not None and straightening_loses(motion, seen, anchor):
+    if seen is not None and source is not None and straightening_harms(motion, seen, anchor):
         source, why_not = None, (*why_not, OTHER_ROWS)
     shutter = replace(found.shutter, method=settings.shutter if source is not None else "none")
     status = "copied" if restored is picture and source is None else "restored"
@@ -156,7 +156,7 @@ def restore_frame(
     elif restored.dtype != np.uint8:
         restored = rounded(restored)
     clock.lap("shutter")
-    warnings = (*_limits(motion), *why_not)
+    warnings = (*_model_warnings(motion), *why_not)
     undistorted = settings.undistort and motion.optics.lens.is_distorted
     return RestoredFrame(
         frame, status, restored, warnings, valid_px, motion.exposure_s or None,
@@ -164,7 +164,7 @@ def restore_frame(
     )  # fmt: skip
 
 
-def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
+def _with_observed_exposure(motion: RowMotion, seen: RowMotion) -> RowMotion:
     """The neighbour-refined motion over the observed exposure time, about the same mid-exposure.
 
     Neighbours show how the picture moved, whatever the clocks say, but not how long the exposure was.
@@ -173,7 +173,7 @@ def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
     return replace(motion, start_s=start_s, exposure_s=seen.exposure_s)
 
 
-def _limits(motion: RowMotion) -> tuple[str, ...]:
+def _model_warnings(motion: RowMotion) -> tuple[str, ...]:
     """Warnings about effects that the motion model does not include."""
     depth_m = motion.profile.depth_m
     if depth_m is not None and np.isinf(depth_m):
@@ -255,7 +255,7 @@ class _KnownBlur:
     """Length of the longest blur path, defocus included."""
     covariance_px2: NDArray[np.float64]
     """(2, 2) covariance of the blur path."""
-    place_std_px: float
+    position_std_px: float
     """Standard deviation of the rows' positions after straightening, per axis."""
     light: FrameLight | None
     """Flicker and vignetting; None: neither."""
@@ -291,7 +291,7 @@ def _deblurred(
     as_shown, picture = picture, picture if unmasked is None else unmasked
     curve, light = blur.motion.profile.response or ResponseCurve("srgb"), blur.light
     measured = _blur_statistics(picture, blur, settings, confirmed)
-    why_not = too_little_to_gain(measured.luma_model, measured.expected_db)
+    why_not = no_gain_reason(measured.luma_model, measured.expected_db)
     if why_not:
         return as_shown, None, (why_not,)
     blurred = blurred_picture(picture, curve, (measured.luma, measured.chroma), measured.field, blur.longest_px)
@@ -302,19 +302,19 @@ def _deblurred(
     blurred = replace(blurred, spread=measured.spread, neighbours=joined.pictures, longest_px=longest_px)
     recorded = picture
     if light is not None:
-        blurred = _evened(blurred, light)
-        recorded = encode_picture([as_kept(plane, blurred) for plane in blurred.light], curve)
+        blurred = _without_flicker_and_vignetting(blurred, light)
+        recorded = encode_picture([with_vignetting(plane, blurred) for plane in blurred.light], curve)
     if joined.pictures:
         settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
-    sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
-    touched, part = _part_taken(blur, settings, blurred, measured, joined, confirmed)
-    restored = _mixed(sharp, recorded, part)
+    sharp = keep_unmeasured(deblur(blurred, settings), recorded, blurred)
+    touched, part = _blend_weights(blur, settings, blurred, measured, joined, confirmed)
+    restored = _blended(sharp, recorded, part)
     changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
     details = _details(blur, settings, measured, joined, confirmed, changed)
     if details.expected_gain_db is not None and details.expected_gain_db < 0:
-        return as_shown, None, (too_little_to_gain(measured.luma_model, details.expected_gain_db),)
+        return as_shown, None, (no_gain_reason(measured.luma_model, details.expected_gain_db),)
     if unmasked is not None:  # unblurred regions keep the phone's sharpening
-        restored = _mixed(restored.__getitem__, as_shown, touched)
+        restored = _blended(restored.__getitem__, as_shown, touched)
     return restored, details, ()
 
 
@@ -333,7 +333,7 @@ def _blur_statistics(
     if few and step is not None:
         luma = luma.with_coder_noise(step, LEAST_CODER_NOISE)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
-    luma_model = luma.doubted_by(spread)
+    luma_model = luma.with_kernel_variance(spread)
     share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)
     expected_db = luma_model.expected_gain_db
     if confirmed is not None:  # neighbours confirm or refute the gain, so the cautious bound for gratings is not needed
@@ -341,7 +341,7 @@ def _blur_statistics(
     return _BlurStatistics(field, spread, luma, chroma, luma_model, expected_db, share)
 
 
-def _part_taken(
+def _blend_weights(
     blur: _KnownBlur,
     settings: RestorationSettings,
     blurred: BlurredPicture,
@@ -359,7 +359,7 @@ def _part_taken(
     touched = blurred_part(blur.motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
     part, seen = touched * share_map(blurred, measured.share), measured_share(blurred)
     part = part if seen is None else part * seen
-    still = still_part(joined.places)
+    still = static_part(joined.places)
     if still is not None and still.min() < 1:
         height, width = blurred.light[0].shape
         part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
@@ -379,7 +379,7 @@ def _details(
     """How a frame was deblurred.  changed: mean square of the change by deblurring, grey levels squared."""
     model = measured.luma_model
     ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
-    misplaced = model.misplaced(blur.place_std_px, joined.passed)
+    misplaced = model.misplaced(blur.position_std_px, joined.passed)
     gain_db = None if confirmed is None else confirmed.of_change_db(changed, model.blur_error, ideal, misplaced)
     return Deblurring(
         method=settings.deblur,
@@ -399,7 +399,7 @@ def _details(
     )
 
 
-def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
+def _without_flicker_and_vignetting(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
     """The picture without flicker and vignetting: they act after the blur, so they are undone before deblurring."""
     planes = [light.evened(plane, mask) for plane, mask in zip(blurred.light, blurred.clipped, strict=True)]
 
@@ -410,14 +410,14 @@ def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
     return replace(blurred, light=planes, slopes=slopes, kept=light.kept)
 
 
-def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
+def _without_flicker(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
     """A picture that is not deblurred, without flicker, and with the vignetting of the positions it is warped to."""
     clipped = cv2.LUT(picture, curve.clipped_table().astype(np.uint8))
     planes = zip(cv2.split(cv2.LUT(picture, curve.linear_table())), cv2.split(clipped), strict=True)
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
 
 
-def _mixed(
+def _blended(
     sharp: RowRenderer, recorded: NDArray[np.uint8], part: NDArray[np.float32] | np.float32
 ) -> NDArray[np.float32]:
     """Blend of the sharp and the recorded picture, (height, width, 3): grey levels 0 to 255, not rounded.

@@ -38,17 +38,17 @@ def find_lag(capture: Capture, profile: CameraProfile, read_gray: GrayReader) ->
 
 def at_lag(capture: Capture, profile: CameraProfile, lag: StartUpLag) -> Capture:
     """The capture with start-up frames at the times and exposures of the captures that they show."""
-    return replace(capture, frames=at_true_times(capture.frames, _followed(profile, lag), capture.repeats))
+    return replace(capture, frames=at_true_times(capture.frames, _profile_with_lag(profile, lag), capture.repeats))
 
 
 def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
     """A plan that was made at true times, with the lag added to its profiles and notes."""
-    contradicted = None if plan.contradicted is None else _followed(plan.contradicted, lag)
+    contradicted = None if plan.contradicted is None else _profile_with_lag(plan.contradicted, lag)
     said = f"frame lag of {lag.lag_s:.2f} s at the start: the first {lag.frames} frames are taken at their true times"
-    profile = _followed(plan.profile, lag)
+    profile = _profile_with_lag(plan.profile, lag)
     return replace(plan, profile=profile, contradicted=contradicted).noted(NoteCode.TRUE_TIMES, said)
 
 
-def _followed(profile: CameraProfile, lag: StartUpLag) -> CameraProfile:
+def _profile_with_lag(profile: CameraProfile, lag: StartUpLag) -> CameraProfile:
     extensions = replace(profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
     return profile.with_estimate("lag_s", lag.lag_s, None, SOURCE, extensions=extensions)

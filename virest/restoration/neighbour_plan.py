@@ -20,10 +20,10 @@ from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 from virest.restoration.neighbours.survey import path_length_px, survey_gain, survey_turns
 from virest.restoration.settings import PRESETS
-from virest.restoration.trial import tried
+from virest.restoration.trial import try_restoration
 
 
-def with_neighbours_asked(
+def with_neighbour_survey(
     plan: RestorationPlan,
     capture: Capture,
     runs: Sequence[Sequence[int]],
@@ -46,7 +46,7 @@ def with_neighbours_asked(
         outside = outside_reason(motion.start_s, motion.end_s, capture.imu.time_s, capture.imu_gaps_s)
         why = outside[1] if outside else ""
         sights[number] = Sight(frames[number], luma, motion, why, coding_step=steps.get(number))
-    plan, sights = _unmasked(plan, sights)
+    plan, sights = _without_sharpening(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing = survey_turns(runs, sights, neighbours, trajectory)
     if missing is not None:
@@ -59,13 +59,16 @@ def with_neighbours_asked(
         return plan
     quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
 
-    def quickly(here: Sight, motion: RowMotion, refined: RefinedMotion | None) -> tuple[Image, Image] | None:
-        return tried(here.picture, motion, quick, refined, here.coding_step)
+    def restore_quickly(here: Sight, motion: RowMotion, refined: RefinedMotion | None) -> tuple[Image, Image] | None:
+        return try_restoration(here.picture, motion, quick, refined, here.coding_step)
 
-    return replace(plan, confirmed=survey_gain(runs, sights, neighbours.knowing(missing), trajectory, lens, quickly))
+    return replace(
+        plan,
+        confirmed=survey_gain(runs, sights, neighbours.with_missing_turn(missing), trajectory, lens, restore_quickly),
+    )
 
 
-def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[RestorationPlan, dict[int, Sight]]:
+def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[RestorationPlan, dict[int, Sight]]:
     """The plan with the phone's sharpening, if edges show one, and the frames with it undone."""
     if plan.settings.deblur == "none":
         return plan, dict(sights)

@@ -13,7 +13,7 @@ from virest.errors import SettingsError
 from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernels import KernelField
 from virest.restoration.blurred import blurred_picture, clipped_anywhere
-from virest.restoration.clipped_light import unseen_kept
+from virest.restoration.clipped_light import keep_unmeasured
 from virest.restoration.deblur import deblur
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import rounded
@@ -54,7 +54,7 @@ def deblur_along(
         )
     longest_px = float(np.linalg.norm(np.ptp(path_px, axis=0)))
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    restored = unseen_kept(deblur(blurred, replace(settings, shutter="none")), picture, blurred)
+    restored = keep_unmeasured(deblur(blurred, replace(settings, shutter="none")), picture, blurred)
     return rounded(restored(slice(0, height)))
 
 

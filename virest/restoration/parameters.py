@@ -136,7 +136,7 @@ class DegradationParameters:
         return None if self.deblur is None else self.deblur.expected_gain_db
 
     def as_json(self) -> Json:
-        """This record's part of a line of ``parameters.jsonl``."""
+        """The record's part of a line of ``parameters.jsonl``."""
         line: Json = _plain(self)
         return line if self.deblur is not None else line | {"deblur": {"method": "none"}}
 

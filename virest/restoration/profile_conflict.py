@@ -106,7 +106,7 @@ def settle_conflict(
     found = found if focal_known else replace(found, focal=_focal(base, noise_px))
     if base.scale < CONTRADICTED:
         return found
-    fit, causes = search.climbed(base)
+    fit, causes = search.add_causes(base)
     log.debug("points lie %.2f off; %s leave %.2f", base.scale, [cause.name for cause in causes], fit.scale)
     if not causes or fit.scale**2 - 1 > MOST_LEFT * (base.scale**2 - 1):
         return replace(found, contradicted=True)
@@ -115,7 +115,7 @@ def settle_conflict(
     for cause, std in zip(causes, stds, strict=True):
         resolved = cause.adopted(resolved, fit.profile, std)
     said = tuple(cause.said(profile, fit.profile, std) for cause, std in zip(causes, stds, strict=True))
-    said = tuple(text + search.rival(fit, causes, cause) for text, cause in zip(said, causes, strict=True))
+    said = tuple(text + search.ambiguity_note(fit, causes, cause) for text, cause in zip(said, causes, strict=True))
     offset = _offset(fit, readout_s, noise_px)
     focal = None if focal_known else _focal(fit, noise_px)
     after_px = fit.scale * noise_px
@@ -187,7 +187,7 @@ class _Search:
             self.imu, table, start.profile, terms, start.scene, max_iterations=MAX_ITERATIONS, covariances=use is None
         )
 
-    def climbed(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
+    def add_causes(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
         """Add causes one by one; returns the fit with all of them, and the causes."""
         here, fit = _Start(self.given, (), None if base.scene is None else self._travel()), base
         while len(here.causes) < MAX_CAUSES and fit.scale >= CONTRADICTED:
@@ -197,7 +197,7 @@ class _Search:
             here, fit = entered
         return fit, here.causes
 
-    def rival(self, fit: TrackFit, causes: tuple[Cause, ...], cause: Cause) -> str:
+    def ambiguity_note(self, fit: TrackFit, causes: tuple[Cause, ...], cause: Cause) -> str:
         """Text to append to the message about a cause that points do not distinguish from its twin; else empty."""
         twin = next((other for other in CAUSES if other.name == TWINS.get(cause.name)), None)
         fitted = {term.name for term in (*self.nuisances, *(other.term for other in causes))}
@@ -212,9 +212,9 @@ class _Search:
         """The first cause, by fit, that predicts held-out blocks significantly better and has a plausible value."""
         fitted = {term.name for term in (*self.nuisances, *(cause.term for cause in here.causes))}
         open_causes = [cause for cause in CAUSES if cause.term.name not in fitted]
-        tried = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
+        fitted_causes = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
         without = None
-        for start, found in sorted(tried, key=lambda one: one[1].cost)[:JUDGED]:
+        for start, found in sorted(fitted_causes, key=lambda one: one[1].cost)[:JUDGED]:
             if found.cost >= fit.cost or found.scale >= fit.scale or not self._has_value(start, found):
                 continue
             without = self._held_out(here, fit) if without is None else without
@@ -235,14 +235,14 @@ class _Search:
             middle_s = float(np.mean(self.table.second_stamp_s))
             moved = [(profile.clock_skew - self.given.clock_skew) * middle_s for profile in starts]
             starts += [shift_offset(p, np.array([-moved_s])) for p, moved_s in zip(starts, moved, strict=True)]
-        off = [self._off(profile, here.scene) for profile in starts]
+        off = [self._typical_distance(profile, here.scene) for profile in starts]
         found = []
         for number in np.argsort(off)[:STARTS]:
             start = _Start(starts[int(number)], (*here.causes, cause), here.scene)
             found.append((start, self.fit(start)))
         return min(found, key=lambda one: one[1].cost, default=None)
 
-    def _off(self, profile: CameraProfile, scene: Motion | None) -> float:
+    def _typical_distance(self, profile: CameraProfile, scene: Motion | None) -> float:
         """Median normalised distance of START_POINTS points from a profile's prediction."""
         fit = fit_tracks(self.imu, self.few, profile, (), scene, max_iterations=0)
         return float(np.median(fit.distance))

@@ -23,7 +23,7 @@ PART_STEP_PX = 80
 """Grid spacing of the minimum-blur test."""
 
 
-def too_little_to_gain(luma: PictureStatistics, expected_db: float) -> str:
+def no_gain_reason(luma: PictureStatistics, expected_db: float) -> str:
     """Why the picture is not deblurred; empty: it is."""
     if not luma.measured:
         return "picture too small, or its blur too long, for its noise to be measured: left alone"
@@ -71,4 +71,4 @@ def trusted_share(luma: PictureStatistics) -> float:
     """
     share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
     sure = min(1.0, luma.expected_gain_db / SURE_GAIN_DB) * min(1.0, luma.gradient_scale / luma.noise_levels)
-    return float(share * (1 - luma.drowned * (1 - sure)))
+    return float(share * (1 - luma.below_noise * (1 - sure)))

@@ -48,16 +48,16 @@ def luma_tiles(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture's luma, smaller than the preset's where the kernels vary fast."""
-    path_holds_px, defocus_holds_px = _kernel_holds_px(blurred)
+    path_side_px, defocus_side_px = _largest_sides_px(blurred)
     side_px = float(settings.tile_px)
     if around is not FULL_MARGIN:
-        side_px = float(np.clip(path_holds_px, LEAST_TILE * side_px, side_px))
-    side_px = min(side_px, max(defocus_holds_px, LEAST_TILE_PX))
+        side_px = float(np.clip(path_side_px, LEAST_TILE * side_px, side_px))
+    side_px = min(side_px, max(defocus_side_px, LEAST_TILE_PX))
     overlap_parts = FINE_OVERLAP if around is FULL_MARGIN else WIDE_OVERLAP
     return tile_deconvolution(blurred, int(side_px), overlap_parts, around=around)
 
 
-def _kernel_holds_px(blurred: BlurredPicture) -> tuple[float, float]:
+def _largest_sides_px(blurred: BlurredPicture) -> tuple[float, float]:
     """Largest tile sides, px, for which the centre's kernel is accurate enough: for the paths, and for the defocus.
 
     Half a tile step from the centre, a third of the side, the wrong kernel changes edges by MOST_WRONG noise standard
@@ -75,8 +75,8 @@ def _kernel_holds_px(blurred: BlurredPicture) -> tuple[float, float]:
     sigma_px = np.broadcast_to(field.defocus_sigma_px, len(field.paths_px)).reshape(len(y), len(x))
     softer = np.mean(np.hypot(*np.gradient(sigma_px, y, x)))
     wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
-    path_holds_px, defocus_holds_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer))
-    return path_holds_px, defocus_holds_px
+    path_side_px, defocus_side_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer))
+    return path_side_px, defocus_side_px
 
 
 def tile_deconvolution(
@@ -135,20 +135,20 @@ def join_neighbours(
     if not blurred.neighbours:
         return
     centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
-    size, lamps, further = own[0].shape[::-1], _lit_by_lamps(blurred), []
+    size, highlights, further = own[0].shape[::-1], _reached_by_highlights(blurred), []
     for neighbour in blurred.neighbours:
         one = neighbour.place
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
         stds_px = STD_STEP_PX * np.round(one.std_at_px(centres_px) / STD_STEP_PX)
         kept = [_kept_sharpness(std_px / scale, deconvolution.size) for std_px in stds_px.tolist()]
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
-        if lamps is not None:
-            trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
-        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, one.finer))
+        if highlights is not None:
+            trust[cv2.resize(highlights, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
+        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, one.coding_noise_ratio))
     deconvolution.join(own, further, ratio)
 
 
-def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
+def _reached_by_highlights(blurred: BlurredPicture) -> Image | None:
     """1.0 where the frame's clipped highlights may reach in any neighbour, (height, width); None: nowhere.
 
     They were removed from the frame's tiles, but not from the neighbours.

@@ -132,7 +132,7 @@ def tile_hyper_laplacian(
         if step == len(betas) - 1 and not few:
             solved = _with_residual(deconvolution, projected, solved, statistics)
         sharp = deconvolution.blend(solved)
-    share = max(LINEAR_SHARE * statistics.unevenness, statistics.drowned if few else 0.0)
+    share = max(LINEAR_SHARE * statistics.unevenness, statistics.below_noise if few else 0.0)
     if share:
         sharp = cv2.addWeighted(linear, share, sharp, 1 - share, 0.0)
     return deconvolution.restore_highlights(sharp)

@@ -26,7 +26,7 @@ LITTLE_LONGER = 1.05
 """Accept a grid that takes up to this many times the fastest one's time if its side is nearer to the requested one."""
 SETTLING_ITERATIONS, SETTLING_RELAXATION = 4, 1.7
 """About as good as seven plain Richardson–Lucy steps."""
-LAMP_DOUBT = 0.02
+HIGHLIGHT_BLEND_LEVEL = 0.02
 """Highlight level, in units of the recorded range, at which the blend is half Richardson–Lucy."""
 LEAST_TRUSTED = 0.3
 """Least mean trust of a tile for a further picture to be joined to it: below, it is not worth the transforms."""
@@ -205,16 +205,16 @@ class TileDeconvolution:
             found = _sharpened(recorded, kernel, measured)
             rest = cv2.min(found, top_light)
             self._rest[number] = transforms.forward(rest)
-            lamp = cv2.subtract(found, rest)
-            blurred_rest, blurred_lamp = (_through(part, self.kernels[number], True) for part in (rest, lamp))
-            left_over = recorded - blurred_lamp - blurred_rest
+            highlight = cv2.subtract(found, rest)
+            blurred_rest, blurred_highlight = (_through(part, self.kernels[number], True) for part in (rest, highlight))
+            left_over = recorded - blurred_highlight - blurred_rest
             self._without_highlights[number] = transforms.forward(
                 cv2.add(blurred_rest, cv2.multiply(measured, left_over))
             )
-            near = cv2.max(_through(blurred_lamp, self.kernels[number], False), 0.0)
-            share = near / (near + np.float32(LAMP_DOUBT * top_light))
+            near = cv2.max(_through(blurred_highlight, self.kernels[number], False), 0.0)
+            share = near / (near + np.float32(HIGHLIGHT_BLEND_LEVEL * top_light))
             inner = np.s_[margin : margin + self.grid.side, margin : margin + self.grid.side]
-            self._highlights[number] = share[inner].copy(), (lamp + share * rest)[inner]
+            self._highlights[number] = share[inner].copy(), (highlight + share * rest)[inner]
 
     def restore_highlights(self, picture: Image) -> Image:
         """A picture (height, width) restored from tiles without highlights, with the highlights put back.
@@ -225,14 +225,14 @@ class TileDeconvolution:
         if not self._highlights:
             return picture
         grid, side = self.grid, self.grid.side
-        shares, lamps = np.zeros((2, grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
+        shares, highlights = np.zeros((2, grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
         corners = list(grid.corners())
         for number, parts in self._highlights.items():
             top, left = corners[number]
-            for part, whole in zip(parts, (shares, lamps), strict=True):
+            for part, whole in zip(parts, (shares, highlights), strict=True):
                 cv2.accumulateProduct(part, self._windows[number], whole[top : top + side, left : left + side])
-        shares, lamps = (whole[: grid.height, : grid.width] for whole in (shares, lamps))
-        return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), lamps)
+        shares, highlights = (whole[: grid.height, : grid.width] for whole in (shares, highlights))
+        return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), highlights)
 
     def solutions(self, projected: Iterable[Image], inner: Image, at_border: Image) -> Iterator[Image]:
         """Each tile's spectrum over |K|² + R; R: regularisation, ``inner`` or ``at_border``.

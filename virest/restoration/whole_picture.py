@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from virest.image_formation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
-from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
+from virest.restoration.blurred import BlurredPicture, luma_of, with_vignetting
 from virest.restoration.clipped_light import near_clipped
 from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import hyper_laplacian, richardson_lucy
@@ -32,7 +32,7 @@ def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -
         start = _extended(light, operator.border)
         result = richardson_lucy(light, operator.apply, operator.adjoint, start, weight, settings.iterations)
         sharp.append(_inner(result, operator.border))
-    sharp = [grey_levels(as_kept(plane, blurred), blurred.curve) for plane in sharp]
+    sharp = [grey_levels(with_vignetting(plane, blurred), blurred.curve) for plane in sharp]
     return lambda rows: cv2.merge([plane[rows] for plane in sharp])
 
 

@@ -63,7 +63,7 @@ HALF = 2
 
 
 @dataclass(frozen=True, slots=True)
-class NeighbourPlace:
+class NeighbourRegistration:
     """A neighbour's registration to the frame, and how far that and its content can be trusted."""
 
     number: int
@@ -86,7 +86,7 @@ class NeighbourPlace:
     """Where the neighbour has unclipped pixels, at the reduced size."""
     std_px: Array
     """(n,) standard deviation of the registration in those tiles, per axis."""
-    finer: float = 1.0
+    coding_noise_ratio: float = 1.0
     """The frame's coding noise over the neighbour's: above 1 if the neighbour was coded with a finer step."""
 
     @property
@@ -97,7 +97,7 @@ class NeighbourPlace:
     @property
     def weight(self) -> float:
         """Mean weight over the picture."""
-        return self.finer * float(self.trust.mean())
+        return self.coding_noise_ratio * float(self.trust.mean())
 
     def passed(self, frequency: Array) -> Array:
         """(RINGS,) mean |K|² over some tiles, times the mean weight and the attenuation by the registration error.
@@ -121,20 +121,20 @@ class NeighbourPlace:
 class NeighbourPicture:
     """One neighbour, registered to the frame's pixels."""
 
-    place: NeighbourPlace
+    place: NeighbourRegistration
     light: Image
     """(height, width) luma of its linear light, scaled to the frame's brightness."""
     half_light: Image
     """(height / 2, width / 2, 3), rounded up: its linear light in colour, scaled to the frame's brightness."""
 
 
-def neighbour_place(
+def register_neighbour(
     view: NeighbourView,
     field: Callable[[Array], KernelField],
     number: int,
     agreement: TileAgreement,
     independent_error: float,
-) -> NeighbourPlace | None:
+) -> NeighbourRegistration | None:
     """Register a neighbour to the frame; None with fewer than 2 LEAST_SHIFTS usable tiles.
 
     field: the neighbour's kernels, from the view.  independent_error: expected mean square difference by independent
@@ -147,31 +147,33 @@ def neighbour_place(
         return None
     affine, typical_px = _affine(agreement.centres_px[used], agreement.shift_px[used], agreement.precision[used])
     off_px = agreement.shift_px[used] - _at(affine, agreement.centres_px[used])
-    lasting_px = _lasting_px(agreement.centres_px[used], off_px, typical_px, TILE * agreement.times)
-    noise_px = np.sqrt(max(typical_px**2 - lasting_px**2, 0.0))
-    std_px = np.full(len(used), lasting_px)
-    std_px[used] = _left_of_shifts_px(off_px, lasting_px, noise_px)
+    common_px = _common_shift_px(agreement.centres_px[used], off_px, typical_px, TILE * agreement.times)
+    noise_px = np.sqrt(max(typical_px**2 - common_px**2, 0.0))
+    std_px = np.full(len(used), common_px)
+    std_px[used] = _registration_std_px(off_px, common_px, noise_px)
     std_px = np.hypot(std_px, noise_px * np.sqrt(LEAST_SHIFTS / len(off_px)))
     trust, alike = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
     height, width = trust.shape
     seen = (agreement.inside & ~agreement.clipped)[:height, :width]
-    return NeighbourPlace(
+    return NeighbourRegistration(
         number, view, affine, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px
     )
 
 
-def neighbour_picture(place: NeighbourPlace, light: Image, half_light: Image, detailed: bool) -> NeighbourPicture:
+def resample_neighbour(
+    place: NeighbourRegistration, light: Image, half_light: Image, detailed: bool
+) -> NeighbourPicture:
     """Resample a neighbour's luma of light (height, width), and its light at half that size, to the frame's pixels.
 
     detailed: see :func:`is_detailed`; the luma is then interpolated from 8 × 8 pixels, at four times the cost.
     """
     source = place.view.map_px(lambda points_px: points_px - _at(place.affine, points_px))
     reading = cv2.INTER_LANCZOS4 if detailed else cv2.INTER_CUBIC
-    brought = cv2.remap(light, source, None, reading, borderMode=cv2.BORDER_REPLICATE)
-    brought_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    for one in (brought, brought_half):
+    registered = cv2.remap(light, source, None, reading, borderMode=cv2.BORDER_REPLICATE)
+    registered_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    for one in (registered, registered_half):
         one *= np.float32(1 / place.gain)
-    return NeighbourPicture(place, brought, brought_half)
+    return NeighbourPicture(place, registered, registered_half)
 
 
 def is_detailed(luma: PictureStatistics) -> bool:
@@ -213,26 +215,26 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
         return np.zeros_like(left), np.zeros_like(left)
     noise = np.float32(min(independent_error, float(np.median(left[some]))))
     expected = OWN_ERROR * both + noise
-    alike = _explained(left, MOVING * expected)
+    alike = _relative_noise(left, MOVING * expected)
     off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
     sure = np.maximum(1 - 2 * noise_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
     near, shown_near = (_power_around(one, CLOSE_BY) for one in (different, shown))
     relief_px = agreement.over_picture(agreement.wholly_seen * sure * np.linalg.norm(off_px, axis=1))
     ordinary = MOVING / (1 + (relief_px / np.float32(RIM_PX)) ** 2)
-    trust = _explained(near, cv2.max(ordinary, 1.0) * (OWN_ERROR * shown_near + noise))
+    trust = _relative_noise(near, cv2.max(ordinary, 1.0) * (OWN_ERROR * shown_near + noise))
     own = np.flatnonzero(sure)
     tiles[own] = agreement.differences(shift_px[own] + sure[own, None] * off_px[own], own)
     misplaced = left - _power_around(agreement.side_by_side(tiles), AROUND)
     trust *= expected / (expected + 2 * cv2.max(misplaced, 0.0))
-    return _not_less(trust), _not_less(alike)
+    return _thresholded(trust), _thresholded(alike)
 
 
-def _explained(power: Image, most: Image) -> Image:
+def _relative_noise(power: Image, most: Image) -> Image:
     """The frame's noise over the neighbour's: 1 up to the power ``most``, above it ½ most / (power − ½ most)."""
     return np.float32(0.5) / cv2.max(power / most - np.float32(0.5), 0.5)
 
 
-def _not_less(trust: Image) -> Image:
+def _thresholded(trust: Image) -> Image:
     return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
 
 
@@ -241,17 +243,17 @@ def _power_around(picture: Image, side: int) -> Image:
     return cv2.sqrBoxFilter(picture, cv2.CV_32F, (side, side))
 
 
-def still_part(found: Sequence[NeighbourPlace]) -> Image | None:
+def static_part(found: Sequence[NeighbourRegistration]) -> Image | None:
     """How surely the frame shows the static scene, 0 to 1, according to the neighbour that agrees best.
 
     Content that no neighbour shows at the registered position moves, and its blur is not the camera's.  Regions that
     no neighbour covers count as static.  Neighbours that differ almost everywhere are ignored; None: none is left.
     """
-    telling = [one for one in found if one.alike[one.seen].mean() > LEAST_ALIKE]
-    if not telling:
+    agreeing = [one for one in found if one.alike[one.seen].mean() > LEAST_ALIKE]
+    if not agreeing:
         return None
-    best = np.maximum.reduce([one.alike for one in telling])
-    return np.where(np.logical_or.reduce([one.seen for one in telling]), best, np.float32(1))
+    best = np.maximum.reduce([one.alike for one in agreeing])
+    return np.where(np.logical_or.reduce([one.seen for one in agreeing]), best, np.float32(1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +265,7 @@ class JoinedNeighbours:
     """(RINGS,) weighted sum of their |K|²."""
 
     @property
-    def places(self) -> tuple[NeighbourPlace, ...]:
+    def places(self) -> tuple[NeighbourRegistration, ...]:
         """Their registrations."""
         return tuple(one.place for one in self.pictures)
 
@@ -274,7 +276,7 @@ def joined_neighbours(found: Sequence[NeighbourPicture], luma: PictureStatistics
     return JoinedNeighbours(tuple(found), np.sum([np.zeros(RINGS), *passed], 0))
 
 
-def most_telling(passed: Sequence[Array], taken: Array, luma: PictureStatistics) -> int:
+def most_useful(passed: Sequence[Array], taken: Array, luma: PictureStatistics) -> int:
     """Index into ``passed`` of the further picture with which the ideal linear filter's error is least.
 
     passed: (RINGS,) weighted |K|² of each.  taken: (RINGS,) their sum over the pictures already chosen.  luma: the
@@ -319,7 +321,7 @@ def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array
     return found, typical
 
 
-def _lasting_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px: float) -> float:
+def _common_shift_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px: float) -> float:
     """Deviation, per axis, of the part of shifts (n, 2) common to adjacent tiles: the affine field's error, not noise.
 
     The noise of adjacent tiles is independent, so the mean product of their shifts is the power of the common part.
@@ -332,13 +334,13 @@ def _lasting_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px:
     return float(np.sqrt(max(products.mean() / 2, 0.0))) if len(products) else typical_px
 
 
-def _left_of_shifts_px(off_px: Array, lasting_px: float, noise_px: float) -> Array:
+def _registration_std_px(off_px: Array, common_px: float, noise_px: float) -> Array:
     """(n,) RMS registration error, per axis, in tiles whose shifts differ from the field by off_px (n, 2).
 
     With normal priors, the expected error is share · off_px, share = lasting² / (lasting² + noise²), with the variance
     share · noise².
     """
-    share = lasting_px**2 / max(lasting_px**2 + noise_px**2, 1e-12)
+    share = common_px**2 / max(common_px**2 + noise_px**2, 1e-12)
     return np.asarray(np.sqrt(share**2 * (off_px**2).sum(axis=1) / 2 + share * noise_px**2))
 
 

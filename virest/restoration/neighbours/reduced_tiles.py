@@ -161,7 +161,7 @@ def radii(side: int = TILE) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _looked_at() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
+def _fitted_phases() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
     """Flat indices into half a spectrum of the m phases to fit, by increasing frequency, and 2π f there, (2, m).
 
     The third: how many of them lie below each of CUTOFFS.
@@ -185,25 +185,25 @@ def common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
 
 def tile_shifts(a: NDArray[np.complex64], b: NDArray[np.complex64], start_px: Array) -> tuple[Array, Array]:
     """Shifts (n, 2) of tiles and their precision (n,), 1 / px², from the phases' scatter; 0: different content."""
-    places, waves, counts = _looked_at()
+    places, waves, counts = _fitted_phases()
     product = np.conj(a.reshape(len(a), -1)[:, places]) * b.reshape(len(b), -1)[:, places]
     size, phase, shift = np.abs(product), np.angle(product), np.tile(start_px, (len(a), 1))
     squares = np.stack([waves[0] ** 2, waves[0] * waves[1], waves[1] ** 2], -1)
     for count in counts:
-        left = _left(phase[:, :count], shift, waves[:, :count])
+        left = _phase_residual(phase[:, :count], shift, waves[:, :count])
         weight = size[:, :count] * np.maximum(np.cos(left), 0)
         xx, xy, yy = (weight @ squares[:count]).T.astype(float)
         x, y = ((weight * left) @ waves[:, :count].T).T.astype(float)
         determinant = np.maximum(xx * yy - xy * xy, 1e-3 * (xx + yy) ** 2 + 1e-20)
         shift += np.stack([(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant], -1)
     total = np.maximum(size.sum(axis=1, dtype=float), 1e-20)
-    coherence = (size * np.cos(_left(phase, shift, waves))).sum(axis=1, dtype=float) / total
+    coherence = (size * np.cos(_phase_residual(phase, shift, waves))).sum(axis=1, dtype=float) / total
     scatter = np.maximum(1 - coherence**2, 1e-4) / np.maximum(coherence**2, 1e-4)
     narrow = determinant / np.maximum(xx + yy, 1e-20) / total
     return shift, np.where(coherence > LEAST_COHERENCE, narrow / scatter, 0.0)
 
 
-def _left(phase: NDArray[np.float32], shift: Array, waves: NDArray[np.float32]) -> NDArray[np.float32]:
+def _phase_residual(phase: NDArray[np.float32], shift: Array, waves: NDArray[np.float32]) -> NDArray[np.float32]:
     """Phase residuals (n, m) after shifts (n, 2), wrapped to ± π."""
     left = phase - shift.astype(np.float32) @ waves
     return np.asarray(left - np.float32(2 * np.pi) * np.rint(left * np.float32(0.5 / np.pi)), np.float32)

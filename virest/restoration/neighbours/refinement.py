@@ -36,7 +36,7 @@ HALF_SPACING = 0.25
 LAG_STD_S, PART_STD = 0.003, 0.1
 """Priors of both: recorders stamp frames and samples to a few milliseconds, and a stabiliser or low pass removes about
 a tenth of the rotation from the picture or the log."""
-BELIEVED = 0.5
+MOST_REMAINING = 0.5
 """Use the fitted lag and part if they reduce the interpolation error's variance below this fraction.  A stabiliser that
 cancels only slow rotation is no function of the rate, and a fit of two values always reduces the variance a little
 (captures at 0.75 and above lost up to 2 dB, those at 0.3 and below gained).
@@ -61,7 +61,7 @@ class FollowingTurn:
             self.lag_s * trajectory.angular_acceleration_rad_s2(time_s) + self.part * trajectory.rate_rad_s(time_s)
         )
 
-    def left_of(self, turn: PairTurn, trajectory: Trajectory) -> PairTurn:
+    def residual_of(self, turn: PairTurn, trajectory: Trajectory) -> PairTurn:
         """The part of a pair's missing rate that it does not explain."""
         change, mean = _change_and_mean(turn, trajectory)
         return replace(turn, rate_rad_s=turn.rate_rad_s - self.lag_s * change - self.part * mean)
@@ -96,7 +96,7 @@ class MissingTurn:
         """
         prior = self.rest_rad_s**2 * np.eye(3)
         chains = [
-            self._unbroken([None if turn is None else self.following.left_of(turn, trajectory) for turn in turns])
+            self._until_gap([None if turn is None else self.following.residual_of(turn, trajectory) for turn in turns])
             for turns in (before, after)
         ]
         if not any(chains):
@@ -118,12 +118,12 @@ class MissingTurn:
         further = FurtherTurn(nodes_s, rest + self.following.at(trajectory, nodes_s))
         return RefinedMotion(motion.turned(further), covariance + bend**2 * np.eye(3), scatter, further)
 
-    def _unbroken(self, turns: Sequence[PairTurn | None]) -> list[PairTurn]:
+    def _until_gap(self, turns: Sequence[PairTurn | None]) -> list[PairTurn]:
         """The pairs up to the first that is missing or is an outlier."""
-        known = [turn if turn is not None and self._likely(turn) else None for turn in turns]
+        known = [turn if turn is not None and self._is_inlier(turn) else None for turn in turns]
         return [turn for turn in known[: known.index(None) if None in known else None] if turn is not None]
 
-    def _likely(self, turn: PairTurn) -> bool:
+    def _is_inlier(self, turn: PairTurn) -> bool:
         spread = turn.covariance + self.rest_rad_s**2 * np.eye(3)
         return float(turn.rate_rad_s @ np.linalg.solve(spread, turn.rate_rad_s)) < FARTHEST**2
 
@@ -148,7 +148,7 @@ class RefinedMotion:
         spread = jacobian @ self.rate_covariance @ jacobian.T + self.scatter_px_s**2 * np.eye(2)
         return np.asarray(spread * self.motion.exposure_s**2)
 
-    def place_std_px(self) -> float:
+    def position_std_px(self) -> float:
         """RMS uncertainty of the rows' positions at mid-exposure after straightening, per axis.
 
         The speed error accumulates over the time between a row's mid-exposure and the reference time.
@@ -179,8 +179,8 @@ def missing_turn(
     variance = _variance(turns)
     if variance <= 0:
         return None
-    following, bend = believed_turn(runs, trajectory)
-    rest = max(_variance([following.left_of(turn, trajectory) for turn in turns]), 0.0)
+    following, bend = accepted_turn(runs, trajectory)
+    rest = max(_variance([following.residual_of(turn, trajectory) for turn in turns]), 0.0)
     bend = rest if bend is None else bend
     found = MissingTurn(
         float(np.sqrt(variance)),
@@ -218,16 +218,16 @@ def _variance(turns: Sequence[PairTurn]) -> float:
     return float(np.median([t.rate_rad_s @ t.rate_rad_s for t in turns]) / chi2_median(3) - noise)
 
 
-def believed_turn(
+def accepted_turn(
     runs: Sequence[Sequence[PairTurn | None]], trajectory: Trajectory
 ) -> tuple[FollowingTurn, float | None]:
-    """The fitted lag and part if they meet BELIEVED, else zeros, and :func:`_bend` of the rest."""
+    """The fitted lag and part if they meet MOST_REMAINING, else zeros, and :func:`_bend` of the rest."""
     none, bend = FollowingTurn(), _bend(runs)
     if bend is None:
         return none, None
-    tried = following_turn([turn for run in runs for turn in run if turn is not None], trajectory)
-    left = _bend([[None if turn is None else tried.left_of(turn, trajectory) for turn in run] for run in runs])
-    return (tried, left) if left is not None and left < BELIEVED * bend else (none, bend)
+    fitted = following_turn([turn for run in runs for turn in run if turn is not None], trajectory)
+    left = _bend([[None if turn is None else fitted.residual_of(turn, trajectory) for turn in run] for run in runs])
+    return (fitted, left) if left is not None and left < MOST_REMAINING * bend else (none, bend)
 
 
 def _bend(runs: Sequence[Sequence[PairTurn | None]]) -> float | None:

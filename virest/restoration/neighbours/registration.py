@@ -127,7 +127,7 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
         return None
     a, apart = spectra_of(inner(tiles.spectra * there)), np.zeros(2)
     for _ in range(2):
-        b = wide_spectra(_brought(view, second, times, apart), tops_lefts)
+        b = wide_spectra(_registered(view, second, times, apart), tops_lefts)
         b = spectra_of(inner(b * tiles.kernels))
         common = common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
@@ -242,7 +242,7 @@ def tile_agreement(
         float(np.median(cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
         _inside(source, second),
-        _near_lamps(tiles.light, there, blur_px) > 0,
+        _near_clipped_light(tiles.light, there, blur_px) > 0,
         blur_px,
         np.asarray(power_of(tiles.kernels).mean(axis=0) + power_of(kernels).mean(axis=0)),
         tiles.times,
@@ -275,7 +275,7 @@ def judged_change(
         return None
     source = view.map_px(times=times)
     brought = read_at(second, source)
-    unknown = _near_lamps(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
+    unknown = _near_clipped_light(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
     seen = cut(np.float32(1) - unknown, tops_lefts)
     b = spectra_of(cut(brought, tops_lefts), seen)
     onto = [spectra_of(inner(wide_spectra(picture, tops_lefts) * kernels), seen) for picture in (recorded, restored)]
@@ -309,17 +309,17 @@ def _inside(source: NDArray[np.float32], second: Image) -> NDArray[np.bool_]:
     return np.asarray(cv2.inRange(source, (-0.5, -0.5), (width - 0.5, height - 0.5)) > 0)
 
 
-def _near_lamps(light: Image, there: Image, reach_px: int, beyond: int = 0) -> NDArray[np.uint8]:
+def _near_clipped_light(light: Image, there: Image, reach_px: int, beyond: int = 0) -> NDArray[np.uint8]:
     """1 where clipped light of either of two registered reduced pictures may reach by blur.
 
     beyond: 1 to mark also what light from beyond their edges may reach.
     """
-    lamps = (cv2.max(light, there) > CLIPPED_LIGHT).astype(np.uint8)
+    clipped_light = (cv2.max(light, there) > CLIPPED_LIGHT).astype(np.uint8)
     around = np.ones((4 * reach_px + 1, 4 * reach_px + 1), np.uint8)
-    return cv2.dilate(lamps, around, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
+    return cv2.dilate(clipped_light, around, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
 
 
-def _brought(view: NeighbourView, second: Image, times: int, apart: Array) -> Image:
+def _registered(view: NeighbourView, second: Image, times: int, apart: Array) -> Image:
     """The neighbour's reduced picture registered by the prediction, minus a common shift (2,), reduced pixels.
 
     The map is computed per row: over the rows of a tile, 5 ms, hand shake bends it by up to half a pixel.

@@ -22,12 +22,12 @@ from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.joint import (
     NeighbourPicture,
-    NeighbourPlace,
+    NeighbourRegistration,
     half_size,
     is_detailed,
-    most_telling,
-    neighbour_picture,
-    neighbour_place,
+    most_useful,
+    register_neighbour,
+    resample_neighbour,
     rings_passed,
 )
 from virest.restoration.neighbours.reduced_tiles import reduced_light
@@ -140,13 +140,13 @@ class FrameNeighbours:
         if not left or not most:
             return ()
         tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
-        found: dict[int, NeighbourPlace] = {}
+        found: dict[int, NeighbourRegistration] = {}
         taken: list[int] = []
         sights = dict(left)
-        passed = {n: _finer(other, here) * self._passed_of(other, here) for n, other in left.items()}
+        passed = {n: _coding_noise_ratio(other, here) * self._passed_of(other, here) for n, other in left.items()}
         while tiles is not None and left and len(taken) < most:
             sum_taken = np.sum([np.zeros(RINGS), *(passed[number] for number in taken)], axis=0)
-            number = list(left)[most_telling([passed[n] for n in left], sum_taken, luma)]
+            number = list(left)[most_useful([passed[n] for n in left], sum_taken, luma)]
             if number in found:
                 taken.append(number)
                 del left[number]
@@ -164,11 +164,11 @@ class FrameNeighbours:
                     passed[other] = passed[other] * share
             passed[number] = measured
         detailed = {n: is_detailed(replace(luma, passed=self._passed[n])) for n in taken}
-        return tuple(neighbour_picture(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
+        return tuple(resample_neighbour(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
 
     def _place(
         self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
-    ) -> NeighbourPlace | None:
+    ) -> NeighbourRegistration | None:
         """Register a neighbour to the frame; None if it shows different content or its path is too long."""
         assert here.motion is not None
         assert other.motion is not None
@@ -181,10 +181,10 @@ class FrameNeighbours:
         level = 255 * float(curve.encode(np.array(agreement.light)))
         slope = float(np.interp(level, np.arange(256), curve.slope_table()))
         error = agreement.expected_error(luma.frequency, luma.noise, slope)
-        place = neighbour_place(view, along, other.frame.index, agreement, error)
-        return None if place is None else replace(place, finer=_finer(other, here))
+        place = register_neighbour(view, along, other.frame.index, agreement, error)
+        return None if place is None else replace(place, coding_noise_ratio=_coding_noise_ratio(other, here))
 
-    def knowing(self, missing: MissingTurn | None) -> FrameNeighbours:
+    def with_missing_turn(self, missing: MissingTurn | None) -> FrameNeighbours:
         """A copy with the capture's missing rotation, which shares the pair comparisons made so far."""
         found = FrameNeighbours(self._trajectory, self._lens, missing)
         found._light, found._turns = self._light, self._turns
@@ -231,7 +231,7 @@ class FrameNeighbours:
                 del kept[old]  # type: ignore[attr-defined]
 
 
-def _finer(other: Sight, here: Sight) -> float:
+def _coding_noise_ratio(other: Sight, here: Sight) -> float:
     """The frame's noise over the neighbour's, as the ratio of their coding steps; 1 if these are unknown.
 
     Coding noise grew as the step to the power of 1.15 between frames on five simulated captures at 0.25 bits per pixel

@@ -48,7 +48,7 @@ def survey_runs(numbers: Iterable[int], path_px: Mapping[int, float]) -> list[tu
     return [runs[k] for k in chosen if len(runs[k]) > 1]
 
 
-def kept_lumas(
+def store_lumas(
     pictures: Iterable[tuple[int, Picture]], wanted: Iterable[int], into: dict[int, Picture]
 ) -> Iterator[tuple[int, Picture]]:
     """Pass (index, luma) pairs through, and store the wanted ones in ``into``."""
@@ -77,25 +77,25 @@ def survey_gain(
     neighbours: FrameNeighbours,
     trajectory: Trajectory,
     lens: MovingLens,
-    tried: Callable[[Sight, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
+    restore: Callable[[Sight, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
 ) -> ConfirmedGain | None:
     """The gain of deblurring that neighbours confirm; None: not measurable.
 
-    tried: restores a frame; returns its luma of light as recorded and as restored, at mid-exposure and reduced, or None
-    if it is not deblurred.  One blurred frame per run is restored, and one more if there are fewer than MOST_RUNS runs.
-    Each is compared with both neighbours; if neither can judge it, the next candidate takes its place.
+    restore: returns a frame's luma of light as recorded and as restored, at mid-exposure and reduced, or None if it is
+    not deblurred.  One blurred frame per run is restored, and one more if there are fewer than MOST_RUNS runs.  Each is
+    compared with both neighbours; if neither can judge it, the next candidate takes its place.
     """
     found: list[tuple[float, float, float, float]] = []
     path_px = {n: path_length_px(s.motion) for n, s in sights.items() if s.usable and s.motion is not None}
     asked, most = 0, min(len(runs) + 1, MOST_RUNS)
-    for number in lively_frames(runs, path_px)[: 2 * most]:
+    for number in gain_test_candidates(runs, path_px)[: 2 * most]:
         if asked == most:
             break
         before, here, after = (sights[number + step] for step in (-1, 0, 1))
         assert here.motion is not None
         refined = neighbours.refined((before,), here, (after,))
         motion = here.motion if refined is None else refined.motion
-        pictures = tried(here, motion, refined)
+        pictures = restore(here, motion, refined)
         if pictures is None:
             continue
         before_this = len(found)
@@ -110,7 +110,7 @@ def survey_gain(
     return confirmed_gain(found)
 
 
-def lively_frames(runs: Sequence[Sequence[int]], path_px: Mapping[int, float]) -> list[int]:
+def gain_test_candidates(runs: Sequence[Sequence[int]], path_px: Mapping[int, float]) -> list[int]:
     """Candidates for testing the gain, each between two usable frames: the best of each run, then the others.
 
     A frame with a short path is of little use: restoring it changes detail finer than the compared pictures resolve.

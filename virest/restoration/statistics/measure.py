@@ -18,8 +18,8 @@ from virest.restoration.statistics.rings import SIDE
 from virest.restoration.statistics.tile_power import (
     MANY_TILES,
     cut,
-    evenly_steep,
     known_part,
+    light_in_grey_levels,
     passed_power,
     white_noise,
     windowed_power,
@@ -50,7 +50,7 @@ def measure_picture(
     chosen = _least_clipped(clipped, corners, most_tiles)
     kernels = field.chosen(chosen).arrays()
     passed = np.stack([passed_power(kernel) for kernel in kernels])
-    real = 0.5 * (1 + passed - np.stack([passed_power(_less_one(kernel)) for kernel in kernels]))
+    real = 0.5 * (1 + passed - np.stack([passed_power(_minus_impulse(kernel)) for kernel in kernels]))
     known = [
         None if clipped is None else known_part(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)
     ]
@@ -62,7 +62,10 @@ def measure_picture(
 
     tiles = zip(chosen, known, strict=True)
     light = np.stack(
-        [windowed_power(evenly_steep(_luma_light(cut(picture, corners[i]), curve), curve), seen) for i, seen in tiles]
+        [
+            windowed_power(light_in_grey_levels(_luma_light(cut(picture, corners[i]), curve), curve), seen)
+            for i, seen in tiles
+        ]
     )
     luma, *red_blue = _planes(_some_rows(picture))
     cells, white_levels, grey = RingCells(passed), white_noise(luma), observed(0, range(len(parts)))
@@ -102,7 +105,7 @@ def _most_colourful(parts: Sequence[tuple[NDArray[np.uint8], ...]]) -> NDArray[n
     return np.sort(np.argsort(spread)[len(parts) // 2 :])
 
 
-def _less_one(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+def _minus_impulse(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     """A kernel minus the unit impulse."""
     left = kernel.copy()
     left[kernel.shape[0] // 2, kernel.shape[1] // 2] -= 1

@@ -68,13 +68,15 @@ def picture_statistics(
         coding_step = None if coding_step is None else coding_step / times
     found = measure_picture(picture, field, curve, clipped_anywhere(picture, curve), most_tiles, coding_step)
     luma, chroma = (
-        focused(one.scaled(times) if times > 1 and one.measured else one, sigma_px).with_error_share(CURVE_SLOPE_STD**2)
+        without_defocus(one.scaled(times) if times > 1 and one.measured else one, sigma_px).with_error_share(
+            CURVE_SLOPE_STD**2
+        )
         for one in found
     )
     return luma, chroma
 
 
-def focused(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64]) -> PictureStatistics:
+def without_defocus(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64]) -> PictureStatistics:
     """Spectra of the picture before Gaussian defocus; sigma_px: one value, or (n,) for the measured tiles.
 
     The Gaussian leaves almost nothing of high frequencies, so dividing by it there gives no valid spectrum.  No scene's
@@ -90,10 +92,10 @@ def focused(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64])
     signal[1:] = np.minimum.accumulate((signal * rise)[1:]) / rise[1:]
     passed = defocused.passed * left
     noise = np.maximum(defocused.noise, through - passed * signal)
-    drowned = np.flatnonzero(passed * signal < noise)
-    drowned = drowned[drowned > 0]
-    if len(drowned):
-        last = drowned[0] - 1
+    below_noise = np.flatnonzero(passed * signal < noise)
+    below_noise = below_noise[below_noise > 0]
+    if len(below_noise):
+        last = below_noise[0] - 1
         signal[last + 1 :] = np.minimum(signal, falling_power(frequency, signal, last))[last + 1 :]
     places = defocused.places and defocused.places.after(left)
     real, cells = defocused.real, defocused.cells

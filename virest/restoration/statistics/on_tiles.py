@@ -44,7 +44,7 @@ def on_spectrum(
     levels = np.log(ring_values).astype(np.float32)
     values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below]) * falling
     if statistics.places is not None and by_place:
-        values = values / _spread_places(statistics.places.share, size, _widening(statistics, scale))
+        values = values / _resampled_places(statistics.places.share, size, _widening(statistics, scale))
     return np.asarray(values, np.float32)
 
 
@@ -53,14 +53,14 @@ def _widening(statistics: PictureStatistics, scale: float) -> float:
     return scale * float(statistics.frequency[0] + statistics.frequency[-1]) / 0.5
 
 
-def _spread_places(share: NDArray[np.float32], size: int, scale: float) -> NDArray[np.float32]:
+def _resampled_places(share: NDArray[np.float32], size: int, scale: float) -> NDArray[np.float32]:
     """Values per frequency interpolated to a packed spectrum (size, size); beyond them, the nearest."""
     rising = np.roll(share, SIDE // 2, axis=0)
-    return cv2.remap(rising, *_on_places(size, scale), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(rising, *_spectrum_coordinates(size, scale), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=8)
-def _on_places(size: int, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _spectrum_coordinates(size: int, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Column and row of the measured spectrum, rows from the lowest frequency up, for each packed value."""
     packed = (np.arange(size) + 1) // 2 / size
     fx, fy = (a.copy() for a in np.broadcast_arrays(packed[None, :], np.fft.fftfreq(size)[:, None]))

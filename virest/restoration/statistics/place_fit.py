@@ -63,14 +63,14 @@ def place_statistics(
     signal, noise = rings.signal[ring], rings.noise[ring]
     seen, k = (_around(np.asarray(spectra.mean(axis=0))) for spectra in (observed, passed))
     k = np.maximum(k, 1e-6)
-    own, doubt = (seen - noise) / k, noise / (k * np.sqrt(count))
+    own, own_std = (seen - noise) / k, noise / (k * np.sqrt(count))
     most = np.maximum(_STEEPEST_PLACE * signal, seen - noise)
-    logarithms = np.log(np.clip(own, np.minimum(doubt, signal), most) / signal)
+    logarithms = np.log(np.clip(own, np.minimum(own_std, signal), most) / signal)
     reliable = k * signal / (k * signal + noise)
     sums, counts = (np.bincount(ring.ravel(), w.ravel(), RINGS) for w in (reliable * logarithms, reliable))
     typical = signal * np.exp(np.minimum(sums / (counts + _FEW_PLACES), 0.0))[ring]
     known = count / (count + (1 + noise / (k * typical)) ** 2)
-    found = np.clip(typical + known * (own - typical), np.minimum(doubt, typical), most)
+    found = np.clip(typical + known * (own - typical), np.minimum(own_std, typical), most)
     return PlaceStatistics(weight, ((found / signal) ** weight).astype(np.float32), k.astype(np.float32))
 
 

@@ -140,7 +140,7 @@ class PictureStatistics:
         return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
 
     @property
-    def drowned(self) -> float:
+    def below_noise(self) -> float:
         """0 if the picture's gradients stand out of the noise, towards 1 the less they do.
 
         The sparse gradient prior then takes texture for noise.
@@ -192,7 +192,7 @@ class PictureStatistics:
         )
         return replace(self, noise=noise, noise_levels=self.noise_levels * float(np.sqrt(after / before)))
 
-    def doubted_by(self, spread: KernelSpread | None) -> PictureStatistics:
+    def with_kernel_variance(self, spread: KernelSpread | None) -> PictureStatistics:
         """With uncertain kernels: their variance times S is added to the noise."""
         if spread is None:
             return self
@@ -217,17 +217,17 @@ class PictureStatistics:
             return 0.0
         if self.places is not None:
             return self.places.expected_gain_db(self.signal, self.noise)
-        left = np.sum(self.frequency * (self._lost() + self.noise))
-        return max(float(10 * np.log10(left / np.sum(self.frequency * self._wrong(further)))), 0.0)
+        left = np.sum(self.frequency * (self._blur_loss() + self.noise))
+        return max(float(10 * np.log10(left / np.sum(self.frequency * self._remaining_error(further)))), 0.0)
 
     def ideal_error(self, further: Array) -> float:
         """Mean square error, grey levels squared, of the ideal linear filter; further: as in :meth:`joint_gain_db`."""
-        return float(self._area() @ self._wrong(further))
+        return float(self._area() @ self._remaining_error(further))
 
     @property
     def blur_error(self) -> float:
         """Mean square error, grey levels squared, of the recorded picture by its blur."""
-        return float(self._area() @ self._lost())
+        return float(self._area() @ self._blur_loss())
 
     def misplaced(self, std_px: float, further: Array) -> Misplaced:
         """Error by rows displaced with a deviation of ``std_px`` per axis; further: as in :meth:`joint_gain_db`.
@@ -245,12 +245,12 @@ class PictureStatistics:
     def _area(self) -> Array:
         return np.asarray(2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]))
 
-    def _lost(self) -> Array:
+    def _blur_loss(self) -> Array:
         """(RINGS,) power of (1 − K) F."""
         real = np.sqrt(self.passed) if self.real is None else self.real
         return np.asarray((1 - 2 * real + self.passed) * self.signal)
 
-    def _wrong(self, further: Array) -> Array:
+    def _remaining_error(self, further: Array) -> Array:
         """(RINGS,) power of the ideal linear filter's error."""
         count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
         signal, noise, passed = self.signal[:, None], self.noise[:, None], passed + further[:, None]

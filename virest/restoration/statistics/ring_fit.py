@@ -95,12 +95,12 @@ def fit_rings(
     determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
     found = []
     for i, (_, _, white_levels, step) in enumerate(spectra):
-        settled = _settled(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels, step)
+        final = _final_statistics(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels, step)
         by_law, by_fit = (
             _misfit(count[i], g[i], n[:, None] + s[:, None] * k[i])
-            for n, s in ((settled.noise, settled.signal), (noise[i], signal[i]))
+            for n, s in ((final.noise, final.signal), (noise[i], signal[i]))
         )
-        found.append(replace(settled, misfit=min(by_law, _OF_FIT * by_fit)))
+        found.append(replace(final, misfit=min(by_law, _OF_FIT * by_fit)))
     return found
 
 
@@ -115,7 +115,7 @@ def _misfit(count: Array, observed: Array, expected: Array) -> float:
     return float(np.sqrt(np.sum(weight * logarithms**2) / max(np.sum(weight), 1.0)))
 
 
-def _settled(
+def _final_statistics(
     signal: Array,
     noise: Array,
     passed: Array,
@@ -133,9 +133,9 @@ def _settled(
     if determined.any():
         noise = np.interp(frequency, frequency[determined], noise[determined])
         noise = np.maximum.accumulate(noise[::-1])[::-1]
-        noise *= _growth_downwards(frequency, noise, determined, observed)
+        noise *= _low_frequency_growth(frequency, noise, determined, observed)
         if passed[_FINEST].mean() > _RECORDED:
-            noise = np.minimum(noise, _at_most(frequency, observed))
+            noise = np.minimum(noise, _noise_bound(frequency, observed))
         if step is not None:
             noise = np.minimum(noise, observed[_FINEST].mean() + coder_noise(observed, step))
     else:
@@ -144,7 +144,7 @@ def _settled(
     through = np.maximum(observed - noise, 0.05 * observed) / np.maximum(passed, 0.05)
     signal = np.where(determined, signal, through)
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
-    signal = _as_detail_falls(frequency, signal, passed, noise)
+    signal = _extrapolated_detail(frequency, signal, passed, noise)
     return PictureStatistics(frequency, signal, noise, passed, _standard_deviation(frequency, passed * signal, noise))
 
 
@@ -154,7 +154,7 @@ def _standard_deviation(frequency: Array, through: Array, noise: Array) -> float
     return float(np.sqrt(np.sum(weight * noise) / np.sum(weight)))
 
 
-def _at_most(frequency: Array, observed: Array) -> Array:
+def _noise_bound(frequency: Array, observed: Array) -> Array:
     """Upper bound on the noise of each ring (RINGS,) where the finest rings still hold detail.
 
     A short path cancels little, and in one direction only, so the picture's own anisotropy is fitted as noise: fits
@@ -169,7 +169,7 @@ def _falling_noise(frequency: Array, finest: float, slope: float) -> Array:
     return np.asarray(max(finest, ROUNDING_POWER) * (frequency[-2] / np.maximum(frequency, _LEVEL_BELOW)) ** slope)
 
 
-def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.bool_], observed: Array) -> Array:
+def _low_frequency_growth(frequency: Array, noise: Array, determined: NDArray[np.bool_], observed: Array) -> Array:
     """Factor on the noise, (RINGS,), below the determined rings: it continues at the slope of the determined ones.
 
     Sensor noise is white.  Coding noise falls with the picture's power where the coder drops it; at lower frequencies,
@@ -189,7 +189,7 @@ def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.boo
     return growth
 
 
-def _as_detail_falls(frequency: Array, signal: Array, passed: Array, noise: Array) -> Array:
+def _extrapolated_detail(frequency: Array, signal: Array, passed: Array, noise: Array) -> Array:
     """S, and where it is close to the noise, at least the f⁻³ extrapolation from the last reliable ring.
 
     There the coder has removed the blurred picture's faint detail, and the fit finds less than the sharp picture has.

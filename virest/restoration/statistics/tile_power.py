@@ -25,7 +25,7 @@ def cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]:
     return plane[corner[0] : corner[0] + SIDE, corner[1] : corner[1] + SIDE]
 
 
-def evenly_steep(light: NDArray[np.float32], curve: ResponseCurve) -> NDArray[np.float32]:
+def light_in_grey_levels(light: NDArray[np.float32], curve: ResponseCurve) -> NDArray[np.float32]:
     """Light of a tile (height, width) scaled to grey levels by the curve's slope at its mean."""
     mean_level = 255 * float(curve.encode(np.array(light.mean())))
     return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
