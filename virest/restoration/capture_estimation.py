@@ -201,9 +201,9 @@ def _with_offset_conflict(plan: RestorationPlan, given_s: float, offset_s: float
     """Note a difference between the frames' time offset and the profile's, if it is significant."""
     if abs(offset_s - given_s) < max(OFFSET_DOUBT_S, 3 * std_s):
         return plan
-    said = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
+    text = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
     contradicted = replace(plan.profile, time_offset_s=offset_s)
-    return replace(plan, contradicted=contradicted).noted(NoteCode.OTHER_OFFSET, said)
+    return replace(plan, contradicted=contradicted).noted(NoteCode.OTHER_OFFSET, text)
 
 
 def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> dict[int, float]:
@@ -244,7 +244,7 @@ def _with_blur_length_check(
     found = path_scale(shown, capture.bits_per_px)
     if found is None or not found.contradicts:
         return plan
-    said = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
+    text = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
     shutter = profile.shutter
     offset_s = profile.time_offset_s or 0.0
     if found_by_points:
@@ -257,7 +257,7 @@ def _with_blur_length_check(
             plan = plan.without(NoteCode.OTHER_OFFSET)
     shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
     contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
-    return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, said)
+    return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, text)
 
 
 def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:
@@ -380,9 +380,9 @@ def _default_notes(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, 
     """A note for each unknown value, which is set to its documented default."""
     notes = []
     if profile.response is None:
-        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "response curve unknown: srgb taken"))
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "response curve unknown: srgb assumed"))
     if not profile.readout_known:
-        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "readout time unknown: 0 taken, rows are not straightened"))
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "readout time unknown: 0 assumed, rows are not straightened"))
     if all(frame.exposure_s is None for frame in capture.frames):
         notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "exposure times unknown: frames are not deblurred"))
     if profile.depth_m is None:

@@ -43,11 +43,11 @@ class Cause:
     """Whether a phone can have such a value.  Arguments: given profile, fitted one."""
     change: Callable[[CameraProfile, CameraProfile], float]
     """Change from the given profile to the fitted one, in the units of the term's first value."""
-    adopted: Callable[[CameraProfile, CameraProfile, Array], CameraProfile]
+    adopt: Callable[[CameraProfile, CameraProfile, Array], CameraProfile]
     """A profile with this cause's values from the fitted one.  Arguments: profile to change, fitted one, and standard
     deviations (k,) in the term's units."""
-    said: Callable[[CameraProfile, CameraProfile, Array], str]
-    """Message about the adopted value.  Arguments: given profile, fitted one, standard deviations (k,)."""
+    message: Callable[[CameraProfile, CameraProfile, Array], str]
+    """Message about the adopt value.  Arguments: given profile, fitted one, standard deviations (k,)."""
 
 
 def _skews(table: TrackTable) -> Array:

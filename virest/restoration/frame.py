@@ -298,7 +298,7 @@ def _deblurred(
     together = neighbours is not None and light is None and blur.anchor == 0.5
     found = neighbours(measured.luma, measured.field) if together and neighbours is not None else ()
     joined = joined_neighbours(found, measured.luma_model)
-    longest_px = max((blur.longest_px, *(one.longest_px for one in joined.places)))
+    longest_px = max((blur.longest_px, *(one.longest_px for one in joined.registrations)))
     blurred = replace(blurred, spread=measured.spread, neighbours=joined.pictures, longest_px=longest_px)
     recorded = picture
     if light is not None:
@@ -359,12 +359,12 @@ def _blend_weights(
     touched = blurred_part(blur.motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
     part, seen = touched * share_map(blurred, measured.share), measured_share(blurred)
     part = part if seen is None else part * seen
-    still = static_part(joined.places)
+    still = static_part(joined.registrations)
     if still is not None and still.min() < 1:
         height, width = blurred.light[0].shape
         part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
     if confirmed is not None:
-        part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.places)))
+        part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.registrations)))
     return touched, part
 
 
@@ -392,7 +392,7 @@ def _details(
         expected_gain_std_db=gain_db[1] if gain_db else None,
         promised_gain_db=model.joint_gain_db(joined.passed) if joined.pictures else model.expected_gain_db,
         path_std_px=float(np.sqrt(np.trace(blur.covariance_px2) / 2)),
-        neighbours=tuple(JoinedNeighbour(one.number, one.weight) for one in joined.places),
+        neighbours=tuple(JoinedNeighbour(one.number, one.weight) for one in joined.registrations),
         neighbours_gain_db=10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
         share=measured.share,
         defocus_sigma_px=most_defocus_px(blur.motion.profile),

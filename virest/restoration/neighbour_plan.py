@@ -50,11 +50,11 @@ def with_neighbour_survey(
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing = survey_turns(runs, sights, neighbours, trajectory)
     if missing is not None:
-        said = (
+        note = (
             f"neighbouring frames rotate by {missing.rate_rad_s:.3f} rad/s rms more or less than predicted: "
             "each frame's motion is corrected by its neighbours"
         )
-        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, said))
+        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, note))
     if plan.settings.deblur == "none":
         return plan
     quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
@@ -76,9 +76,9 @@ def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> t
     mask = seen_mask(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
     if mask is None:
         return plan, dict(sights)
-    said = (
+    note = (
         "edges overshoot as after a phone's sharpening: before deblurring, process undoes the expected "
         f"unsharp mask, of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
     )
-    plan = replace(plan, mask=mask, notes=(*plan.notes, said))
+    plan = replace(plan, mask=mask, notes=(*plan.notes, note))
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}

@@ -113,13 +113,15 @@ def settle_conflict(
     resolved = profile
     stds = [_std(fit, cause, noise_px) for cause in causes]
     for cause, std in zip(causes, stds, strict=True):
-        resolved = cause.adopted(resolved, fit.profile, std)
-    said = tuple(cause.said(profile, fit.profile, std) for cause, std in zip(causes, stds, strict=True))
-    said = tuple(text + search.ambiguity_note(fit, causes, cause) for text, cause in zip(said, causes, strict=True))
+        resolved = cause.adopt(resolved, fit.profile, std)
+    messages = tuple(cause.message(profile, fit.profile, std) for cause, std in zip(causes, stds, strict=True))
+    messages = tuple(
+        text + search.ambiguity_note(fit, causes, cause) for text, cause in zip(messages, causes, strict=True)
+    )
     offset = _offset(fit, readout_s, noise_px)
     focal = None if focal_known else _focal(fit, noise_px)
     after_px = fit.scale * noise_px
-    return Settled(resolved, True, said, left_px, after_px, noise_px, offset, motion_px, focal)
+    return Settled(resolved, True, messages, left_px, after_px, noise_px, offset, motion_px, focal)
 
 
 def _offset(fit: TrackFit, readout_s: float, noise_px: float) -> tuple[float, float]:
@@ -206,7 +208,7 @@ class _Search:
         both = self.fit(_Start(fit.profile, (*causes, twin), fit.scene))
         change = cause.change(self.given, both.profile)
         std = _std(both, cause, float(np.median(self.table.noise_px)))[0]
-        return "" if abs(change) > TOLD_SIGMA * std else f" (or a {twin.name}, which this motion does not tell from it)"
+        return "" if abs(change) > TOLD_SIGMA * std else f" (or a {twin.name}: this motion cannot tell them apart)"
 
     def _next(self, here: _Start, fit: TrackFit) -> tuple[_Start, TrackFit] | None:
         """The first cause, by fit, that predicts held-out blocks significantly better and has a plausible value."""

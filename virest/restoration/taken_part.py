@@ -26,9 +26,9 @@ PART_STEP_PX = 80
 def no_gain_reason(luma: PictureStatistics, expected_db: float) -> str:
     """Why the picture is not deblurred; empty: it is."""
     if not luma.measured:
-        return "picture too small, or its blur too long, for its noise to be measured: left alone"
+        return "picture too small, or its blur too long, for its noise to be measured: not deblurred"
     if expected_db < MIN_GAIN_DB:
-        return f"deblurring is expected to gain only {max(expected_db, 0.0):.2f} dB, left alone"
+        return f"deblurring is expected to gain only {max(expected_db, 0.0):.2f} dB: not deblurred"
     return ""
 
 

@@ -137,7 +137,7 @@ def join_neighbours(
     centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
     size, highlights, further = own[0].shape[::-1], _reached_by_highlights(blurred), []
     for neighbour in blurred.neighbours:
-        one = neighbour.place
+        one = neighbour.registration
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
         stds_px = STD_STEP_PX * np.round(one.std_at_px(centres_px) / STD_STEP_PX)
         kept = [_kept_sharpness(std_px / scale, deconvolution.size) for std_px in stds_px.tolist()]

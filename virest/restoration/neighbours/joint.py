@@ -121,7 +121,7 @@ class NeighbourRegistration:
 class NeighbourPicture:
     """One neighbour, registered to the frame's pixels."""
 
-    place: NeighbourRegistration
+    registration: NeighbourRegistration
     light: Image
     """(height, width) luma of its linear light, scaled to the frame's brightness."""
     half_light: Image
@@ -161,19 +161,19 @@ def register_neighbour(
 
 
 def resample_neighbour(
-    place: NeighbourRegistration, light: Image, half_light: Image, detailed: bool
+    registration: NeighbourRegistration, light: Image, half_light: Image, detailed: bool
 ) -> NeighbourPicture:
     """Resample a neighbour's luma of light (height, width), and its light at half that size, to the frame's pixels.
 
     detailed: see :func:`is_detailed`; the luma is then interpolated from 8 × 8 pixels, at four times the cost.
     """
-    source = place.view.map_px(lambda points_px: points_px - _at(place.affine, points_px))
+    source = registration.view.map_px(lambda points_px: points_px - _at(registration.affine, points_px))
     reading = cv2.INTER_LANCZOS4 if detailed else cv2.INTER_CUBIC
     registered = cv2.remap(light, source, None, reading, borderMode=cv2.BORDER_REPLICATE)
     registered_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     for one in (registered, registered_half):
-        one *= np.float32(1 / place.gain)
-    return NeighbourPicture(place, registered, registered_half)
+        one *= np.float32(1 / registration.gain)
+    return NeighbourPicture(registration, registered, registered_half)
 
 
 def is_detailed(luma: PictureStatistics) -> bool:
@@ -203,7 +203,7 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     the frame's, and any excess is the neighbour's.  The ring fit counts overtones of edges as noise, so the noise is
     limited to the median difference.  Since local differences scatter, E is a multiple of the expected power: MOVING
     when detecting motion, less near relief when weighing a neighbour, because of rims that are hidden in one frame.
-    A difference that vanishes with a tile's own shift in place of the field's distorts the picture near relief, and
+    A difference that vanishes with a tile's own shift in registration of the field's distorts the picture near relief, and
     none of it is ordinary.  Only the part of a tile's own shift counts that the shifts' noise, noise_px per axis, does
     not explain (James & Stein 1961).
     """
@@ -265,14 +265,14 @@ class JoinedNeighbours:
     """(RINGS,) weighted sum of their |K|²."""
 
     @property
-    def places(self) -> tuple[NeighbourRegistration, ...]:
+    def registrations(self) -> tuple[NeighbourRegistration, ...]:
         """Their registrations."""
-        return tuple(one.place for one in self.pictures)
+        return tuple(one.registration for one in self.pictures)
 
 
 def joined_neighbours(found: Sequence[NeighbourPicture], luma: PictureStatistics) -> JoinedNeighbours:
     """Join registered neighbours; luma: the frame's statistics."""
-    passed = [one.place.passed(luma.frequency) for one in found]
+    passed = [one.registration.passed(luma.frequency) for one in found]
     return JoinedNeighbours(tuple(found), np.sum([np.zeros(RINGS), *passed], 0))
 
 

@@ -185,8 +185,8 @@ def common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
 
 def tile_shifts(a: NDArray[np.complex64], b: NDArray[np.complex64], start_px: Array) -> tuple[Array, Array]:
     """Shifts (n, 2) of tiles and their precision (n,), 1 / px², from the phases' scatter; 0: different content."""
-    places, waves, counts = _fitted_phases()
-    product = np.conj(a.reshape(len(a), -1)[:, places]) * b.reshape(len(b), -1)[:, places]
+    indices, waves, counts = _fitted_phases()
+    product = np.conj(a.reshape(len(a), -1)[:, indices]) * b.reshape(len(b), -1)[:, indices]
     size, phase, shift = np.abs(product), np.angle(product), np.tile(start_px, (len(a), 1))
     squares = np.stack([waves[0] ** 2, waves[0] * waves[1], waves[1] ** 2], -1)
     for count in counts:

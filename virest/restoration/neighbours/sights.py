@@ -151,12 +151,12 @@ class FrameNeighbours:
                 taken.append(number)
                 del left[number]
                 continue
-            place = self._place(here, left[number], refined, tiles, luma)
-            if place is None or place.weight == 0:
+            registration = self._registration(here, left[number], refined, tiles, luma)
+            if registration is None or registration.weight == 0:
                 del left[number]
                 continue
-            found[number] = place
-            measured = place.passed(luma.frequency)
+            found[number] = registration
+            measured = registration.passed(luma.frequency)
             share = np.minimum(measured / np.maximum(passed[number], 1e-12), 1.0)
             apart = abs(number - here.frame.index)
             for other in left:
@@ -166,7 +166,7 @@ class FrameNeighbours:
         detailed = {n: is_detailed(replace(luma, passed=self._passed[n])) for n in taken}
         return tuple(resample_neighbour(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
 
-    def _place(
+    def _registration(
         self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
     ) -> NeighbourRegistration | None:
         """Register a neighbour to the frame; None if it shows different content or its path is too long."""
@@ -181,8 +181,10 @@ class FrameNeighbours:
         level = 255 * float(curve.encode(np.array(agreement.light)))
         slope = float(np.interp(level, np.arange(256), curve.slope_table()))
         error = agreement.expected_error(luma.frequency, luma.noise, slope)
-        place = register_neighbour(view, along, other.frame.index, agreement, error)
-        return None if place is None else replace(place, coding_noise_ratio=_coding_noise_ratio(other, here))
+        registration = register_neighbour(view, along, other.frame.index, agreement, error)
+        return (
+            None if registration is None else replace(registration, coding_noise_ratio=_coding_noise_ratio(other, here))
+        )
 
     def with_missing_turn(self, missing: MissingTurn | None) -> FrameNeighbours:
         """A copy with the capture's missing rotation, which shares the pair comparisons made so far."""
