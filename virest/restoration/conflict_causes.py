@@ -47,7 +47,7 @@ class Cause:
     """A profile with this cause's values from the fitted one.  Arguments: profile to change, fitted one, and standard
     deviations (k,) in the term's units."""
     message: Callable[[CameraProfile, CameraProfile, Array], str]
-    """Message about the adopt value.  Arguments: given profile, fitted one, standard deviations (k,)."""
+    """Message about the adopted value.  Arguments: given profile, fitted one, standard deviations (k,)."""
 
 
 def _skews(table: TrackTable) -> Array:

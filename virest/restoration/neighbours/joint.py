@@ -203,7 +203,7 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     the frame's, and any excess is the neighbour's.  The ring fit counts overtones of edges as noise, so the noise is
     limited to the median difference.  Since local differences scatter, E is a multiple of the expected power: MOVING
     when detecting motion, less near relief when weighing a neighbour, because of rims that are hidden in one frame.
-    A difference that vanishes with a tile's own shift in registration of the field's distorts the picture near relief, and
+    A difference that vanishes with a tile's own shift in place of the field's distorts the picture near relief, and
     none of it is ordinary.  Only the part of a tile's own shift counts that the shifts' noise, noise_px per axis, does
     not explain (James & Stein 1961).
     """
