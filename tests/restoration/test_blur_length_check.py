@@ -17,9 +17,9 @@ from virest.restoration.blur_length_check import (
     MOST_FRAMES,
     PathScale,
     TilePowers,
-    kept_powers,
+    frames_to_measure,
     path_scale,
-    telling,
+    store_powers,
     tile_powers,
 )
 
@@ -99,7 +99,7 @@ def test_lumas_pass_through_and_spectra_of_some_are_kept() -> None:
     """In order and unchanged."""
     picture = luma(record(camera()).picture)
     kept: dict[int, TilePowers] = {}
-    passed = list(kept_powers(((n, picture) for n in range(5)), (1, 3, 9), CURVE, kept))
+    passed = list(store_powers(((n, picture) for n in range(5)), (1, 3, 9), CURVE, kept))
     assert [n for n, _ in passed] == [0, 1, 2, 3, 4]
     assert all(seen is picture for _, seen in passed)
     assert sorted(kept) == [1, 3]
@@ -108,7 +108,7 @@ def test_lumas_pass_through_and_spectra_of_some_are_kept() -> None:
 def test_frames_are_looked_at_whose_paths_tell_most() -> None:
     """Neither those that hardly moved nor those whose paths leave the tiles; evenly, and not too many."""
     paths = BEST_PATH_PX * np.tile([0.01, 0.9, 30.0, 1.2], 30)
-    chosen = telling(range(120), paths)
+    chosen = frames_to_measure(range(120), paths)
     assert len(chosen) <= MOST_FRAMES
     assert {n % 4 for n in chosen} <= {1, 3}
     assert min(chosen) < 10

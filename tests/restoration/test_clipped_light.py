@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from virest.image_formation.kernels import KernelField
-from virest.restoration.clipped_light import _along_paths, unseen_masks
+from virest.restoration.clipped_light import _along_paths, unmeasured_masks
 
 WIDTH, HEIGHT, LENGTH = 160, 120, 12.0
 
@@ -55,6 +55,6 @@ def test_a_clipped_pixel_alone_is_kept_nowhere() -> None:
     clipped = np.zeros((HEIGHT, WIDTH), np.float32)
     clipped[55:57, 40] = 1.0
     blurred = SimpleNamespace(field=field, light=[clipped] * 3, dark=[None] * 3, clipped=[clipped, None, None])
-    assert unseen_masks(blurred) == [None] * 3  # type: ignore[arg-type]
+    assert unmeasured_masks(blurred) == [None] * 3  # type: ignore[arg-type]
     clipped[40:80, 20:60] = 1.0
-    assert unseen_masks(blurred)[0] is not None  # type: ignore[arg-type]
+    assert unmeasured_masks(blurred)[0] is not None  # type: ignore[arg-type]

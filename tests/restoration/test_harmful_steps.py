@@ -10,7 +10,7 @@ from blurred_scene import FRAME, camera, record
 
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.frame import restore_frame
-from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
+from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_harms, straightening_harms
 from virest.restoration.settings import PRESETS
 
 RATE = (0.9, -2.0, 0.1)
@@ -30,13 +30,13 @@ def turning(times: float = 1.0, turned_rad: float = 0.0) -> RowMotion:
 )
 def test_what_reaches_beyond_the_seen_path_is_a_loss(times: float, turned_rad: float, loses: bool) -> None:
     """A path predicted too short does no harm; one far too long, or across, does."""
-    assert deblurring_loses(turning(times, turned_rad), turning()) is loses
+    assert deblurring_harms(turning(times, turned_rad), turning()) is loses
 
 
 @pytest.mark.parametrize(("times", "loses"), [(1.0, False), (0.3, False), (1.6, False), (2.2, True), (-0.5, True)])
 def test_straightening_is_a_loss_where_points_would_end_further_off(times: float, loses: bool) -> None:
     """As far too far, or the wrong way."""
-    assert straightening_loses(turning(times), turning(), 0.5) is loses
+    assert straightening_harms(turning(times), turning(), 0.5) is loses
 
 
 def test_a_frame_against_which_everything_speaks_is_copied_and_says_why() -> None:

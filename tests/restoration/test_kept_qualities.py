@@ -14,7 +14,7 @@ from virest.image_formation.light import FrameLight
 from virest.inference.synchronisation import OffsetEstimate
 from virest.restoration import capture_estimation
 from virest.restoration.capture import RestorationPlan
-from virest.restoration.frame import _relit
+from virest.restoration.frame import _without_flicker
 from virest.restoration.settings import PRESETS
 from virest.restoration.shutter import warp
 
@@ -36,7 +36,7 @@ def test_a_straightened_picture_keeps_the_vignetting_of_where_its_pixels_go() ->
     kept = np.linspace(0.6, 1.0, width, dtype=np.float32)[None].repeat(height, axis=0)
     grey = int(np.rint(255 * curve.encode(0.5 * 0.3)))
     picture = np.full((height, width, 3), grey, np.uint8)
-    shown = curve.linear_table()[_relit(picture, curve, FrameLight(recorded, recorded, kept))][..., 1]
+    shown = curve.linear_table()[_without_flicker(picture, curve, FrameLight(recorded, recorded, kept))][..., 1]
     expected = curve.linear_table()[grey] / 0.5 * kept
     np.testing.assert_allclose(shown, expected, rtol=0.03)
 
@@ -50,5 +50,5 @@ def test_frames_are_copied_where_the_offset_is_not_known_well_enough(
     monkeypatch.setattr(capture_estimation, "estimate_time_offset", lambda *_: estimate)
     lens = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
     profile = replace(CameraProfile(640, 480, intrinsics=lens), time_offset_s=None)
-    plan = capture_estimation._filled(RestorationPlan(profile, PRESETS["balanced"]), None, None)  # type: ignore[arg-type]
+    plan = capture_estimation._with_estimates(RestorationPlan(profile, PRESETS["balanced"]), None, None)  # type: ignore[arg-type]
     assert (plan.copy_reason is not None) is copied

@@ -48,7 +48,7 @@ def test_a_gyroscope_s_scale_is_not_taken_for_a_focal_length() -> None:
     assert focal_px(found.profile) == pytest.approx(520.0, rel=1e-9)
     assert len(found.taken) == 1
     assert "gyroscope scale" in found.taken[0]
-    assert "does not tell" not in found.taken[0]
+    assert "cannot tell them apart" not in found.taken[0]
 
 
 def test_where_a_motion_cannot_tell_gyroscope_and_lens_apart_both_are_named() -> None:
@@ -59,7 +59,7 @@ def test_where_a_motion_cannot_tell_gyroscope_and_lens_apart_both_are_named() ->
     assert len(found.taken) == 1
     assert "gyroscope scale" in found.taken[0]
     assert "focal length" in found.taken[0]
-    assert "does not tell" in found.taken[0]
+    assert "cannot tell them apart" in found.taken[0]
 
 
 @pytest.mark.parametrize("fraction", [0.2])

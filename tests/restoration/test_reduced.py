@@ -74,7 +74,7 @@ def test_tiles_are_as_large_as_their_kernels_hold() -> None:
 
         blurred = _blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
         statistics = replace(blurred.statistics, noise_levels=noise_levels)
-        return np.array(tile_layout._kernel_holds_px(replace(blurred, field=field, statistics=statistics)))
+        return np.array(tile_layout._largest_sides_px(replace(blurred, field=field, statistics=statistics)))
 
     assert sides(0.02, 1.0) == pytest.approx(sides(0.01, 1.0) / 2, rel=1e-6)
     assert sides(0.01, 0.5) == pytest.approx(sides(0.01, 1.0) / 2, rel=1e-6)

@@ -221,9 +221,9 @@ def test_detail_that_a_coder_took_away_is_taken_to_fall_as_a_pictures_does() -> 
     frequency = (np.arange(24) + 0.5) / 48
     signal, noise, passed = 40.0 * frequency**-3, np.full(24, 900.0), np.linspace(0.9, 0.1, 24)
     cut = np.where(frequency > 0.3, 1e-3 * signal, signal)
-    found = ring_fit._as_detail_falls(frequency, cut, passed, noise)
+    found = ring_fit._extrapolated_detail(frequency, cut, passed, noise)
     np.testing.assert_allclose(found, signal, rtol=1e-9)
-    clear = ring_fit._as_detail_falls(frequency, signal, passed, np.full(24, 1e-3))
+    clear = ring_fit._extrapolated_detail(frequency, signal, passed, np.full(24, 1e-3))
     np.testing.assert_array_equal(clear, signal)
 
 

@@ -1,1 +1,1 @@
-"""Undoing the degradation: deconvolution in linear light, then one warp."""
+"""Restoration: deconvolution in linear light, then one warp."""

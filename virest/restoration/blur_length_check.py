@@ -1,13 +1,13 @@
-"""How long the blur paths are that the pictures show, beside the predicted ones: asked once a capture, at planning.
+"""Estimate the length of the blur paths in the frames relative to the predicted ones, once per capture at planning.
 
-A wrong exposure scale, gyroscope scale, lens or stabiliser makes all paths too long or too short; tracked points, which
-know the way from frame to frame only, do not see the exposure at all.  A path that is s times as long has |K(s f)|² for
-|K(f)|², so |G|² = |K|² S + N is fitted ring by ring for several s, S and N free in each, and the likelihood of the
-spectra (Whittle 1953: −Σ (ln λ + |G|² / λ)) over that of no blur is the evidence for s.  Frames that move differently
-before one scene add up; a scene's own directions do not.
+A wrong exposure scale, gyroscope scale, lens or stabiliser makes all paths too long or too short.  Tracked points give
+only the motion from frame to frame and do not depend on the exposure.  A path s times as long has |K(s f)|² in place of
+|K(f)|², so |G|² = |K|² S + N is fitted ring by ring for several s, with S and N free in each ring.  The evidence for s
+is the likelihood of the spectra (Whittle 1953: −Σ (ln λ + |G|² / λ)) over that of no blur.  The evidence of frames with
+different motion adds up; that of directional content in the scene does not.
 
-The lowest frequencies that tell anything are believed, up to a third of all evidence: higher up a picture holds what
-its coder kept of the frames before, and what the curve and the change of the kernel over a tile filled in.
+Only the lowest frequencies are used, up to a third of all evidence.  Higher frequencies are affected by content that
+the coder carries over from earlier frames, by the tone curve, and by the variation of the kernel over a tile.
 """
 
 from __future__ import annotations
@@ -26,32 +26,34 @@ from virest.restoration.blurred import CLIPPED_LEVELS
 from virest.restoration.statistics.records import ROUNDING_POWER
 from virest.restoration.statistics.ring_fit import RingCells
 from virest.restoration.statistics.rings import RINGS, SIDE
-from virest.restoration.statistics.tile_power import MANY_TILES, cut, evenly_steep, passed_power, windowed_power
+from virest.restoration.statistics.tile_power import MANY_TILES, cut, light_in_grey_levels, passed_power, windowed_power
 
 Array = NDArray[np.float64]
 
 SCALES = np.geomspace(2**-2, 2**1.5, 15)
-"""Path lengths over the predicted ones that are tried."""
+"""Path lengths to try, relative to the predicted ones."""
 LONGEST = 2.2
-"""Longer ones are no estimate: pictures with little detail, or such as no lens gives, go on to the last one tried."""
+"""Ignore larger scales: with little detail, or with content that no lens gives, the fit runs to the largest one tried.
+"""
 MOST_FRAMES = 16
-"""Number of frames that are measured."""
+"""Largest number of measured frames."""
 MOST_TILES = 24
-"""Tiles of a frame of which spectra are kept; the most blurred MANY_TILES of them are used."""
+"""Spectra are kept of this many tiles per frame; the most blurred MANY_TILES of them are used."""
 LEAST_PATH_PX = 1.5
-"""Frames whose median path is predicted shorter tell too little."""
+"""Skip frames whose predicted median path is shorter."""
 BEST_PATH_PX = SIDE / 5
-"""A path that fits into a tile so often cancels much and is seen whole: frames with about such paths are looked at."""
+"""Best path length, px: it cancels many frequencies and still fits into a tile."""
 LEAST_FRAMES = 4
-BELIEVED = 1 / 3
-"""Part of all evidence, from the lowest frequency on, that is believed."""
+EVIDENCE_FRACTION = 1 / 3
+"""Fraction of all evidence, from the lowest frequency up, that is used."""
 MODEL_STD = 0.1
-"""How far, in the logarithm, right profiles are off: lenses, curves and paths that change over a tile."""
+"""Standard deviation of ln scale for correct profiles, from lenses, curves and paths that vary over a tile."""
 STARVED_BITS = 0.1
-"""Bits a pixel below which a coder repeats the frames before: the scale is known half as well."""
+"""Bits per pixel at which MODEL_STD is doubled: a coder then largely repeats earlier frames."""
 MOST_CLIPPED = 0.002
-"""Tiles with a larger part of clipped light are taken only where there are none better."""
+"""Use tiles with a larger fraction of clipped light only if too few tiles have less."""
 RESAMPLED = 60
+"""Number of bootstrap samples of the frames."""
 SURE = 3.0
 """Above this many standard deviations the frames contradict a profile."""
 _FIT_STEPS = 6
@@ -60,26 +62,27 @@ _TINY = 1e-30
 
 @dataclass(frozen=True, slots=True)
 class TilePowers:
-    """Spectra of some of a frame's tiles."""
+    """Power spectra of some of a frame's tiles."""
 
     centres_px: Array
-    """(n, 2)."""
+    """(n, 2) tile centres."""
     power: NDArray[np.float32]
-    """(n, SIDE, SIDE / 2 - 1) |G|² of light in grey levels."""
+    """(n, SIDE, SIDE / 2 - 1) |G|² of light scaled to grey levels."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathScale:
-    """How many times as long as predicted the blur paths are by the pictures."""
+    """Length of the blur paths in the frames, relative to the predicted ones."""
 
     scale: float
     std: float
-    """Of its logarithm: scatter of the frames, and what right profiles are off by."""
+    """Standard deviation of ln scale: the frames' scatter and MODEL_STD."""
     frames: int
+    """Number of measured frames."""
 
     @property
     def contradicts(self) -> bool:
-        """Whether the predicted lengths are beyond doubt not what the pictures show."""
+        """Whether the frames contradict the predicted lengths significantly."""
         return abs(np.log(self.scale)) > SURE * self.std and self.scale < LONGEST
 
     def __str__(self) -> str:
@@ -87,7 +90,7 @@ class PathScale:
 
 
 def tile_powers(luma: NDArray[np.uint8], curve: ResponseCurve) -> TilePowers | None:
-    """Spectra of tiles spread over a frame's luma (height, width), in light; None where it is smaller than a tile."""
+    """Power spectra, in light, of tiles spread over a frame's luma (height, width); None if it has less than a tile."""
     height, width = luma.shape
     if min(height, width) < SIDE:
         return None
@@ -95,19 +98,19 @@ def tile_powers(luma: NDArray[np.uint8], curve: ResponseCurve) -> TilePowers | N
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
     corners = _least_clipped(luma, corners[:: -(-len(corners) // MOST_TILES)], curve)
     tiles = (cut(luma, (int(top), int(left))) for top, left in corners)
-    power = [windowed_power(evenly_steep(cv2.LUT(tile, curve.linear_table()), curve)) for tile in tiles]
+    power = [windowed_power(light_in_grey_levels(cv2.LUT(tile, curve.linear_table()), curve)) for tile in tiles]
     return TilePowers(corners[:, ::-1].astype(float) + (SIDE - 1) / 2, np.stack(power))
 
 
 def path_scale(frames: Iterable[tuple[RowMotion, TilePowers]], bits_per_px: float = np.inf) -> PathScale | None:
-    """Find the scale from frames with their predicted motion; None where too few are blurred enough to tell."""
+    """Estimate the scale from frames with their predicted motion; None if fewer than LEAST_FRAMES are usable."""
     evidence = np.array([found for motion, tiles in frames if (found := _evidence(motion, tiles)) is not None])
     if len(evidence) < LEAST_FRAMES:
         return None
-    best = _best(_believed(evidence.sum(axis=0)))
+    best = _best(_low_ring_evidence(evidence.sum(axis=0)))
     rng = np.random.default_rng(len(evidence))
     drawn = rng.integers(0, len(evidence), (RESAMPLED, len(evidence)))
-    scatter = float(np.std([_best(_believed(evidence[numbers].sum(axis=0))) for numbers in drawn]))
+    scatter = float(np.std([_best(_low_ring_evidence(evidence[numbers].sum(axis=0))) for numbers in drawn]))
     starved = (STARVED_BITS / bits_per_px) ** 3
     return PathScale(float(np.exp(best)), float(np.hypot(scatter, MODEL_STD * (1 + starved))), len(evidence))
 
@@ -116,7 +119,7 @@ def path_scale(frames: Iterable[tuple[RowMotion, TilePowers]], bits_per_px: floa
 
 
 def _least_clipped(luma: NDArray[np.uint8], corners: NDArray[np.intp], curve: ResponseCurve) -> NDArray[np.intp]:
-    """The tiles whose light was measured: a lamp's streak has a spectrum of its own."""
+    """The tiles with little clipped light: the streak of a highlight has a spectrum of its own."""
     clipped = curve.clipped_table(CLIPPED_LEVELS)
     if not clipped[int(luma.max())]:
         return corners
@@ -126,7 +129,7 @@ def _least_clipped(luma: NDArray[np.uint8], corners: NDArray[np.intp], curve: Re
 
 
 def _evidence(motion: RowMotion, tiles: TilePowers) -> Array | None:
-    """(scales, RINGS) logarithm of the likelihood ratio to no blur; None where the paths are too short or too long."""
+    """(scales, RINGS) log likelihood ratio to no blur; None if the paths are too short or too long."""
     length_px = np.linalg.norm(blur_chords(motion, tiles.centres_px), axis=-1)
     if np.median(length_px) < LEAST_PATH_PX:
         return None
@@ -144,9 +147,9 @@ def _evidence(motion: RowMotion, tiles: TilePowers) -> Array | None:
 
 
 def _ring_evidence(cells: Sequence[RingCells], seen: NDArray[np.float32]) -> Array:
-    """(scales, RINGS) logarithm of the likelihood of |K|² S + N, with the best S and N, over that of an even N.
+    """(scales, RINGS) log likelihood ratio of |K|² S + N, with the best S and N, to constant power in the ring.
 
-    cells: of the |K|² of each scale.
+    cells: one per scale, of its |K|².
     """
     count, k, g = (np.stack(parts) for parts in zip(*((c.count, c.passed, c.means(seen)) for c in cells), strict=True))
     in_ring = np.maximum(count.sum(-1), 1)
@@ -168,15 +171,15 @@ def _ring_evidence(cells: Sequence[RingCells], seen: NDArray[np.float32]) -> Arr
     return np.asarray(np.maximum(found, 0.0))
 
 
-def _believed(evidence: Array) -> Array:
-    """(scales,) the evidence (scales, RINGS) of the lowest rings that hold BELIEVED of it."""
+def _low_ring_evidence(evidence: Array) -> Array:
+    """(scales,) sum of the evidence (scales, RINGS) over the lowest rings that hold EVIDENCE_FRACTION of the total."""
     reached = np.cumsum(evidence.max(axis=0))
-    last = int(np.searchsorted(reached, BELIEVED * reached[-1]))
+    last = int(np.searchsorted(reached, EVIDENCE_FRACTION * reached[-1]))
     return np.asarray(evidence[:, : last + 1].sum(axis=1))
 
 
 def _best(evidence: Array) -> float:
-    """Logarithm of the scale at which evidence (scales,) is greatest, by the parabola through its neighbours."""
+    """Logarithm of the scale with the largest evidence (scales,), refined by a parabola through its neighbours."""
     i = int(np.argmax(evidence))
     step = 0.0
     if 0 < i < len(evidence) - 1:
@@ -186,8 +189,8 @@ def _best(evidence: Array) -> float:
     return float(np.interp(i + step, np.arange(len(SCALES)), np.log(SCALES)))
 
 
-def telling(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
-    """At most MOST_FRAMES of some frames, evenly over the half of them whose paths are nearest to BEST_PATH_PX."""
+def frames_to_measure(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
+    """At most MOST_FRAMES frames, evenly spaced among the half whose paths are nearest to BEST_PATH_PX."""
     if not numbers:
         return ()
     off = np.abs(np.log(np.maximum(path_px, 1e-3) / BEST_PATH_PX))
@@ -195,13 +198,13 @@ def telling(numbers: Sequence[int], path_px: Array) -> tuple[int, ...]:
     return tuple(near[:: -(-len(near) // MOST_FRAMES)])
 
 
-def kept_powers(
+def store_powers(
     pictures: Iterable[tuple[int, NDArray[np.uint8]]],
     wanted: Iterable[int],
     curve: ResponseCurve,
     into: dict[int, TilePowers],
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Pass lumas on by their index, and keep the spectra of those that are wanted."""
+    """Pass (index, luma) pairs through, and store the spectra of the wanted ones in ``into``."""
     chosen = set(wanted)
     for index, luma in pictures:
         if index in chosen and (powers := tile_powers(luma, curve)) is not None:

@@ -1,4 +1,4 @@
-"""A recorded picture in linear light, with all that restoring it needs to know."""
+"""A recorded picture in linear light, with everything needed to restore it."""
 
 from __future__ import annotations
 
@@ -18,50 +18,53 @@ from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
 
 CLIPPED_LEVELS = 2.0
-"""A pixel this close to the top was clipped."""
+"""Pixels within this many grey levels of the top count as clipped."""
 PULLED_DOWN_LEVELS = 8.0
-"""Next to a clipped pixel, the movie's codec returns clipped ones up to about this far below the top."""
+"""Next to a clipped pixel, the movie's codec lowers clipped ones by up to about this many grey levels."""
 CODEC_REACH_PX = 2.5
-"""A lamp's edge is smeared about so far by the movie's codec."""
+"""The movie's codec smears the edge of a clipped highlight about this far."""
 SHRUNK_PARTS, LOOKED_AT = 8, 4
-"""Neighbourhoods are summed in a picture in which they have this many pixels a side or more; this many of the rows
-that fall on such a pixel are read."""
+"""Neighbourhood means are computed at reduced size, where the side has at least SHRUNK_PARTS pixels, from LOOKED_AT of
+the rows behind each reduced pixel."""
 SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
+"""See :attr:`BlurredPicture.slopes`."""
 FieldMaker = Callable[[NDArray[np.float64]], KernelField]
 
 
 @dataclass(frozen=True, slots=True)
 class BlurredPicture:
-    """A recorded picture and what restoring it needs to know."""
+    """A recorded picture and everything needed to restore it."""
 
     light: list[Image]
     """Linear light of each channel, (height, width)."""
     slopes: SlopeMaker
-    """Grey levels per unit of light of a channel, by its number, over neighbourhoods of a side in pixels.
+    """Gives the tone curve's local slope, grey levels per unit of light, as a picture.
 
-    As a picture of a given (width, height); see :func:`_slopes_around`.
+    Arguments: channel index, side of the neighbourhood in px, (width, height) of the result; see
+    :func:`_slopes_around`.
     """
     dark: list[Image | None]
-    """1.0 where a channel's light was too little to be measured; None: nowhere."""
+    """1.0 where a channel's light is too dark to be measured; None: nowhere."""
     clipped: list[Image | None]
-    """1.0 where a channel's light was too much to be measured; None: nowhere."""
+    """1.0 where a channel's light is clipped; None: nowhere."""
     statistics: PictureStatistics
-    """Of the luma."""
+    """Statistics of the luma."""
     chroma: PictureStatistics
+    """Statistics of the colour differences."""
     field: FieldMaker
     """Kernels at given tile centres."""
     longest_px: float
     """Longest blur path in the picture."""
     holes: Image | None
-    """1.0 where light is clipped in all channels, and in any beside such; None: nowhere; see :func:`_holes`."""
+    """1.0 where all channels are clipped, and where any is nearby; None: nowhere; see :func:`_holes`."""
     curve: ResponseCurve
-    """Takes light back to grey levels."""
+    """Tone curve that encodes light to grey levels."""
     spread: KernelSpread | None = None
-    """How well the kernels are known; None: as if exactly."""
+    """Uncertainty of the kernels; None: exact."""
     neighbours: tuple[NeighbourPicture, ...] = ()
     """Further measurements of the same sharp luma."""
     kept: Image | None = None
-    """Vignetting (height, width) that the restored picture has and ``light`` has not; None: none."""
+    """Vignetting (height, width) to apply to the restored picture, since ``light`` is without it; None: none."""
 
 
 def blurred_picture(
@@ -71,7 +74,7 @@ def blurred_picture(
     field: FieldMaker,
     longest_px: float,
 ) -> BlurredPicture:
-    """Take a picture (height, width, 3) through the inverse of the exposure curve."""
+    """Linearise a picture (height, width, 3) by the inverse of the tone curve.  statistics: of luma and chroma."""
     channels = cv2.split(picture)
     light = [cv2.LUT(channel, curve.linear_table()) for channel in channels]
     dark = [_dark(channel, curve) for channel in channels]
@@ -87,9 +90,9 @@ def blurred_picture(
 def _slopes_around(light: Image, curve: ResponseCurve, side_px: int, size: tuple[int, int]) -> Image:
     """The curve's slope at a neighbourhood's mean light, as a picture of ``size`` (width, height).
 
-    Grey levels have about the same noise everywhere; in light that is their noise over the curve's slope, so that
-    nearly all of it is in what is bright, and so is most of the mean light.  A deconvolution that weighs all pixels of
-    a tile alike spreads that noise over the dark parts, where a slope of their own would show it as detail.
+    Grey levels have about the same noise everywhere; in light it is that noise over the slope, so nearly all of it is
+    in bright pixels.  A deconvolution that weighs all pixels of a tile equally spreads that noise to dark pixels, where
+    their own, steeper slope would show it as detail.
     """
     height, width = light.shape
     shrunk = max(1, side_px // SHRUNK_PARTS)
@@ -102,19 +105,19 @@ def _slopes_around(light: Image, curve: ResponseCurve, side_px: int, size: tuple
 
 @functools.lru_cache(maxsize=8)
 def _measured_slopes(curve: ResponseCurve) -> NDArray[np.float32]:
-    """The curve's slope table; levels that tell no light have their neighbours'."""
+    """The curve's slope table; at censored levels, interpolated from their neighbours."""
     levels, known = np.arange(256), ~curve.censored_table()
     return np.interp(levels, levels[known], curve.slope_table()[known]).astype(np.float32)
 
 
 def _dark(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
-    """1.0 where the channel is below the curve's A."""
+    """1.0 where the channel is below the curve's lower limit A; None: nowhere."""
     table = curve.censored_table() & ~curve.clipped_table()
     return cv2.LUT(channel, table.astype(np.float32)) if table[int(channel.min())] else None
 
 
 def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
-    """1.0 where the channel is clipped, and where its neighbours are and the codec has pulled it down a little."""
+    """1.0 where the channel is clipped, or next to clipped pixels and lowered a little by the codec; None: nowhere."""
     table = curve.clipped_table(CLIPPED_LEVELS)
     if not table[int(channel.max())]:
         return None
@@ -126,7 +129,7 @@ def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
 
 
 def around(mask: NDArray[np.uint8], reach: int) -> tuple[slice, slice]:
-    """Rows and columns of all that is not 0 in a mask (height, width), widened on each side by a margin in pixels."""
+    """Rows and columns of the bounding box of a mask (height, width), extended on each side by ``reach`` px."""
     left, top, width, height = cv2.boundingRect(mask)
     return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
 
@@ -143,10 +146,10 @@ def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArra
 
 
 def _holes(clipped: list[Image | None], longest_px: float) -> Image | None:
-    """1.0 where light is clipped in all channels, and in any beside such: what is recorded there is no measurement.
+    """1.0 where all channels are clipped, and where any is nearby, so that the light is unknown; None: nowhere.
 
-    A lamp is far too bright for all channels, and its rim for some.  Where nothing around has more than one channel
-    clipped it is a vivid surface: the others show its colour, and nearly all of its light was measured.
+    A clipped highlight is too bright for all channels, and its rim for some.  Where no pixel nearby has all channels
+    clipped it is a saturated colour: the other channels show it, and nearly all of its light was measured.
     """
     masks = [mask for mask in clipped if mask is not None]
     if len(masks) < len(clipped):
@@ -159,20 +162,23 @@ def _holes(clipped: list[Image | None], longest_px: float) -> Image | None:
 
 
 def luma_of(light: list[Image]) -> Image:
-    """Luma of linear light; it and the colour differences are restored apart: noise and detail differ between them."""
+    """Luma of linear light.  It is restored separately from the colour differences, whose noise and detail differ."""
     red, green, blue = light
     return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, 1 - LUMA_RED - LUMA_BLUE, 0.0))
 
 
-def as_kept(light: Image, blurred: BlurredPicture) -> Image:
-    """Light as the restored picture has it, with its vignetting."""
+def with_vignetting(light: Image, blurred: BlurredPicture) -> Image:
+    """Light with the restored picture's vignetting applied."""
     if blurred.kept is None:
         return light
     return cv2.multiply(light, cv2.resize(blurred.kept, light.shape[::-1], interpolation=cv2.INTER_AREA))
 
 
 def reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
-    """The luma of a picture at 1 / times its size, and all that restoring it needs, to scale; no colour."""
+    """The luma of a picture at 1 / times its size, with everything needed to restore it scaled to match; no colour.
+
+    Neighbours are left out.
+    """
     height, width = blurred.light[0].shape
     size = (max(round(width / times), 1), max(round(height / times), 1))
 

@@ -1,4 +1,4 @@
-"""A capture: records in, restored frames out, by a plan (see :mod:`capture_estimation`): gate, deblur and warp."""
+"""Restore a capture by a plan (see :mod:`capture_estimation`): check, deblur and warp each frame."""
 
 from __future__ import annotations
 
@@ -32,49 +32,50 @@ from virest.restoration.settings import JOINT_METHODS, RestorationSettings
 
 UNTRUSTED = "the inertial log does not follow the camera"
 LAG_TO_THE_END = 0.8
-"""Lags that repeats are still using up this far into the movie may outlast it."""
+"""If the recorder's lag is still shrinking this far into the movie (fraction of its frames), it may last to the end."""
 ALMOST = 1e-6
+"""Frame periods: guards against rounding when the lag is truncated to whole periods."""
 FOCAL_UNKNOWN = "focal length unknown; it could not be estimated from the frames: give fx_px in camera.yaml"
 
 
 @dataclass(frozen=True, slots=True)
 class RestorationPlan:
-    """Everything a worker needs besides pictures and inertial samples."""
+    """Everything a worker needs besides frames and inertial samples."""
 
     profile: CameraProfile
-    """Unknown values filled in, as far as they could be."""
+    """Unknown values are filled in where they could be estimated."""
     settings: RestorationSettings
     said: tuple[PlanNote, ...] = ()
-    """What holds for the whole capture, for its user to know."""
+    """Notes to the user about the whole capture."""
     refusal: PlanNote | None = None
-    """Why no frame may be restored; None: they may."""
+    """Why every frame is copied; None: frames are restored."""
     imu_gaps_s: tuple[tuple[float, float], ...] = ()
-    """Holes in the inertial data: frames that reach into one are left out."""
+    """Gaps in the inertial data, start and end: frames that reach into one are skipped."""
     notes: tuple[str, ...] = ()
-    """What the profile adds to the nominal model and is applied."""
+    """Extensions of the nominal model that the profile enables and the run applies."""
     translations: Mapping[int, FrameTranslation] | None = None
-    """By movie index, at the reference time that the settings name; None or missing: rotation only."""
+    """By movie index, at the settings' reference time; None or missing: rotation only."""
     contradicted: CameraProfile | None = None
-    """The profile as the pictures have it, where they contradict a stated value: no step is taken that would be a loss
-    by it; None: they do not."""
+    """The profile that the frames support, where they contradict a stated value: steps that would do harm according to
+    it are skipped; None: no contradiction."""
 
     missing_turn: MissingTurn | None = None
-    """What neighbouring frames show that the predicted turns lack; None: nothing, or it could not be measured."""
+    """Rotation that neighbouring frames show and the prediction lacks; None: none, or not measurable."""
 
     mask: UnsharpMask | None = None
-    """The phone's sharpening, which is undone before the blur is; None: none that the pictures show."""
+    """The phone's sharpening, undone before deblurring; None: none detected."""
 
     confirmed: ConfirmedGain | None = None
-    """How much of a promised gain neighbouring frames confirm; None: they could not tell."""
+    """How much of the predicted gain neighbouring frames confirm; None: not measurable."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The sentences of ``said``."""
+        """The texts of ``said``."""
         return tuple(note.text for note in self.said)
 
     @property
     def copy_reason(self) -> str | None:
-        """The sentence of ``refusal``."""
+        """The text of ``refusal``."""
         return None if self.refusal is None else self.refusal.text
 
     def noted(self, code: NoteCode, *texts: str) -> RestorationPlan:
@@ -82,33 +83,33 @@ class RestorationPlan:
         return replace(self, said=(*self.said, *(PlanNote(code, text) for text in texts)))
 
     def without(self, code: NoteCode) -> RestorationPlan:
-        """The plan without notes about something, a refusal included."""
+        """The plan without notes of this code, nor a refusal of this code."""
         kept = tuple(note for note in self.said if note.code is not code)
         return replace(self, said=kept, refusal=None if self.refuses(code) else self.refusal)
 
     def refused(self, code: NoteCode, text: str) -> RestorationPlan:
-        """The plan that copies all frames, for this reason."""
+        """The plan changed to copy all frames, for this reason."""
         return replace(self, refusal=PlanNote(code, text))
 
     def refuses(self, *codes: NoteCode) -> bool:
-        """Whether all frames are copied for one of these reasons."""
+        """Whether all frames are copied, for a reason with one of these codes."""
         return self.refusal is not None and self.refusal.code in codes
 
     @property
     def reach(self) -> int:
-        """Neighbours of a frame on each side that its restoration looks at."""
+        """Number of neighbouring frames on each side that a frame's restoration uses."""
         if self.copy_reason is not None:
             return 0
         joined = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
         return max(joined, 0 if self.missing_turn is None else 1)
 
     def joined(self, before: Sequence[Sight], after: Sequence[Sight]) -> tuple[Sight, ...]:
-        """Those of a frame's neighbours that it may be restored with, in order."""
+        """The neighbours that may take part in a frame's joint restoration, in movie order."""
         count = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
         return (*before[max(len(before) - count, 0) :], *after[:count]) if count else ()
 
     def of(self, frames: Iterable[Frame]) -> RestorationPlan:
-        """The plan as a worker needs it who has these frames only."""
+        """The plan reduced to what a worker needs for these frames."""
         if self.translations is None:
             return self
         numbers = [frame.index for frame in frames]
@@ -122,10 +123,10 @@ def restore_frames(
     only: Collection[int] | None = None,
     steps: Mapping[int, float] | None = None,
 ) -> Iterator[RestoredFrame]:
-    """Restore frames one by one; ``imu`` covers them. Frames without a picture are passed over.
+    """Restore frames one by one; ``imu`` covers them.  Frames without a picture are passed over.
 
-    frames: in the movie's order.  only: numbers of those that are restored, the others being there as their neighbours;
-    None: all.  steps: of the coder's quantiser, by number, known when a frame comes; missing: not known.
+    frames: in movie order.  only: indices of the frames to restore, the others serving as neighbours; None: all.
+    steps: the coder's quantiser step by frame index, filled in as frames are decoded; missing: unknown.
     """
     profile, steps = plan.profile, {} if steps is None else steps
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
@@ -190,7 +191,7 @@ def restore_frames(
 
 
 def untrusted_reason(motion: RowMotion) -> str | None:
-    """Why a frame whose rows reach into a stretch without a bridge is left alone; None: it does not."""
+    """Why a frame is copied whose rows reach into an untrusted interval that is not bridged; None: none do."""
     parts = (p for p in motion.profile.unbridged_s if motion.start_s < p[1] and motion.end_s > p[0])
     return next((f"{UNTRUSTED} from {start:.3f} to {end:.3f} s" for start, end in parts), None)
 
@@ -203,17 +204,17 @@ def moved_over_frame(
     translation: FrameTranslation | None,
     profile: CameraProfile,
 ) -> RowMotion:
-    """The camera's motion over one frame's rows, by a profile."""
+    """The camera's motion over one frame's rows, according to a profile."""
     return row_motion(trajectory, profile, frame.time_s, frame.exposure_s, reference, translation, lens)
 
 
 def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequence[int] = ()) -> tuple[Frame, ...]:
-    """All frames of a movie, those of the recorder's start-up at the times and exposures of what they show.
+    """All frames of a movie; those of the recorder's start-up get the time and exposure of the capture they show.
 
-    frame_lag: slot k shows capture k + lag − repeats so far; exact repeats use the lag up over the first slots.
-    repeats: slots that were seen to repeat; where they are not as many as the lag, they are taken as evenly spread,
-    unless the movie ends before the lag is used up: then all slots keep what is left of it.
-    Frames that only the start-up speaks against may then be used.
+    frame_lag: slot k shows capture k + lag − repeats so far; exact repeats reduce the lag to 0 over the first slots.
+    repeats: slots observed to repeat.  If their number differs from the lag, repeats are assumed evenly spaced, unless
+    the movie ends before the lag reaches 0: then the observed ones are used, and all slots keep the remaining lag.
+    Frames that were skipped only for the start-up become usable.
     """
     lagging = profile.extensions.frame_lag_frames
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
@@ -234,7 +235,7 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
 
 
 def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float, later_s: float) -> Frame:
-    """A slot's frame with the time and exposure of the capture that it shows; stamp and place stay the slot's."""
+    """A slot's frame with the time and exposure of the capture that it shows; stamp and index stay the slot's."""
     source = frames[min(capture, len(frames) - 1)]
     time_s = source.time_s + max(capture - len(frames) + 1, 0) * period_s + later_s
     frame = replace(frame, time_s=time_s, exposure_s=source.exposure_s)

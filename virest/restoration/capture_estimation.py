@@ -1,7 +1,7 @@
-"""What is asked of a capture once, before its frames are restored: what the profile leaves open, and if it is right.
+"""Estimate a capture's unknown values and check its profile, once, before its frames are restored.
 
-Unknown values are filled in from tracked points; clocks and blur paths that the profile states are compared with what
-the pictures show; the camera's travel and the scene's depth are found where the capture tells them.
+Missing values are estimated from tracked points.  The clocks and blur paths of the profile are compared with those of
+the frames.  Camera translation and scene depth are estimated where the capture determines them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from virest.inference.unsharp_mask import MOST_FRAMES
 from virest.inference.visual_inertial import align, choose_runs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
-from virest.restoration.blur_length_check import TilePowers, kept_powers, path_scale, telling
+from virest.restoration.blur_length_check import TilePowers, frames_to_measure, path_scale, store_powers
 from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
 from virest.restoration.conflict_plan import (
     MAX_FOCAL_SPREAD,
@@ -47,15 +47,16 @@ from virest.restoration.conflict_plan import (
     settle,
 )
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
-from virest.restoration.neighbour_plan import with_neighbours_asked
-from virest.restoration.neighbours.survey import kept_lumas, survey_runs
+from virest.restoration.neighbour_plan import with_neighbour_survey
+from virest.restoration.neighbours.survey import store_lumas, survey_runs
 from virest.restoration.plan_notes import NoteCode, PlanNote
 from virest.restoration.settings import RestorationSettings
 
 MIN_COARSE_EXPLAINED = 0.5
-"""Part of the pictures' turns that the gyroscope must explain at a coarse offset for a finer fit to begin there."""
+"""Least fraction of the frames' rotation that the gyroscope must explain at a coarse offset for it to be refined."""
 OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
-"""A stated offset this far from the pictures' is warned of; a bias below three of this may be tracking's own."""
+"""Warn if a stated offset differs by this much, s, from the frames'; systematic standard deviation of a gyroscope bias,
+since tracking can cause as much."""
 OTHER_OFFSET = "the frames indicate a time offset of"
 UNCHECKED = "agreement of frames and gyroscope could not be tested"
 OTHER_PATHS = "the frames show blur paths"
@@ -69,10 +70,10 @@ def plan_restoration(
     read_gray: GrayReader,
     steps: Mapping[int, float] | None = None,
 ) -> RestorationPlan:
-    """Fill what the profile leaves open from a few dozen frames, and ask whether pictures and gyroscope agree at all.
+    """Estimate the profile's missing values from a few dozen frames, and check that frames and gyroscope agree.
 
-    read_gray: gives (index, luma) of the frames asked for, in order.  The cost does not grow with the movie.
-    steps: of the coder's quantiser, by number, known when a frame was read; missing: not known.
+    read_gray: gives (index, luma) of the requested frames, in order.  The cost does not grow with the movie's length.
+    steps: the coder's quantiser step by frame index, filled in as frames are read; missing: unknown.
     """
     steps = {} if steps is None else steps
     lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
@@ -89,7 +90,7 @@ def _planned(
     steps: Mapping[int, float],
 ) -> RestorationPlan:
     plan = RestorationPlan(
-        profile, settings, _unknowns(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
+        profile, settings, _default_notes(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
     )
     frames = tuple(
         replace(f, skip_reason=None) if settings.keep_start_up and f.only_startup else f
@@ -104,16 +105,16 @@ def _planned(
     powers: dict[int, TilePowers] = {}
     curve = profile.response or ResponseCurve("srgb")
     path_px = _rough_paths_px(capture, profile, chosen)
-    looked_at = telling(list(path_px), np.array(list(path_px.values()))) if settings.deblur != "none" else ()
+    measured = frames_to_measure(list(path_px), np.array(list(path_px.values()))) if settings.deblur != "none" else ()
     surveyed, lumas = survey_runs(path_px, path_px), dict[int, NDArray[np.uint8]]()
     wanted = sorted(chosen.union(runs))
     guide = find_guide(capture, profile, read_gray, wanted)
     kept = {n for run in surveyed for n in run}.union(sorted(path_px, key=path_px.__getitem__)[:MOST_FRAMES])
-    pictures = kept_lumas(read_gray(wanted), kept, lumas)
-    all_pairs = track_pairs(kept_powers(pictures, looked_at, curve, powers), guide=guide)
+    pictures = store_lumas(read_gray(wanted), kept, lumas)
+    all_pairs = track_pairs(store_powers(pictures, measured, curve, powers), guide=guide)
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
-        plan = _filled(plan, capture.imu, observe_tracks(capture, tracked, profile))
+        plan = _with_estimates(plan, capture.imu, observe_tracks(capture, tracked, profile))
     alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
@@ -140,20 +141,20 @@ def _planned(
             )
             if estimate.determined:
                 offset_s, std_s = estimate.time_offset_s, estimate.std_s
-            plan = _with_doubt(plan, profile.time_offset_s, offset_s, std_s)
+            plan = _with_offset_conflict(plan, profile.time_offset_s, offset_s, std_s)
     if plan.refusal is not None:
         return plan
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
-    plan = _with_seen_paths(plan, profile, capture, powers)
-    return with_neighbours_asked(plan, capture, surveyed, lumas, steps)
+    plan = _with_blur_length_check(plan, profile, capture, powers)
+    return with_neighbour_survey(plan, capture, surveyed, lumas, steps)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _wants_translation(profile: CameraProfile, capture: Capture) -> bool:
-    """A scene at infinity has no parallax; without an accelerometer there is no displacement in metres."""
+    """False for a scene at infinity, which has no parallax, and without an accelerometer, which gives the scale."""
     far = profile.depth_m is not None and np.isinf(profile.depth_m)
     return not far and capture.imu.has_accelerometer
 
@@ -161,10 +162,10 @@ def _wants_translation(profile: CameraProfile, capture: Capture) -> bool:
 def _aligned(
     filled: CameraProfile, given: CameraProfile, capture: Capture, pairs: list[TrackPair]
 ) -> VisualInertialAlignment:
-    """Fit the translation; where the offset could not be told from turns alone, from where they agree best.
+    """Fit the translation; if the offset is still unknown, start from the coarse one where rotations agree best.
 
-    Pictures that travel and hardly turn agree nowhere: clocks are then taken as common, which a phone's nearly are, and
-    the fit is judged by what it explains.
+    With translation and hardly any rotation there is none: the fit then starts from an offset of 0, which is nearly
+    right on phones, and is judged by what it explains.
     """
     observed = observe_tracks(capture, pairs, filled)
     start = filled
@@ -177,7 +178,7 @@ def _aligned(
 
 
 def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualInertialAlignment) -> RestorationPlan:
-    """Take the joint fit's offset and bias over where the profile has none; say where it contradicts a stated one."""
+    """Adopt the joint fit's offset and bias if the profile has no offset; else note a contradiction of it."""
     clock, bias = alignment.clock(), alignment.gyro_bias()
     if clock is None or bias is None:
         return plan
@@ -185,7 +186,7 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     if std_s > MAX_OFFSET_STD_S:
         return plan
     if given.time_offset_s is not None:
-        return _with_doubt(plan, given.time_offset_s, offset_s, std_s)
+        return _with_offset_conflict(plan, given.time_offset_s, offset_s, std_s)
     source = "tracked points against gyroscope and accelerometer"
     profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
     values, spread = bias[0], np.hypot(bias[1], BIAS_FLOOR_RAD_S)
@@ -196,17 +197,17 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
 
 
-def _with_doubt(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
-    """Say where the pictures put the clocks far from where the profile does."""
+def _with_offset_conflict(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
+    """Note a difference between the frames' time offset and the profile's, if it is significant."""
     if abs(offset_s - given_s) < max(OFFSET_DOUBT_S, 3 * std_s):
         return plan
-    said = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
+    text = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
     contradicted = replace(plan.profile, time_offset_s=offset_s)
-    return replace(plan, contradicted=contradicted).noted(NoteCode.OTHER_OFFSET, said)
+    return replace(plan, contradicted=contradicted).noted(NoteCode.OTHER_OFFSET, text)
 
 
 def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> dict[int, float]:
-    """About how long the blur path is in those of the chosen frames whose exposure is known, by movie index."""
+    """Approximate blur path length of the chosen frames with known exposure, by movie index."""
     frames = [capture.frames[index] for index in sorted(chosen) if capture.frames[index].exposure_s]
     if not frames:
         return {}
@@ -218,13 +219,13 @@ def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[i
     return dict(zip((f.index for f in frames), (focal_px * at_frames * exposure_s).tolist(), strict=True))
 
 
-def _with_seen_paths(
+def _with_blur_length_check(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, powers: Mapping[int, TilePowers]
 ) -> RestorationPlan:
-    """Say where the frames show blur paths of another length than predicted, and take no step that then loses.
+    """Note blur paths of another length than predicted, and set ``contradicted`` so that harmful steps are skipped.
 
-    Tracked points see the middle of the exposures, and an offset found with them holds for it.  A stated one that they
-    do not contradict, or contradict only because the exposures differ as much, stays.
+    An offset from tracked points holds at mid-exposure, so it is corrected for the different exposure time.  A stated
+    offset is kept if the points do not contradict it, or if the different exposure time explains the contradiction.
     """
     profile = plan.contradicted or plan.profile
     found_by_points = plan.contradicted is not None or given.time_offset_s is None
@@ -243,30 +244,30 @@ def _with_seen_paths(
     found = path_scale(shown, capture.bits_per_px)
     if found is None or not found.contradicts:
         return plan
-    said = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
+    text = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
     shutter = profile.shutter
     offset_s = profile.time_offset_s or 0.0
     if found_by_points:
         logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
         to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
         offset_s += (1 - found.scale) * to_middle_s
-        doubt_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
-        if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < doubt_s:
+        tolerance_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
+        if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < tolerance_s:
             offset_s = given.time_offset_s
             plan = plan.without(NoteCode.OTHER_OFFSET)
     shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
     contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
-    return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, said)
+    return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, text)
 
 
 def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:
-    """Whether a trusted joint fit already shows that pictures and gyroscope belong together."""
+    """Whether a reliable joint fit already confirms the clock, and so that frames and gyroscope belong together."""
     clock = None if alignment is None else alignment.clock()
     return clock is not None and abs(clock[0] - (profile.time_offset_s or 0.0)) < AGREEMENT_SLACK_S
 
 
 def _with_translations(plan: RestorationPlan, capture: Capture, alignment: VisualInertialAlignment) -> RestorationPlan:
-    """Velocity, acceleration and plane of every frame that has them, and an account of both kinds."""
+    """Add the translation and depth plane of every frame for which they are known, with notes about all frames."""
     profile, reference = plan.profile, plan.settings.reference
     frames = [f for f in at_true_times(capture.frames, profile, capture.repeats) if np.isfinite(f.time_s)]
     motions = {frame.index: _motion(alignment, profile, frame, reference) for frame in frames}
@@ -286,7 +287,7 @@ def _with_translations(plan: RestorationPlan, capture: Capture, alignment: Visua
         plan = plan.noted(NoteCode.TRANSLATION, text)
     translations = {index: _translation(motion, profile.depth_m) for index, motion in known.items()}
     scaled = [motion for motion in known.values() if not motion.unscaled]
-    notes = (*plan.notes, _account(scaled, alignment)) if scaled else plan.notes
+    notes = (*plan.notes, _translation_note(scaled, alignment)) if scaled else plan.notes
     return replace(plan, notes=notes, translations=translations)
 
 
@@ -297,7 +298,10 @@ def _without_translation(plan: RestorationPlan, reason: str) -> RestorationPlan:
 def _motion(
     alignment: VisualInertialAlignment, profile: CameraProfile, frame: Frame, reference: str
 ) -> FrameMotion | str:
-    """Motion over the frame's exposure and readout, at the instants that the alignment's own clock gives them."""
+    """Translation during the frame's exposure and readout, or the reason why it is unknown.
+
+    Times are passed in the camera clock; the alignment converts them by its own clock fit.
+    """
     clock = RowClock(profile)
     start_s, reference_s = frame_times_s(profile, frame.time_s, frame.exposure_s, reference)
     last_s = clock.end_s(frame.time_s, frame.exposure_s or 0.0)
@@ -305,7 +309,7 @@ def _motion(
 
 
 def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTranslation:
-    """A stated depth is the one logged; the plane is then tilted as the pictures say, at that depth."""
+    """The frame's translation and depth plane; the depth for the log is the stated one, if any."""
     depth = motion.depth
     found_m = None if motion.unscaled else depth.depth_m
     return FrameTranslation(
@@ -319,7 +323,7 @@ def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTran
     )
 
 
-def _account(known: list[FrameMotion], alignment: VisualInertialAlignment) -> str:
+def _translation_note(known: list[FrameMotion], alignment: VisualInertialAlignment) -> str:
     depth, std = (np.median([getattr(m.depth, name) for m in known]) for name in ("depth_m", "std_m"))
     speed = np.sqrt(np.mean([(m.velocity_m_s**2).sum() for m in known]))
     std_m_s = alignment.velocity_std_m_s(np.array([m.reference_s for m in known]))
@@ -332,7 +336,7 @@ def _account(known: list[FrameMotion], alignment: VisualInertialAlignment) -> st
 
 
 def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
-    """What the profile adds to the nominal model, one line each, and what becomes of it."""
+    """One line for each extension of the nominal model that the profile enables and the run applies."""
     lines: dict[str, int] = {effect.applied(profile): 1 for effect in EFFECTS.values() if effect.applied(profile)}
     lines |= {f"field of {field.kind} over {', '.join(field.covariates)}: followed": 1 for field in profile.fields}
     bridged = len(profile.imu_untrusted_s) - len(profile.unbridged_s)
@@ -341,9 +345,9 @@ def applied_extensions(profile: CameraProfile) -> tuple[str, ...]:
 
 
 def _through_resting_lens(pairs: list[TrackPair], capture: Capture, profile: CameraProfile) -> list[TrackPair]:
-    """Tracks as the profile's lens would show them at stamp_0 and with its stabiliser at rest.
+    """Tracks as the profile's lens would show them at stamp_0 with its stabiliser at rest.
 
-    Where clocks or focal length are not known yet, the lens's path is not either, and tracks stay as they are.
+    If the clock or focal length is still unknown, the lens's motion is unknown too, and the tracks are unchanged.
     """
     ext = profile.extensions
     moves = ext.focal_drift_per_s or ext.stabilisation_fraction or any(f.kind == "scale" for f in ext.field)
@@ -367,18 +371,18 @@ def _through_resting_lens(pairs: list[TrackPair], capture: Capture, profile: Cam
 def resting_points(
     lens: MovingLens, profile: CameraProfile, frame: Frame, points_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Points (n, 2) of a frame, each seen in the middle of its row's exposure, through the lens at rest."""
+    """Points (n, 2) of a frame, each at its row's mid-exposure, as the lens at rest would project them."""
     time_s = RowClock(profile).seen_s(points_px, frame.time_s, frame.exposure_s or 0.0)
     return lens.lens.project(lens.rays(points_px, time_s))
 
 
-def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
-    """A note for each value that is a documented default."""
+def _default_notes(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
+    """A note for each unknown value, which is set to its documented default."""
     notes = []
     if profile.response is None:
-        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "response curve unknown: srgb taken"))
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "response curve unknown: srgb assumed"))
     if not profile.readout_known:
-        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "readout time unknown: 0 taken, rows are not straightened"))
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "readout time unknown: 0 assumed, rows are not straightened"))
     if all(frame.exposure_s is None for frame in capture.frames):
         notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "exposure times unknown: frames are not deblurred"))
     if profile.depth_m is None:
@@ -386,8 +390,8 @@ def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
     return tuple(notes)
 
 
-def _filled(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTracks) -> RestorationPlan:
-    """The plan with time offset, gyroscope bias and focal length as far as the pictures determine them."""
+def _with_estimates(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTracks) -> RestorationPlan:
+    """The plan with time offset, gyroscope bias and focal length estimated from tracked points, or refused."""
     estimate = estimate_time_offset(observed, imu, plan.profile)
     plan = _with_focal(plan, estimate)
     if plan.profile.time_offset_s is not None:
@@ -411,7 +415,7 @@ def _filled(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTracks) ->
 
 
 def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfile:
-    """Take the gyroscope's bias over where it is significant and no parallax can have faked it."""
+    """Adopt the gyroscope bias if it is significant in any axis; it has no finite deviation if it may be parallax."""
     bias, std = np.array(estimate.bias_rad_s), np.array(estimate.bias_std_rad_s)
     if not np.all(np.isfinite(std)) or np.all(np.abs(bias) < 3 * std):
         return profile
@@ -421,7 +425,7 @@ def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfil
 
 
 def _with_focal(plan: RestorationPlan, estimate: OffsetEstimate) -> RestorationPlan:
-    """Take the focal length over where the profile has none and the pictures determine it well enough."""
+    """Adopt the focal length if the profile has none and the frames determine it within MAX_FOCAL_SPREAD."""
     profile = plan.profile
     if profile.intrinsics is not None:
         return plan

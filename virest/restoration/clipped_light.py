@@ -1,4 +1,4 @@
-"""Where light was too much or too little to be measured, and what the blur carried from there."""
+"""Pixels whose light was clipped or too dark to be measured, and the pixels that blur reaches from there."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture, around
 from virest.restoration.row_chunks import RowRenderer
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
-"""Parts of the unclipped pixels clear of clipped light at which restoring begins and at which it is taken whole;
-seen over this many pixels and the path to both sides."""
+"""Fractions of the unclipped pixels with undisturbed light at which restoring begins and at which it has full weight;
+and side, px, of the neighbourhood, which is extended by the path on both sides."""
 
 PLACES = 4
-"""Parts of the picture each way whose own blur path is used."""
+"""The picture is divided into this many parts each way, each with its own blur path."""
 TOUCHED = 2e-3
-"""Part of the light of a path that counts as touching."""
+"""Kernel values above this are on the path."""
 
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:
@@ -36,9 +36,9 @@ def near_clipped(blurred: BlurredPicture) -> Image | None:
 
 
 def measured_part(holes: Image) -> Image:
-    """0 in holes, rising to 1 around them: the codec spreads a lamp's edge over its neighbours.
+    """Weight 0 in holes, rising to 1 around them, since the codec spreads a highlight's edge to its neighbours.
 
-    A sharp edge of the weights would show as an outline around the lamp.
+    A sharp edge of the weights would show as an outline around the highlight.
     """
     part = np.ones_like(holes)
     near = around(holes.astype(np.uint8), int(4 * CODEC_REACH_PX) + 3)
@@ -48,9 +48,9 @@ def measured_part(holes: Image) -> Image:
 
 
 def measured_share(blurred: BlurredPicture) -> Image | None:
-    """How much of a restored picture to take where light is clipped, (height, width); None: all of it, everywhere.
+    """Weight of the restored picture near clipped light, (height, width); None: 1 everywhere.
 
-    Thin things on a clipped background lie within the margins of the holes: next to nothing of them was measured.
+    Thin objects on a clipped background lie within the margins of the holes, so almost nothing of them was measured.
     """
     holes = blurred.holes
     if holes is None:
@@ -61,8 +61,8 @@ def measured_share(blurred: BlurredPicture) -> Image | None:
     return cv2.blur(np.clip(share, 0, 1), (side, side))
 
 
-def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
-    """1 where a channel's light is censored, dark or clipped, with all its neighbours along the path; None: nowhere."""
+def unmeasured_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
+    """1 where a channel is dark, or clipped, all along the blur path around a pixel; None per channel: nowhere."""
     if all(mask is None for mask in (*blurred.dark, *blurred.clipped)):
         return [None] * len(blurred.light)
     masks: list[NDArray[np.uint8] | None] = []
@@ -73,12 +73,12 @@ def unseen_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     return masks
 
 
-def unseen_kept(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: BlurredPicture) -> RowRenderer:
-    """The grey levels (height, width, 3) that were recorded where nothing says more.
+def keep_unmeasured(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: BlurredPicture) -> RowRenderer:
+    """The restored picture, but with the recorded grey levels (height, width, 3) where nothing was measured.
 
-    Among them are some that no light gives, as noise and codec leave them beyond the curve's ends.
+    These include levels beyond the curve's ends, from noise and the codec, that no light would give.
     """
-    masks = unseen_masks(blurred)
+    masks = unmeasured_masks(blurred)
     if all(mask is None for mask in masks):
         return sharp
 
@@ -95,11 +95,11 @@ def unseen_kept(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: Blurre
 def _along_paths(
     mask: NDArray[np.uint8], blurred: BlurredPicture, operation: Callable[[Any, Any], Any]
 ) -> NDArray[np.uint8]:
-    """A mask (height, width) dilated or eroded along the blur path of each place, to both sides.
+    """A mask (height, width) dilated or eroded along the local blur path, in both directions.
 
-    Paths change over a picture by the rows' times and the lens: each of PLACES x PLACES parts takes that of its middle.
-    Parts in which the mask is the same all over, with the path's length around them, stay as they are, and so does what
-    lies further than that from all of the mask.
+    Paths vary over a picture with row time and lens: each of PLACES × PLACES parts uses the path at its centre.  Parts
+    where the mask is constant, including a margin of the path's size, are unchanged, and so are pixels farther than two
+    such margins from the mask.
     """
     height, width = mask.shape
     rows, columns = (np.linspace(0, length, PLACES + 1).astype(int) for length in (height, width))

@@ -1,4 +1,4 @@
-"""Colour differences, which hold little detail, beside a luma that is restored."""
+"""Restoration of the colour differences, which hold little detail, to go with a restored luma."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from virest.image_formation.blur import Image
-from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
+from virest.restoration.blurred import BlurredPicture, luma_of, with_vignetting
 from virest.restoration.encoding import grey_levels
 from virest.restoration.neighbours.joint import HALF, NeighbourPicture
 from virest.restoration.row_chunks import RowRenderer
@@ -19,23 +19,24 @@ from virest.restoration.tile_layout import COARSE_OVERLAP, join_neighbours, nois
 
 COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 4
 COLOUR_TILE_PX = 384
-"""Colour differences hold so little detail that kernels need not follow the paths as closely, nor pixels the movie's.
+"""Reductions of the colour differences, and side of their tiles: they hold so little detail that larger tiles and
+pixels are sufficient.
 
-The coarse scale, with few iterations, costs up to 0.05 dB.
+The coarse scale, used with few iterations, costs up to 0.05 dB.
 """
 COARSE_COLOUR_BLUR_PX = COARSE_COLOUR_SCALE * 3**0.5
-"""Path that blurs as much as the coarse scale does: a mean over its squares, variance s²/12, and linear interpolation,
-s²/6, against L²/12.  Colours that were blurred by less would lose by it."""
+"""Path length L that blurs as much as the coarse scale s does: block means have variance s²/12 and linear interpolation
+s²/6, against L²/12.  With shorter paths the coarse scale would lose detail."""
 NEARBY_SIDE, FINE_SIDE = 5, 3
-"""Sides, in pixels of the colour differences, of squares in which these are compared with the luma: for blurred ones
-besides the path to both sides, and for sharp ones."""
+"""Sides, in pixels of the colour differences, of the squares for their regression on the luma: for blurred pictures, in
+addition to the path on both sides, and for sharp ones."""
 
 
 def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSettings) -> RowRenderer:
-    """Grey levels of a sharp luma, in light and perhaps smaller, and the colour differences.
+    """Combine a sharp luma, in linear light and perhaps at reduced size, with the restored colour differences.
 
-    These are restored at half size or less, since a movie stores no more of them, and come back as differences of grey
-    levels: an edge of luma changes them less than it does those of light, and a small error of light is a large one of
+    These are restored at half size or less, since a movie stores no more of them, and enlarged as differences of grey
+    levels: an edge of luma changes these less than differences of light, and a small error in light is a large one in
     dark grey levels.
     """
     height, width = blurred.light[0].shape
@@ -43,7 +44,7 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
     scale = COARSE_COLOUR_SCALE if coarse else COLOUR_SCALE
     small = _shrunk(sharp, blurred, scale)
     small_grey, *differences = _grey_differences(blurred, small, *_sharp_differences(blurred, small, settings, scale))
-    slopes = _slopes_on(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
+    slopes = _regression_slopes(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
     rests = [cv2.subtract(d, cv2.multiply(s, small_grey)) for d, s in zip(differences, slopes, strict=True)]
 
     def full(planes: list[Image]) -> Image:
@@ -51,7 +52,7 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
         return cv2.resize(cv2.merge(planes), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
 
     factors, rest = full([cv2.add(slope, 1.0) for slope in slopes]), full(rests)
-    luma = grey_levels(as_kept(sharp, blurred), blurred.curve)
+    luma = grey_levels(with_vignetting(sharp, blurred), blurred.curve)
     if luma.shape != (height, width):
         luma = cv2.resize(luma, (width, height), interpolation=cv2.INTER_CUBIC)
 
@@ -67,18 +68,19 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
 def _sharp_differences(
     blurred: BlurredPicture, sharp: Image, settings: RestorationSettings, scale: int
 ) -> Iterator[Image]:
-    """Light of red and of blue less the luma's, ``scale`` times smaller, as ``sharp``, the luma, is.
+    """Sharp light of red and of blue minus the luma's, ``scale`` times smaller, as the luma ``sharp`` is.
 
-    Blur is linear, so what of a difference goes with the luma nearby does so in the sharp picture, and the luma is
-    restored with a better prior; as long as that is even over a path.  The rest is filtered by the measured Wiener
-    filter.
+    Blur is linear, so the part of a difference that is proportional to the luma nearby is so in the sharp picture too,
+    if the slope is constant over a path; the luma is restored with a better prior.  The rest is restored by the
+    measured Wiener filter.
     """
     deconvolution = tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, scale)
     luma, differences = _small_differences(blurred, scale)
     side = 2 * int(np.ceil(blurred.longest_px / scale)) + NEARBY_SIDE
     noise = blurred.statistics.noise_levels / blurred.slopes(1, scale * side, luma.shape[::-1])
     slopes = [
-        cv2.blur(slope, (side, side)) for slope in _slopes_on(luma, differences, cv2.multiply(noise, noise), side)
+        cv2.blur(slope, (side, side))
+        for slope in _regression_slopes(luma, differences, cv2.multiply(noise, noise), side)
     ]
     ratios = noise_to_signal(deconvolution, settings, blurred.chroma, scale)
 
@@ -100,14 +102,14 @@ def _sharp_differences(
 
 
 def _neighbour_differences(neighbour: NeighbourPicture, scale: int) -> tuple[Image, list[Image]]:
-    """Luma of a neighbour's light, and red and blue less it, at the size of the colour differences."""
+    """Luma of a neighbour's light, and red and blue minus it, at the size of the colour differences."""
     red, green, blue = (_block_means(plane, scale // HALF) for plane in cv2.split(neighbour.half_light))
     luma = luma_of([red, green, blue])
     return luma, [cv2.subtract(plane, luma) for plane in (red, blue)]
 
 
-def _slopes_on(luma: Image, differences: list[Image], noise_power: Any, side: int) -> list[Image]:
-    """How differences change with the luma, within squares of ``side`` pixels about each; 0 where it is but noise.
+def _regression_slopes(luma: Image, differences: list[Image], noise_power: Any, side: int) -> list[Image]:
+    """Local slopes of the differences over the luma, within ``side`` × ``side`` pixels; 0 if the luma is only noise.
 
     He, Sun and Tang 2013 (doi:10.1109/TPAMI.2012.213), the guided filter's local linear model.
     """
@@ -131,18 +133,18 @@ def _shrunk(sharp: Image, blurred: BlurredPicture, scale: int) -> Image:
 
 
 def _grey_differences(blurred: BlurredPicture, luma: Image, red: Image, blue: Image) -> list[Image]:
-    """Grey levels of the luma, and those of red, green and blue less it; red, blue: light less the luma's."""
+    """Grey levels of the luma, and those of red, green and blue minus it; red, blue: light minus the luma's."""
     green_luma = 1 - LUMA_RED - LUMA_BLUE
     green = cv2.addWeighted(red, -LUMA_RED / green_luma, blue, -LUMA_BLUE / green_luma, 0.0)
     grey, *channels = (
-        grey_levels(as_kept(light, blurred), blurred.curve)
+        grey_levels(with_vignetting(light, blurred), blurred.curve)
         for light in (luma, *(cv2.add(luma, difference) for difference in (red, green, blue)))
     )
     return [grey, *(cv2.subtract(channel, grey) for channel in channels)]
 
 
 def _small_differences(blurred: BlurredPicture, scale: int) -> tuple[Image, list[Image]]:
-    """Luma, and red and blue less it, ``scale`` times smaller; clipped ones, which show no colour, from around them."""
+    """Luma, and red and blue minus it, ``scale`` times smaller; clipped pixels, without colour, are filled in."""
     red, green, blue = (_block_means(plane, scale) for plane in blurred.light)
     luma = luma_of([red, green, blue])
     differences = [cv2.subtract(plane, luma) for plane in (red, blue)]
@@ -154,9 +156,10 @@ def _small_differences(blurred: BlurredPicture, scale: int) -> tuple[Image, list
 
 
 def _block_means(plane: Image, side: int) -> Image:
-    """Means over squares of whole pixels, the last ones smaller: an area's mean of other sides takes twice as long.
+    """Means over blocks of ``side`` × ``side`` whole pixels, the last ones smaller.
 
-    OpenCV is quickest with squares of two pixels, so larger even ones are made of such.
+    Area interpolation with fractional ratios takes twice as long.  OpenCV is fastest with blocks of 2 × 2 pixels, so
+    larger even ones are built from these.
     """
     if side == 1:
         return plane
@@ -172,13 +175,13 @@ def _block_means(plane: Image, side: int) -> Image:
 
 
 def _blocks(length: int, side: int) -> list[slice]:
-    """Where the whole pieces of ``side`` are, and where the rest is."""
+    """The range of whole blocks, and the range of the rest, if not empty."""
     whole = length - length % side
     return [part for part in (slice(0, whole), slice(whole, length)) if part.stop > part.start]
 
 
 def _filled_in(planes: list[Image], known: Image) -> list[Image]:
-    """Weighted means of what is known, over wider and wider neighbourhoods."""
+    """Fill unknown pixels with weighted means of the known ones, over increasingly large neighbourhoods."""
     weight, filled = known, [cv2.multiply(plane, known) for plane in planes]
     for side in (3, 9, 27, 81):
         near = cv2.blur(weight, (side, side))

@@ -1,4 +1,4 @@
-"""What a profile may be wrong in beyond its ordinary doubts: where a fit of it begins, and how it is said."""
+"""Profile errors beyond the stated uncertainties: starting values of their fits, plausible ranges, and messages."""
 
 from __future__ import annotations
 
@@ -17,35 +17,37 @@ from virest.inference.track_fit import Term
 Array = NDArray[np.float64]
 SOURCE = "tracked points against the gyroscope, which contradict the profile's value"
 SKEW_REACH, SKEW_ERROR_S, MOST_SKEWS = 0.015, 0.01, 61
-"""Skews tried; so close that one of them is off by no more than this time at the capture's ends."""
+"""Clock skews tried: the range, the largest error in s at the capture's ends of the nearest one, and the largest number
+of them."""
 FOCAL_REACH, FOCAL_STEPS = 0.95, 20
-"""Logarithms of the focal scales tried: factors of 0.39 to 2.6."""
+"""Focal scales tried: the range of the logarithm (factors of 0.39 to 2.6), and their number."""
 FRACTIONS, CUTOFF_STEPS = (0.25, 0.5, 0.8), (-1.2, 0.0, 1.2)
-"""Stabilisers tried; cutoffs as logarithms of factors on the profile's."""
+"""Stabilisers tried: fractions, and cutoffs as logarithms of factors on the profile's."""
 GYRO_REACH, GYRO_STEPS = 0.14, 8
-"""Logarithms of the gyroscope scales tried: what a gyroscope may be off by."""
+"""Gyroscope scales tried: the range of the logarithm, that of plausible errors, and their number."""
 MOST_STABILISED = 0.95
-"""A lens that takes all of the shake is none: such pictures were cropped and turned by software."""
+"""No lens cancels more of the shake than this: such frames were cropped and rotated by software."""
 CUTOFF_HZ = (0.03, 15.0)
-"""Cutoffs that an optical stabiliser may have."""
+"""Plausible cutoffs of an optical stabiliser."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One thing that may be wrong."""
+    """One possible profile error."""
 
     name: str
     term: Term
     starts: Callable[[TrackTable], Array]
-    """(n, k) changes of the term's values from which a fit may begin."""
+    """(n, k) changes of the term's values, as starting points for a fit."""
     plausible: Callable[[CameraProfile, CameraProfile], bool]
-    """Whether a phone can be like that: the profile given, the one found."""
+    """Whether a phone can have such a value.  Arguments: given profile, fitted one."""
     change: Callable[[CameraProfile, CameraProfile], float]
-    """From the profile given to the one found, in the units of the term's first value."""
-    adopted: Callable[[CameraProfile, CameraProfile, Array], CameraProfile]
-    """A profile with this cause's values of the one found, and their deviations (k,) in the term's units."""
-    said: Callable[[CameraProfile, CameraProfile, Array], str]
-    """What is taken, in words: the profile given, the one found, deviations."""
+    """Change from the given profile to the fitted one, in the units of the term's first value."""
+    adopt: Callable[[CameraProfile, CameraProfile, Array], CameraProfile]
+    """A profile with this cause's values from the fitted one.  Arguments: profile to change, fitted one, and standard
+    deviations (k,) in the term's units."""
+    message: Callable[[CameraProfile, CameraProfile, Array], str]
+    """Message about the adopted value.  Arguments: given profile, fitted one, standard deviations (k,)."""
 
 
 def _skews(table: TrackTable) -> Array:
@@ -114,7 +116,8 @@ def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
 
 FOCAL_LENGTH, GYROSCOPE = "focal length", "gyroscope scale"
 TWINS = {FOCAL_LENGTH: GYROSCOPE, GYROSCOPE: FOCAL_LENGTH}
-"""Turns about the picture's axes tell only their product; turns about the optical axis tell the gyroscope's alone."""
+"""Rotation about the picture's axes determines only the product of the two; rotation about the optical axis determines
+the gyroscope's scale alone."""
 CAUSES = (
     Cause(
         FOCAL_LENGTH,

@@ -1,4 +1,4 @@
-"""A plan whose profile tracked points contradict: what is taken in its place, and what is said of it."""
+"""Revise a plan whose profile contradicts the tracked points: replace values, and note it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from virest.restoration.profile_conflict import CONTRADICTED, Settled, settle_co
 
 OFFSET_SOURCE = "tracked points against the gyroscope"
 MAX_OFFSET_STD_S = 0.003
-"""An estimated offset known no better than this restores nothing: at a hand's 30 rad/s² the rates, and so the blur
+"""Largest usable deviation of an estimated offset, s: beyond it, at a hand's 30 rad/s², the rates, and so the blur
 paths, would be off by 0.1 rad/s."""
 MAX_FOCAL_SPREAD = 0.05
-"""An estimated focal length known no better than this part restores nothing: all paths would be off by it."""
+"""Largest usable relative deviation of an estimated focal length: all paths would be off by it."""
 FOLLOWED = 0.95
-"""Part of the points' motion that must be explained for a residual to be a matter of the scene, not of the clocks."""
+"""Least explained fraction of the points' motion for a residual to come from the scene, not from the clocks."""
 LEAST_EXPLAINED = 0.3
-"""Part of the turns that must be explained for a fit to begin there; the points judge where it ends."""
+"""Least explained fraction of the rotation for an offset to be used as a starting point; the points judge the result.
+"""
 
 
 def explains_points(alignment: VisualInertialAlignment) -> bool:
-    """Whether turning and travelling, by the profile, put all points where they were tracked."""
+    """Whether rotation and translation, with the profile, explain all tracked points."""
     scales = [stretch.fit.scale for stretch in alignment.stretches]
     return bool(scales) and max(scales) < CONTRADICTED
 
@@ -36,16 +37,16 @@ def explains_points(alignment: VisualInertialAlignment) -> bool:
 def settle(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, pairs: Sequence[TrackPair]
 ) -> tuple[RestorationPlan, bool]:
-    """The plan with what tracked points put in the place of values that they contradict, and a warning for each.
+    """The plan with contradicted values replaced by those from tracked points, and a note for each.
 
-    The second: whether the points follow the gyroscope beyond doubt, however the turns of whole frames compare.
+    The second: whether the points clearly follow the gyroscope, even if the rotations of whole frames do not.
     """
     offset_known, focal_known = given.time_offset_s is not None, plan.profile.intrinsics is not None
     profile = plan.profile if focal_known else replace(plan.profile, intrinsics=guessed_lens(plan.profile))
     observed = observe_tracks(capture, pairs, profile)
     found = settle_conflict(observed, capture.imu, profile, offset_known=offset_known, focal_known=focal_known)
     if found.contradicted and not found.taken and not offset_known:
-        begun = _begun(observed, capture, profile)
+        begun = _at_coarse_offset(observed, capture, profile)
         if begun is not None:
             again = settle_conflict(observed, capture.imu, begun, offset_known=False, focal_known=focal_known)
             found = again if again.after_px < found.after_px else found
@@ -54,7 +55,7 @@ def settle(
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     if offset_known:
         plan = replace(plan, profile=found.profile, refusal=None)
-        return plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_rest(found)), followed
+        return plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_remaining_note(found)), followed
     open_yet = plan.refuses(NoteCode.TIME_OFFSET, NoteCode.NOT_FOLLOWING, NoteCode.FOCAL_LENGTH)
     if not found.taken and not (followed and (open_yet or found.contradicted)):
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
@@ -62,7 +63,7 @@ def settle(
 
 
 def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
-    """Take over the offset, and perhaps the focal length, that the profile leaves open, beside what was taken."""
+    """Adopt the estimated offset, and focal length if the profile has none, in addition to the replaced values."""
     assert found.offset is not None
     offset_s, std_s = found.offset
     profile = found.profile
@@ -74,12 +75,12 @@ def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
     plan = replace(plan.without(NoteCode.TIME_OFFSET), profile=profile, refusal=None)
     if std_s > MAX_OFFSET_STD_S:
         plan = plan.refused(NoteCode.TIME_OFFSET, f"time offset only known to ± {std_s * 1e3:.1f} ms")
-    plan = plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_rest(found))
+    plan = plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_remaining_note(found))
     return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
 
 
 def estimated_offset(offset_s: float, std_s: float) -> str:
-    """What is said of an offset that the profile leaves open."""
+    """Message about an estimated offset."""
     return f"time offset estimated: {offset_s * 1e3:+.2f} ± {std_s * 1e3:.2f} ms"
 
 
@@ -91,18 +92,18 @@ def _unexplained(found: Settled) -> str:
     )
 
 
-def _rest(found: Settled) -> tuple[str, ...]:
+def _remaining_note(found: Settled) -> tuple[str, ...]:
     if found.after_px < CONTRADICTED * found.noise_px:
         return ()
     left = f"{found.after_px:.2f} px off (tracking noise {found.noise_px:.2f} px)"
     return (f"tracked points still lie {left}: virest diagnose may find why",)
 
 
-def _begun(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
-    """The profile at the offset at which the turns of pictures and gyroscope agree best, at any focal length.
+def _at_coarse_offset(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> CameraProfile | None:
+    """The profile at the offset where the rotations of frames and gyroscope agree best, at any focal length.
 
-    Several clock rates are tried, each with its offset as it is in the middle of the pairs.  None where turns agree
-    nowhere, or only at the end of the search.
+    Several clock skews are tried; the offset is that at the middle of the pairs.  None if rotations agree nowhere, or
+    only at the end of the search range.
     """
     observed = observed.covered(capture.imu, profile)
     if len(observed.pairs) < MIN_PAIRS:

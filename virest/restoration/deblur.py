@@ -1,4 +1,4 @@
-"""One picture, deblurred: linear light in, grey levels out, by the method that the settings name."""
+"""Deblur one picture by the method in the settings: linear light in, grey levels out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from virest.restoration.whole_picture import by_global_hyper_laplacian, by_richa
 
 
 def deblur(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
-    """The sharp picture, through the curve again, at the kernels' anchor."""
+    """The sharp picture at the kernels' anchor, encoded by the tone curve.  Raises ValueError for an unknown method."""
     methods: dict[str, Callable[[BlurredPicture, RestorationSettings], RowRenderer]] = {
         "inverse": by_tile_filter,
         "wiener": by_tile_filter,

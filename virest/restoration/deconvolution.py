@@ -1,6 +1,6 @@
-"""Deconvolution solvers.  They take callables, so that any linear operator will do.
+"""Deconvolution solvers.  They take callables, so any linear operator can be used.
 
-Data model: ``observed = apply(sharp) + noise``, with a weight per observed pixel: 0 where it is censored or outside.
+Data model: ``observed = apply(sharp) + noise``, with a weight per observed pixel: 0 where censored or outside.
 """
 
 from __future__ import annotations
@@ -17,15 +17,17 @@ from virest.restoration.row_chunks import bands
 Image = NDArray[np.float32]
 Operator = Callable[[Image], Image]
 ALPHA = 2.0 / 3.0
-"""Exponent of the gradients' hyper-Laplacian (Krishnan & Fergus 2009)."""
+"""Exponent of the hyper-Laplacian gradient prior (Krishnan & Fergus 2009)."""
 _UNSEEN = 1e-3
-"""Added above and below in Richardson-Lucy's update, so that light that no pixel weighs stays as it is."""
+"""Added to numerator and denominator of the Richardson–Lucy update, so that pixels without data stay unchanged."""
 _LEAST_CHANGE = 0.2
-"""Part of a pixel's light that an over-relaxed step of Richardson-Lucy's leaves at least."""
+"""Lower bound on the factor of an over-relaxed Richardson–Lucy step."""
 _TABLE_SIZE = 2048
+"""Entries of :func:`shrinkage_table`."""
 _TABLE_END = 8.0
+"""Largest |v| in :func:`shrinkage_table`."""
 LEVELS_PER_UNIT = 32.0
-"""Steps in which :func:`shrinkage_levels` tabulates."""
+"""Entries of :func:`shrinkage_levels` per unit of |v|."""
 
 
 def richardson_lucy(
@@ -39,8 +41,8 @@ def richardson_lucy(
 ) -> Image:
     """Multiplicative updates for Poisson noise (Richardson 1972, Lucy 1974), with weights (Whyte et al. 2014).
 
-    f ← f · Aᵀ(w g / A f) / Aᵀ w;  pixels of weight 0 neither pull nor push.  relaxation: each step goes this many times
-    as far, but never below a fifth.
+    f ← f · Aᵀ(w g / A f) / Aᵀ w.  Pixels of weight 0 have no influence.  relaxation: step length over the plain one;
+    an over-relaxed step multiplies no pixel by less than _LEAST_CHANGE.
     """
     sharp: Image = cv2.max(start, 1e-4)
     seen, weighted = cv2.add(adjoint(weight), _UNSEEN), cv2.multiply(weight, observed)
@@ -55,7 +57,7 @@ def richardson_lucy(
 
 @lru_cache(maxsize=64)
 def shrinkage_levels(beta: float) -> Image:
-    """The factor w / v at |v| = level / LEVELS_PER_UNIT, (256,): for tables over 8-bit levels."""
+    """The factor w / v at |v| = level / LEVELS_PER_UNIT, (256,): a look-up table over 8-bit levels."""
     level = np.minimum((np.arange(256) + 0.0) * (_TABLE_SIZE / _TABLE_END / LEVELS_PER_UNIT), _TABLE_SIZE - 1)
     return shrinkage_table(beta)[level.astype(int)]
 
@@ -63,7 +65,7 @@ def shrinkage_levels(beta: float) -> Image:
 def shrinkage_table(beta: float, exponent: float = ALPHA) -> Image:
     """argmin over w of |w|^exponent + β/2 (w − v)², tabulated over |v| in [0, _TABLE_END), as the factor w / v.
 
-    Krishnan & Fergus 2009 (NIPS): the minimum is 0 or the outer root; the root is found by Newton's steps.
+    Krishnan & Fergus 2009 (NIPS): the minimum is 0 or the outer root, found by Newton's method.
     """
     v = (np.arange(_TABLE_SIZE) + 0.5) * (_TABLE_END / _TABLE_SIZE)
     w = v.copy()
@@ -76,13 +78,13 @@ def shrinkage_table(beta: float, exponent: float = ALPHA) -> Image:
 
 
 def shrink(gradient: Image, table: Image) -> Image:
-    """Apply a table of :func:`shrinkage_table` to signed values."""
+    """Shrink signed values by a :func:`shrinkage_table`."""
     index = np.minimum(np.abs(gradient) * np.float32(_TABLE_SIZE / _TABLE_END), _TABLE_SIZE - 1).astype(np.int32)
     return gradient * np.take(table, index)
 
 
 def difference(picture: Image, axis: int) -> Image:
-    """Forward difference along an axis, 0 in the last place."""
+    """Forward difference along an axis; 0 in the last row or column."""
     result = np.zeros_like(picture)
     if axis == 0:
         np.subtract(picture[1:], picture[:-1], out=result[:-1])
@@ -104,7 +106,7 @@ def difference_adjoint(gradient: Image, axis: int) -> Image:
 
 
 def add_roughness(result: Image, picture: Image, weight: Image) -> None:
-    """Add Dᵀ w D of a picture to the result, with the forward differences D along both axes."""
+    """Add Dᵀ w D picture to ``result``, in place; D: forward differences along both axes."""
     for rows in bands(len(picture)):
         x, w, total = (plane[rows.start : rows.stop + 1] for plane in (picture, weight, result))
         steps = (x[1:] - x[:-1]) * w[:-1]
@@ -117,7 +119,7 @@ def add_roughness(result: Image, picture: Image, weight: Image) -> None:
 
 
 def conjugate_gradients(normal: Operator, right: Image, start: Image, precondition: Image, iterations: int) -> Image:
-    """Solve normal(x) = right for a symmetric positive operator; precondition: about its inverse diagonal."""
+    """Solve normal(x) = right for a symmetric positive operator; precondition: its approximate inverse diagonal."""
     x = start.copy()
     residual = right - normal(x)
     conjugate = precondition * residual
@@ -154,10 +156,10 @@ def hyper_laplacian(
 ) -> Image:
     """min over f of data_weight/2 Σ weight² (A f − g)² + Σ |s ∇f / u|^⅔, by half-quadratic splitting.
 
-    Krishnan & Fergus 2009, over any operator A and with weights.  observed, weight: shape of A f; start, slope
-    s: shape of f.  s is the curve's slope (grey levels per light), so that gradients and noise count as they are
-    seen; u = gradient_unit is the grey level that a gradient of 1 stands for.  betas: rising penalties; inner:
-    conjugate-gradient steps for each.
+    Krishnan & Fergus 2009, for any linear operator A, with weights.  observed, weight: shape of A f; start, slope
+    s: shape of f.  s is the tone curve's slope (grey levels per unit of light), so that gradients and noise count in
+    grey levels; u = gradient_unit: grey levels per unit of gradient.  betas: increasing penalties; inner:
+    conjugate-gradient steps per penalty.
     """
     unit_slope = slope / np.float32(gradient_unit)
     squared = unit_slope * unit_slope

@@ -1,4 +1,4 @@
-"""Back from light to the grey levels of a stored picture."""
+"""Encode linear light to the grey levels of a stored picture."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from virest.image_formation.blur import Image
 from virest.restoration.row_chunks import bands
 
 _STEPS = 65535
-"""Steps of the root of light in the tables: the root is about as steep as a curve, so all of them are much alike."""
+"""Table steps in the square root of light, which is nearly as steep as a tone curve, so that steps are about equal."""
 
 
 def encode_picture(light: list[Image], curve: ResponseCurve) -> NDArray[np.uint8]:
-    """Linear light of the channels (height, width) to a stored picture (height, width, 3)."""
+    """Encode the channels' linear light, (height, width) each, to a stored picture (height, width, 3)."""
     table = np.clip(np.rint(_table(curve)), 0, 255).astype(np.uint8)
     pictures = (cv2.merge([plane[rows] for plane in light]) for rows in bands(len(light[0])))
     return np.concatenate([cv2.LUT(_steps(picture, curve), table) for picture in pictures])
 
 
 def grey_levels(light: Image, curve: ResponseCurve) -> Image:
-    """Grey levels of light (height, width), of 255 and not rounded."""
+    """Grey levels, 0 to 255 and not rounded, of light (height, width)."""
     return np.concatenate([cv2.LUT(_steps(light[rows], curve), _table(curve)) for rows in bands(len(light))])
 
 
 def _steps(light: Image, curve: ResponseCurve) -> NDArray[np.uint16]:
-    """Place of light in the table."""
+    """Table index of light."""
     low, high = curve.light_range
     if (low, high) != (0.0, 1.0):
         light = cv2.addWeighted(light, 1.0 / (high - low), light, 0.0, -low / (high - low))

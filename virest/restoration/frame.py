@@ -1,4 +1,4 @@
-"""One frame: recorded picture in, restored picture and everything that was assumed out."""
+"""Restore one frame: recorded picture in, restored picture and all assumed parameters out."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from virest.image_formation.light import FrameLight, equivalent_length_px, frame
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
-from virest.restoration.blurred import BlurredPicture, as_kept, blurred_picture
-from virest.restoration.clipped_light import measured_share, unseen_kept
+from virest.restoration.blurred import BlurredPicture, blurred_picture, with_vignetting
+from virest.restoration.clipped_light import keep_unmeasured, measured_share
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
-from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_loses, straightening_loses
+from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_harms, straightening_harms
 from virest.restoration.neighbours.confirmation import ConfirmedGain
-from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, still_part
+from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, static_part
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.parameters import (
     Deblurring,
@@ -43,29 +43,30 @@ from virest.restoration.shutter import perspective_map, rounded, rowwise_map, va
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
-from virest.restoration.taken_part import blurred_part, share_map, too_little_to_gain, trusted_share
+from virest.restoration.taken_part import blurred_part, no_gain_reason, share_map, trusted_share
 from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
-"""Straightening that moves no point further than this is left out: a gyroscope at rest seems to turn as much."""
+"""Skip straightening that moves no point further than this: gyroscope noise at rest has the same effect."""
 LEAST_CODER_NOISE = 0.5
-"""Least part of a coder's noise by its step that a frame has: on 35 frames of five simulated captures it is 0.5 to 2.5
-times that.  Few iterations from few tiles enlarge noise that was missed; more of them, with neighbours, do not."""
+"""Lower bound on a frame's coding noise, over that predicted from the quantiser step: on 35 frames of five simulated
+captures the ratio is 0.5 to 2.5.  Few iterations with few measured tiles amplify noise that the fit missed; more
+iterations, with neighbours, do not."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
-"""Methods whose kernels go over into each other between the tiles."""
+"""Methods whose kernels vary smoothly between tiles."""
 NOTHING_LEFT = "straightening would leave no recorded pixel (check lens, axes and clock): not straightened"
 MIN_RELIGHT = 0.002
-"""A relative change of light below this is less than half a grey level anywhere."""
+"""Skip illumination corrections below this relative change: they are less than half a grey level everywhere."""
 
 NeighbourFinder = Callable[
     [PictureStatistics, Callable[[NDArray[np.float64]], KernelField]], tuple[NeighbourPicture, ...]
 ]
-"""Neighbours to restore a frame with, by what was measured on its luma and by its kernels."""
+"""Select the neighbours to restore a frame with, from the statistics of its luma and its kernels."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestoredFrame:
-    """What became of one frame."""
+    """The result for one frame."""
 
     frame: Frame
     status: str
@@ -74,21 +75,21 @@ class RestoredFrame:
     """(height, width, 3) RGB; None where there is no output."""
     warnings: tuple[str, ...] = ()
     valid_px: tuple[int, int, int, int] = (0, 0, 0, 0)
-    """x0, y0, x1, y1, the last two one past the end: the rectangle of real data."""
+    """x0, y0, x1, y1, end exclusive: the rectangle of recorded data."""
     exposure_s: float | None = None
     """True exposure: logged × scale."""
     degradation: DegradationParameters | None = None
-    """What was found out about the frame and done about it; None where it was not looked at."""
+    """The frame's degradation and how it was corrected; None: not analysed."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Time spent: estimate, deblur, shutter."""
+    """Time spent on each of estimate, deblur and shutter."""
     source_px: NDArray[np.float32] | None = None
-    """(height, width, 2) where in the recorded picture each pixel came from; None: from its own place."""
+    """(height, width, 2) position in the recorded picture that each pixel came from; None: not moved."""
     undistorted: bool = False
-    """Whether the picture is a pinhole's: the lens's distortion was undone."""
+    """Whether lens distortion was corrected, so that the picture is a pinhole camera's."""
 
     @property
     def parameters(self) -> Json:
-        """``degradation`` with the keys of ``parameters.jsonl``, for users; empty where there is none."""
+        """``degradation`` with the keys of ``parameters.jsonl``; empty if it is None."""
         return {} if self.degradation is None else self.degradation.as_json()
 
 
@@ -105,25 +106,25 @@ def restore_frame(
     unmasked: NDArray[np.uint8] | None = None,
     coding_step: float | None = None,
 ) -> RestoredFrame:
-    """Deblur in linear light, then straighten by one warp; a step that would not help is left out, and said so.
+    """Deblur in linear light, then straighten with one warp; steps that would not help are skipped, with a warning.
 
-    picture: (height, width, 3) RGB as stored.  The picture shows ``motion.reference_s``.  seen: the motion by the
-    pictures' own account, where that contradicts the profile's.  refined: the motion by the frame's neighbours, which
-    is then taken.  confirmed: how much of a promised gain neighbours confirm.  neighbours:
-    brings those to the frame that it is restored with.  unmasked: the picture without the phone's sharpening, which is
-    what is deblurred; None: ``picture`` itself.  coding_step: of the coder's quantiser, grey levels; None: not known.
+    picture: (height, width, 3) RGB as stored.  The restored picture shows the scene at ``motion.reference_s``.
+    seen: the observed motion, where the frames contradict the profile.  refined: the motion refined from neighbouring
+    frames; replaces ``motion``.  confirmed: how much of the predicted gain neighbours confirm.  neighbours: selects the
+    frames for joint restoration and registers them.  unmasked: the picture with the phone's sharpening undone, to be
+    deblurred; None: ``picture`` itself.  coding_step: the coder's quantiser step, grey levels; None: unknown.
     """
     clock = _Clock()
     if refined is not None:
         motion = refined.motion
         if seen is not None and refined.further is not None:
-            seen = _exposed_as(motion, seen)
+            seen = _with_observed_exposure(motion, seen)
     height, width = picture.shape[:2]
     curve = motion.profile.response or ResponseCurve("srgb")
     found = degradation_parameters(motion, trajectory)
     longest_px = float(equivalent_length_px(found.blur.longest_px, most_defocus_px(motion.profile)))
     method, why_not = deblur_method(motion, settings, longest_px)
-    if seen is not None and method != "none" and deblurring_loses(motion, seen):
+    if seen is not None and method != "none" and deblurring_harms(motion, seen):
         method, why_not = "none", (OTHER_BLUR,)
     straighten = settings.shutter != "none"
     anchor = 0.5 if straighten or settings.reference == "frame-middle" or method == "none" else 0.0
@@ -133,14 +134,14 @@ def restore_frame(
     deblurring: Deblurring | None = None
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-        place_std_px = refined.place_std_px() if refined is not None and straighten else 0.0
-        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, place_std_px, light, coding_step)
+        position_std_px = refined.position_std_px() if refined is not None and straighten else 0.0
+        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, position_std_px, light, coding_step)
         restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
-        restored = _relit(picture, curve, light)
+        restored = _without_flicker(picture, curve, light)
     clock.lap("deblur")
     source = _source_map(motion, settings, anchor, deblurring is not None) if straighten else None
-    if seen is not None and source is not None and straightening_loses(motion, seen, anchor):
+    if seen is not None and source is not None and straightening_harms(motion, seen, anchor):
         source, why_not = None, (*why_not, OTHER_ROWS)
     shutter = replace(found.shutter, method=settings.shutter if source is not None else "none")
     status = "copied" if restored is picture and source is None else "restored"
@@ -155,7 +156,7 @@ def restore_frame(
     elif restored.dtype != np.uint8:
         restored = rounded(restored)
     clock.lap("shutter")
-    warnings = (*_limits(motion), *why_not)
+    warnings = (*_model_warnings(motion), *why_not)
     undistorted = settings.undistort and motion.optics.lens.is_distorted
     return RestoredFrame(
         frame, status, restored, warnings, valid_px, motion.exposure_s or None,
@@ -163,17 +164,17 @@ def restore_frame(
     )  # fmt: skip
 
 
-def _exposed_as(motion: RowMotion, seen: RowMotion) -> RowMotion:
-    """A motion that its neighbours bear out, over the exposure that another account gives it, about the same middle.
+def _with_observed_exposure(motion: RowMotion, seen: RowMotion) -> RowMotion:
+    """The neighbour-refined motion over the observed exposure time, about the same mid-exposure.
 
-    Neighbours tell where the picture moved, whatever clocks say; the exposure's length they do not see.
+    Neighbours show how the picture moved, whatever the clocks say, but not how long the exposure was.
     """
     start_s = motion.start_s + 0.5 * (motion.exposure_s - seen.exposure_s)
     return replace(motion, start_s=start_s, exposure_s=seen.exposure_s)
 
 
-def _limits(motion: RowMotion) -> tuple[str, ...]:
-    """What the model leaves out."""
+def _model_warnings(motion: RowMotion) -> tuple[str, ...]:
+    """Warnings about effects that the motion model does not include."""
     depth_m = motion.profile.depth_m
     if depth_m is not None and np.isinf(depth_m):
         return ()
@@ -195,9 +196,10 @@ def copied_frame(
     *,
     undistort: bool = False,
 ) -> RestoredFrame:
-    """The decoded pixels unchanged, and why.  found: of a frame of which nothing was undone; None: not known.
+    """The decoded pixels unchanged, and the reason.  found: the frame's degradation; None: unknown.
 
-    undistort: but for the lens's distortion, as in a run's other pictures.  The lens is then the profile's, at stamp_0.
+    undistort: correct the lens distortion all the same, to match the run's other frames.  The lens is then the
+    profile's, at stamp_0.
     """
     height, width = picture.shape[:2]
     clock, valid_px, source = _Clock(), (0, 0, width, height), _lens_map(profile, undistort)
@@ -212,14 +214,17 @@ def copied_frame(
 
 
 def _lens_map(profile: CameraProfile, undistort: bool) -> NDArray[np.float32] | None:
-    """Where the lens shows what its pinhole shows, for pictures that nothing else moves; None: nothing is asked for."""
+    """Undistortion map for frames that are not warped otherwise; None: not requested, or no intrinsics."""
     return undistortion_map(profile.intrinsics) if undistort and profile.intrinsics is not None else None
 
 
 def _source_map(
     motion: RowMotion, settings: RestorationSettings, anchor: float, deblurred: bool
 ) -> NDArray[np.float32] | None:
-    """Where each pixel of the output was recorded; None where nothing would move."""
+    """Where each output pixel was recorded.
+
+    None for a frame that is not deblurred and that either moves less than MIN_WARP_PX or has no known readout time.
+    """
     corners = corner_points(motion.profile.width, motion.profile.height)
     moved_px = np.abs(straightened_points(motion, corners, anchor) - corners).max()
     if not deblurred and (moved_px < MIN_WARP_PX or not motion.profile.readout_known):
@@ -229,7 +234,7 @@ def _source_map(
 
 
 def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: float) -> tuple[str, tuple[str, ...]]:
-    """The method for a frame of so long a blur, and why it is ``none``."""
+    """The deblurring method for a blur of this length, and why it is ``none``."""
     if settings.deblur == "none":
         return "none", ("deblurring is switched off",)
     if motion.exposure_s <= 0:
@@ -241,37 +246,37 @@ def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: 
 
 @dataclass(frozen=True, slots=True)
 class _KnownBlur:
-    """What is known of a frame's blur before its picture is looked at."""
+    """What is known about a frame's blur before its picture is analysed."""
 
     motion: RowMotion
     anchor: float
-    """Part of each row's exposure that the restored picture shows."""
+    """Instant that the restored picture shows, as a fraction of each row's exposure."""
     longest_px: float
-    """Length of the longest path, defocus included."""
+    """Length of the longest blur path, defocus included."""
     covariance_px2: NDArray[np.float64]
-    """(2, 2) of the path."""
-    place_std_px: float
-    """Of where straightening puts the rows, each axis."""
+    """(2, 2) covariance of the blur path."""
+    position_std_px: float
+    """Standard deviation of the rows' positions after straightening, per axis."""
     light: FrameLight | None
     """Flicker and vignetting; None: neither."""
     coding_step: float | None
-    """Of the coder's quantiser, grey levels; None: not known."""
+    """The coder's quantiser step, grey levels; None: unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class _BlurStatistics:
-    """What a blurred picture shows of noise and detail, and what undoing the blur is to gain."""
+    """Noise and detail measured on a blurred picture, and the expected gain of deblurring it."""
 
     field: Callable[[NDArray[np.float64]], KernelField]
     spread: KernelSpread | None
     luma: PictureStatistics
     chroma: PictureStatistics
     luma_model: PictureStatistics
-    """``luma`` with what the kernels are uncertain by."""
+    """``luma`` with the kernels' uncertainty counted as noise."""
     expected_db: float
-    """By the model, and by the neighbours where they tell."""
+    """Expected gain according to the model, scaled by what the neighbours confirm."""
     share: float
-    """Part of the deblurred picture to take."""
+    """Weight of the deblurred picture in the output."""
 
 
 def _deblurred(
@@ -282,61 +287,61 @@ def _deblurred(
     neighbours: NeighbourFinder | None = None,
     unmasked: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[Any], Deblurring | None, tuple[str, ...]]:
-    """The deblurred picture, not rounded, and how it was made; or the picture itself, and why it was left alone."""
+    """The deblurred picture, not rounded, and how it was made; or the picture as recorded, and why."""
     as_shown, picture = picture, picture if unmasked is None else unmasked
     curve, light = blur.motion.profile.response or ResponseCurve("srgb"), blur.light
     measured = _blur_statistics(picture, blur, settings, confirmed)
-    why_not = too_little_to_gain(measured.luma_model, measured.expected_db)
+    why_not = no_gain_reason(measured.luma_model, measured.expected_db)
     if why_not:
         return as_shown, None, (why_not,)
     blurred = blurred_picture(picture, curve, (measured.luma, measured.chroma), measured.field, blur.longest_px)
     together = neighbours is not None and light is None and blur.anchor == 0.5
     found = neighbours(measured.luma, measured.field) if together and neighbours is not None else ()
     joined = joined_neighbours(found, measured.luma_model)
-    longest_px = max((blur.longest_px, *(one.longest_px for one in joined.places)))
+    longest_px = max((blur.longest_px, *(one.longest_px for one in joined.registrations)))
     blurred = replace(blurred, spread=measured.spread, neighbours=joined.pictures, longest_px=longest_px)
     recorded = picture
     if light is not None:
-        blurred = _evened(blurred, light)
-        recorded = encode_picture([as_kept(plane, blurred) for plane in blurred.light], curve)
+        blurred = _without_flicker_and_vignetting(blurred, light)
+        recorded = encode_picture([with_vignetting(plane, blurred) for plane in blurred.light], curve)
     if joined.pictures:
         settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
-    sharp = unseen_kept(deblur(blurred, settings), recorded, blurred)
-    touched, part = _part_taken(blur, settings, blurred, measured, joined, confirmed)
-    restored = _mixed(sharp, recorded, part)
+    sharp = keep_unmeasured(deblur(blurred, settings), recorded, blurred)
+    touched, part = _blend_weights(blur, settings, blurred, measured, joined, confirmed)
+    restored = _blended(sharp, recorded, part)
     changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
     details = _details(blur, settings, measured, joined, confirmed, changed)
     if details.expected_gain_db is not None and details.expected_gain_db < 0:
-        return as_shown, None, (too_little_to_gain(measured.luma_model, details.expected_gain_db),)
-    if unmasked is not None:  # where nothing was blurred the picture stays as it was shown
-        restored = _mixed(restored.__getitem__, as_shown, touched)
+        return as_shown, None, (no_gain_reason(measured.luma_model, details.expected_gain_db),)
+    if unmasked is not None:  # unblurred regions keep the phone's sharpening
+        restored = _blended(restored.__getitem__, as_shown, touched)
     return restored, details, ()
 
 
 def _blur_statistics(
     picture: NDArray[np.uint8], blur: _KnownBlur, settings: RestorationSettings, confirmed: ConfirmedGain | None
 ) -> _BlurStatistics:
-    """Noise, detail and kernels of a picture (height, width, 3)."""
+    """Statistics and kernels of a picture (height, width, 3)."""
     height, width = picture.shape[:2]
     curve = blur.motion.profile.response or ResponseCurve("srgb")
     centres_px = most_blurred(blur.motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     few = settings.iterations <= FEW_ITERATIONS
-    # under a doubtful path its error counts as noise, unless neighbours make up for it
+    # with few iterations and an uncertain path, the path's error counts as noise instead: the coding step is ignored
     step = None if few and blur.covariance_px2.any() else blur.coding_step
     field = smooth_field(blur.motion, blur.anchor)
     luma, chroma = picture_statistics(picture, field(centres_px), curve, FEW_TILES if few else MANY_TILES, step)
     if few and step is not None:
         luma = luma.with_coder_noise(step, LEAST_CODER_NOISE)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
-    luma_model = luma.doubted_by(spread)
+    luma_model = luma.with_kernel_variance(spread)
     share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)
     expected_db = luma_model.expected_gain_db
-    if confirmed is not None:  # neighbours have told whether what lies at few places was detail
+    if confirmed is not None:  # neighbours confirm or refute the gain, so the cautious bound for gratings is not needed
         expected_db = confirmed.expected_db(replace(luma_model, places=None).expected_gain_db)
     return _BlurStatistics(field, spread, luma, chroma, luma_model, expected_db, share)
 
 
-def _part_taken(
+def _blend_weights(
     blur: _KnownBlur,
     settings: RestorationSettings,
     blurred: BlurredPicture,
@@ -344,9 +349,9 @@ def _part_taken(
     joined: JoinedNeighbours,
     confirmed: ConfirmedGain | None,
 ) -> tuple[NDArray[np.float32] | np.float32, NDArray[np.float32] | np.float32]:
-    """Where the picture was blurred, and how much of the deblurred one is taken: 0 to 1 each.
+    """Masks of the blurred regions and of the deblurred picture's weight, each 0 to 1.
 
-    (height, width), or one number for all.
+    (height, width), or one number for the whole picture.
     """
     if blur.anchor != 0.5:
         return np.float32(1.0), np.float32(1.0)
@@ -354,12 +359,12 @@ def _part_taken(
     touched = blurred_part(blur.motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
     part, seen = touched * share_map(blurred, measured.share), measured_share(blurred)
     part = part if seen is None else part * seen
-    still = still_part(joined.places)
+    still = static_part(joined.registrations)
     if still is not None and still.min() < 1:
         height, width = blurred.light[0].shape
         part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
     if confirmed is not None:
-        part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.places)))
+        part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.registrations)))
     return touched, part
 
 
@@ -371,10 +376,10 @@ def _details(
     confirmed: ConfirmedGain | None,
     changed: float,
 ) -> Deblurring:
-    """How a frame was deblurred.  changed: mean square of what restoring changed, grey levels."""
+    """How a frame was deblurred.  changed: mean square of the change by deblurring, grey levels squared."""
     model = measured.luma_model
     ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
-    misplaced = model.misplaced(blur.place_std_px, joined.passed)
+    misplaced = model.misplaced(blur.position_std_px, joined.passed)
     gain_db = None if confirmed is None else confirmed.of_change_db(changed, model.blur_error, ideal, misplaced)
     return Deblurring(
         method=settings.deblur,
@@ -387,15 +392,15 @@ def _details(
         expected_gain_std_db=gain_db[1] if gain_db else None,
         promised_gain_db=model.joint_gain_db(joined.passed) if joined.pictures else model.expected_gain_db,
         path_std_px=float(np.sqrt(np.trace(blur.covariance_px2) / 2)),
-        neighbours=tuple(JoinedNeighbour(one.number, one.weight) for one in joined.places),
+        neighbours=tuple(JoinedNeighbour(one.number, one.weight) for one in joined.registrations),
         neighbours_gain_db=10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
         share=measured.share,
         defocus_sigma_px=most_defocus_px(blur.motion.profile),
     )
 
 
-def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
-    """The picture without flicker and vignetting: both came after the blur, so they go before it is undone."""
+def _without_flicker_and_vignetting(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
+    """The picture without flicker and vignetting: they act after the blur, so they are undone before deblurring."""
     planes = [light.evened(plane, mask) for plane, mask in zip(blurred.light, blurred.clipped, strict=True)]
 
     def slopes(channel: int, side_px: int, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -405,19 +410,19 @@ def _evened(blurred: BlurredPicture, light: FrameLight) -> BlurredPicture:
     return replace(blurred, light=planes, slopes=slopes, kept=light.kept)
 
 
-def _relit(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
-    """The picture that is not deblurred, without flicker, and vignetted as where its pixels go."""
+def _without_flicker(picture: NDArray[np.uint8], curve: ResponseCurve, light: FrameLight) -> NDArray[np.uint8]:
+    """A picture that is not deblurred, without flicker, and with the vignetting of the positions it is warped to."""
     clipped = cv2.LUT(picture, curve.clipped_table().astype(np.uint8))
     planes = zip(cv2.split(cv2.LUT(picture, curve.linear_table())), cv2.split(clipped), strict=True)
     return encode_picture([light.evened(plane, mask) * light.kept for plane, mask in planes], curve)
 
 
-def _mixed(
+def _blended(
     sharp: RowRenderer, recorded: NDArray[np.uint8], part: NDArray[np.float32] | np.float32
 ) -> NDArray[np.float32]:
-    """So much of the sharp picture, the rest recorded, (height, width, 3): grey levels of 255, not rounded.
+    """Blend of the sharp and the recorded picture, (height, width, 3): grey levels 0 to 255, not rounded.
 
-    part: (height, width), or one number for all.
+    part: weight of the sharp picture, (height, width) or one number for the whole picture.
     """
     mixed = np.empty(recorded.shape, np.float32)
     for rows in bands(len(recorded)):
@@ -432,13 +437,13 @@ def _mixed(
 
 
 def _mean_square(restored: NDArray[np.float32], recorded: NDArray[np.uint8]) -> float:
-    """Of what restoring changed, (height, width, 3) each; seen in every fourth row."""
+    """Mean square of the change by restoring, (height, width, 3) each, over every fourth row."""
     changed = cv2.subtract(restored[::4], recorded[::4], dtype=cv2.CV_32F)
     return float(cv2.norm(changed, cv2.NORM_L2SQR)) / changed.size
 
 
 class _Clock:
-    """Seconds of each step."""
+    """Measures the seconds of each step."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

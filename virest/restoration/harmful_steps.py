@@ -26,23 +26,23 @@ OTHER_BLUR = "the blur observed in this frame disagrees with the profile: not de
 OTHER_ROWS = "the row displacement observed in this frame disagrees with the profile: not straightened"
 
 
-def deblurring_loses(predicted: RowMotion, seen: RowMotion) -> bool:
+def deblurring_harms(predicted: RowMotion, seen: RowMotion) -> bool:
     """Whether more than MOST_OUTSIDE of the predicted blur paths lies outside the observed ones.
 
     A predicted path that is too short removes less blur than there is, which does no harm.  The part beyond or beside
     the observed path would remove blur that is not there.
     """
-    places = _grid_points(predicted)
-    chord, true = blur_chords(predicted, places), blur_chords(seen, places)
+    points = _grid_points(predicted)
+    chord, true = blur_chords(predicted, points), blur_chords(seen, points)
     along = np.clip((chord * true).sum(-1) / np.maximum((true**2).sum(-1), 1e-12), 0.0, 1.0)
     return _rms(chord - along[:, None] * true) > MOST_OUTSIDE * _rms(chord)
 
 
-def straightening_loses(predicted: RowMotion, seen: RowMotion, anchor: float) -> bool:
+def straightening_harms(predicted: RowMotion, seen: RowMotion, anchor: float) -> bool:
     """Whether straightening would leave points about as far from their observed positions as recorded, or farther."""
-    places = _grid_points(predicted)
-    true = straightened_points(seen, places, anchor)
-    return _rms(straightened_points(predicted, places, anchor) - true) > MOST_LEFT * _rms(places - true)
+    points = _grid_points(predicted)
+    true = straightened_points(seen, points, anchor)
+    return _rms(straightened_points(predicted, points, anchor) - true) > MOST_LEFT * _rms(points - true)
 
 
 def _grid_points(motion: RowMotion) -> Array:

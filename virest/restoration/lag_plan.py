@@ -1,4 +1,4 @@
-"""A recorder's start-up lag that no profile states: found from repeated frames and turns, and followed."""
+"""Detect a recorder's start-up lag that the profile does not state, and plan at the frames' true times."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.plan_notes import NoteCode
 
 GrayReader = Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
+"""Gives (index, luma) of the requested frames, in order."""
 MOST_FRAMES = 90
+"""Largest number of start-up frames to read."""
 SOURCE = "repeated frames, and frame rotations against the gyroscope"
 
 
 def find_lag(capture: Capture, profile: CameraProfile, read_gray: GrayReader) -> StartUpLag | None:
-    """The lag of the first frames; None where none is seen, or turns agree no better with it than without."""
+    """The lag of the first frames; None: no sign of one, or rotations do not agree better with it than without."""
     lagging = [frame.index for frame in capture.frames if frame.only_startup][:MOST_FRAMES]
     if profile.extensions.frame_lag_frames or not capture.repeats or len(lagging) <= MIN_PAIRS:
         return None
@@ -35,18 +37,18 @@ def find_lag(capture: Capture, profile: CameraProfile, read_gray: GrayReader) ->
 
 
 def at_lag(capture: Capture, profile: CameraProfile, lag: StartUpLag) -> Capture:
-    """The capture with the frames of the start-up at the times and exposures of what they show."""
-    return replace(capture, frames=at_true_times(capture.frames, _followed(profile, lag), capture.repeats))
+    """The capture with start-up frames at the times and exposures of the captures that they show."""
+    return replace(capture, frames=at_true_times(capture.frames, _profile_with_lag(profile, lag), capture.repeats))
 
 
 def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
-    """A plan made for true times, with the lag in its profile and in what is said."""
-    contradicted = None if plan.contradicted is None else _followed(plan.contradicted, lag)
-    said = f"frame lag of {lag.lag_s:.2f} s at the start: the first {lag.frames} frames are taken at their true times"
-    profile = _followed(plan.profile, lag)
-    return replace(plan, profile=profile, contradicted=contradicted).noted(NoteCode.TRUE_TIMES, said)
+    """A plan that was made at true times, with the lag added to its profiles and notes."""
+    contradicted = None if plan.contradicted is None else _profile_with_lag(plan.contradicted, lag)
+    text = f"frame lag of {lag.lag_s:.2f} s at the start: the first {lag.frames} frames are used at their true times"
+    profile = _profile_with_lag(plan.profile, lag)
+    return replace(plan, profile=profile, contradicted=contradicted).noted(NoteCode.TRUE_TIMES, text)
 
 
-def _followed(profile: CameraProfile, lag: StartUpLag) -> CameraProfile:
+def _profile_with_lag(profile: CameraProfile, lag: StartUpLag) -> CameraProfile:
     extensions = replace(profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
     return profile.with_estimate("lag_s", lag.lag_s, None, SOURCE, extensions=extensions)

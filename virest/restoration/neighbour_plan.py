@@ -1,4 +1,4 @@
-"""What neighbouring frames show of the prediction, and of the gain, asked once for a capture."""
+"""Compare neighbouring frames once per capture, to correct the prediction and confirm the gain."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 from virest.restoration.neighbours.survey import path_length_px, survey_gain, survey_turns
 from virest.restoration.settings import PRESETS
-from virest.restoration.trial import tried
+from virest.restoration.trial import try_restoration
 
 
-def with_neighbours_asked(
+def with_neighbour_survey(
     plan: RestorationPlan,
     capture: Capture,
     runs: Sequence[Sequence[int]],
     lumas: Mapping[int, NDArray[np.uint8]],
     steps: Mapping[int, float],
 ) -> RestorationPlan:
-    """What neighbouring frames show that the predicted turns lack, and how much of a promised gain they confirm.
+    """The plan with the phone's sharpening, the missing rotation and the confirmed gain, from neighbouring frames.
 
-    lumas: of the frames of the runs.  steps: of the coder's quantiser, by number; missing: not known.
+    lumas: of the runs' frames, by index.  steps: the coder's quantiser step by frame index; missing: unknown.
     """
     profile = plan.profile
     if not lumas or profile.intrinsics is None:
@@ -46,36 +46,39 @@ def with_neighbours_asked(
         outside = outside_reason(motion.start_s, motion.end_s, capture.imu.time_s, capture.imu_gaps_s)
         why = outside[1] if outside else ""
         sights[number] = Sight(frames[number], luma, motion, why, coding_step=steps.get(number))
-    plan, sights = _unmasked(plan, sights)
+    plan, sights = _without_sharpening(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing = survey_turns(runs, sights, neighbours, trajectory)
     if missing is not None:
-        said = (
+        note = (
             f"neighbouring frames rotate by {missing.rate_rad_s:.3f} rad/s rms more or less than predicted: "
             "each frame's motion is corrected by its neighbours"
         )
-        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, said))
+        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, note))
     if plan.settings.deblur == "none":
         return plan
     quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
 
-    def quickly(here: Sight, motion: RowMotion, refined: RefinedMotion | None) -> tuple[Image, Image] | None:
-        return tried(here.picture, motion, quick, refined, here.coding_step)
+    def restore_quickly(here: Sight, motion: RowMotion, refined: RefinedMotion | None) -> tuple[Image, Image] | None:
+        return try_restoration(here.picture, motion, quick, refined, here.coding_step)
 
-    return replace(plan, confirmed=survey_gain(runs, sights, neighbours.knowing(missing), trajectory, lens, quickly))
+    return replace(
+        plan,
+        confirmed=survey_gain(runs, sights, neighbours.with_missing_turn(missing), trajectory, lens, restore_quickly),
+    )
 
 
-def _unmasked(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[RestorationPlan, dict[int, Sight]]:
-    """With the phone's sharpening, where edges show one, and what the frames are without it."""
+def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[RestorationPlan, dict[int, Sight]]:
+    """The plan with the phone's sharpening, if edges show one, and the frames with it undone."""
     if plan.settings.deblur == "none":
         return plan, dict(sights)
     usable = [(one.picture, one.motion) for one in sights.values() if one.usable and one.motion is not None]
     mask = seen_mask(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
     if mask is None:
         return plan, dict(sights)
-    said = (
+    note = (
         "edges overshoot as after a phone's sharpening: before deblurring, process undoes the expected "
         f"unsharp mask, of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
     )
-    plan = replace(plan, mask=mask, notes=(*plan.notes, said))
+    plan = replace(plan, mask=mask, notes=(*plan.notes, note))
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}

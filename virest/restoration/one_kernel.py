@@ -1,4 +1,4 @@
-"""Deblurring a picture by a kernel or a blur path that is given, the same all over: no capture, no gyroscope."""
+"""Deblur a single picture with a given kernel or blur path, the same all over; no capture, no gyroscope."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from virest.errors import SettingsError
 from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernels import KernelField
 from virest.restoration.blurred import blurred_picture, clipped_anywhere
-from virest.restoration.clipped_light import unseen_kept
+from virest.restoration.clipped_light import keep_unmeasured
 from virest.restoration.deblur import deblur
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import rounded
@@ -23,19 +23,19 @@ Array = NDArray[np.float64]
 SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which the picture's noise is measured."""
 LEAST_PART = 1e-6
-"""Of the largest value of a kernel: below it there is no light."""
+"""Kernel values below this fraction of the largest count as 0."""
 SAMPLES = 64
-"""Instants at which a path is taken."""
+"""Least number of samples of a path."""
 
 
 def deblur_along(
     picture: NDArray[np.uint8], path_px: Array, light: Array | None, curve: ResponseCurve, settings: RestorationSettings
 ) -> NDArray[np.uint8]:
-    """The sharp picture, where each of its points moved along ``path_px`` while the picture was taken.
+    """Deblur a picture whose points all moved along ``path_px`` during the exposure.
 
-    Model: grey = E(mean over the path of sharp light at p − d) + noise, E the exposure curve.  picture: (height, width,
-    3) RGB.  path_px: (m, 2) displacements d, x right, y down; the sharp picture shows d = 0.  light: (m,) weights.
-    The noise is measured in the picture; a picture too small for that raises SettingsError.
+    Model: grey = E(mean over the path of sharp light at p − d) + noise, E the tone curve.  picture: (height, width, 3)
+    RGB.  path_px: (m, 2) displacements d, x right, y down; the sharp picture shows d = 0.  light: (m,) weights; None:
+    equal.  The noise is measured on the picture.  Raises SettingsError if the picture is too small for that.
     """
     height, width = picture.shape[:2]
 
@@ -54,12 +54,15 @@ def deblur_along(
         )
     longest_px = float(np.linalg.norm(np.ptp(path_px, axis=0)))
     blurred = blurred_picture(picture, curve, (luma, chroma), field, longest_px)
-    restored = unseen_kept(deblur(blurred, replace(settings, shutter="none")), picture, blurred)
+    restored = keep_unmeasured(deblur(blurred, replace(settings, shutter="none")), picture, blurred)
     return rounded(restored(slice(0, height)))
 
 
 def path_of_kernel(kernel: Array) -> tuple[Array, Array]:
-    """Displacements (m, 2) from the middle of a convolution kernel, and the light (m,) at each."""
+    """Displacements (m, 2) from the centre of a convolution kernel, and the light (m,) at each.
+
+    Raises SettingsError unless the kernel is 2-D, finite and non-negative, with a positive sum.
+    """
     kernel = np.asarray(kernel, float)
     if kernel.ndim != 2 or not np.isfinite(kernel).all() or kernel.min() < 0 or not kernel.sum() > 0:
         raise SettingsError(
@@ -72,7 +75,10 @@ def path_of_kernel(kernel: Array) -> tuple[Array, Array]:
 
 
 def even_path(path_px: Array) -> Array:
-    """A path (k, 2), k at least 2, at SAMPLES instants, evenly spaced in time as the given points are."""
+    """A path (k, 2), k ≥ 2, resampled evenly in time to SAMPLES points or four per pixel, whichever is more.
+
+    The given points are taken as evenly spaced in time.  Raises SettingsError for other shapes or values.
+    """
     path_px = np.asarray(path_px, float)
     if path_px.ndim != 2 or path_px.shape[1] != 2 or len(path_px) < 2 or not np.isfinite(path_px).all():
         raise SettingsError(
@@ -84,7 +90,7 @@ def even_path(path_px: Array) -> Array:
 
 
 def as_colour(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A picture (h, w) or (h, w, 3) of 8 bits as RGB; raises SettingsError for anything else."""
+    """An 8-bit picture (h, w) or (h, w, 3) as RGB; raises SettingsError for anything else."""
     picture = np.asarray(picture)
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or (picture.ndim == 3 and picture.shape[2] != 3):
         raise SettingsError(

@@ -1,4 +1,4 @@
-"""What was found out about one frame's degradation, as a record; the log's lines are made from it."""
+"""The degradation of one frame, as a record from which the log's lines are made."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory, quaternion_wxyz
 
 LOG_TILE_PX = 128
-"""Spacing of the tiles in the log."""
+"""Spacing, px, of the tiles in the log."""
 
 Json = dict[str, Any]
 Numbers = tuple[float, ...]
@@ -26,21 +26,21 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class ExposureMotion:
-    """The camera's motion over the exposure of the centre's row, in its axes at the start (eqs 4-10)."""
+    """The camera's motion during the exposure of the centre row, in camera axes at its start (eqs 4-10)."""
 
     delta_position_m: Numbers | None = None
-    """(3,); None where travel is not known in metres."""
+    """(3,); None: translation unknown, or not in metres."""
     delta_q_wxyz: Numbers | None = None
-    """(4,), start from end; None where the motion is not known."""
+    """(4,), start from end; None: motion unknown."""
     rate_rad_s: Numbers | None = None
-    """(3,), in the middle of the exposure."""
+    """(3,) at mid-exposure; None: motion unknown."""
     velocity_m_s: Numbers | None = None
-    """(3,), at the start."""
+    """(3,) at the start; None: translation unknown, or not in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class TileBlur:
-    """The blur at one place (eqs 12-18)."""
+    """The blur at one tile's centre (eqs 12-18)."""
 
     centre_px: Numbers
     angle_rad: float
@@ -49,7 +49,7 @@ class TileBlur:
 
 @dataclass(frozen=True, slots=True)
 class FrameBlur:
-    """The blur at the frame's centre and tile by tile; None: not known."""
+    """The blur at the frame's centre and tile by tile; None: unknown."""
 
     angle_rad: float | None = None
     length_px: float | None = None
@@ -57,33 +57,36 @@ class FrameBlur:
 
     @property
     def longest_px(self) -> float:
-        """The longest blur of any tile."""
+        """The longest blur of all tiles."""
         return max(tile.length_px for tile in self.tiles)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameShutter:
-    """The rolling shutter's displacement, and how it was undone."""
+    """The rolling shutter's displacement, and how it was corrected."""
 
     readout_time_s: float | None
     method: str = "none"
-    """``none``: it was not."""
+    """``none``: not corrected."""
     corners_px: tuple[Numbers, ...] | None = None
-    """(4, 2): where the centres of the corner pixels go (eq 28)."""
+    """(4, 2) straightened positions of the corner pixels' centres (eq 28)."""
     max_displacement_px: float | None = None
+    """Largest displacement of a corner."""
 
 
 @dataclass(frozen=True, slots=True)
 class JoinedNeighbour:
-    """A frame that another was restored with."""
+    """A neighbouring frame used in a joint restoration."""
 
     frame: int
+    """Movie index."""
     weight: float
+    """Mean weight over the picture."""
 
 
 @dataclass(frozen=True, slots=True)
 class Deblurring:
-    """How a frame was deblurred, and what that is expected to gain."""
+    """How a frame was deblurred, and the expected gain."""
 
     method: str
     preset: str
@@ -92,22 +95,23 @@ class Deblurring:
     tile_px: int
     noise_grey_levels: float
     expected_gain_db: float | None
-    """None where no neighbour confirms it."""
+    """None: not tested on neighbours."""
     expected_gain_std_db: float | None
     promised_gain_db: float
-    """Of an ideal filter at the measured noise."""
+    """Gain of an ideal filter at the measured noise."""
     path_std_px: float
-    """Standard deviation of the blur path, one axis."""
+    """Standard deviation of the blur path, per axis."""
     neighbours: tuple[JoinedNeighbour, ...]
     neighbours_gain_db: float
+    """Part of an ideal filter's gain that the neighbours add."""
     share: float
-    """Part of the deblurred picture that is taken, the rest being the recorded one."""
+    """Weight of the deblurred picture in the output; the rest is the recorded one."""
     defocus_sigma_px: float
 
 
 @dataclass(frozen=True, slots=True)
 class DegradationParameters:
-    """What was found out about one frame, and what was done about it.  The fields stand in the log's order."""
+    """One frame's degradation, and how it was corrected.  The fields are in the log's order."""
 
     motion: ExposureMotion
     depth_m: float | None
@@ -117,35 +121,35 @@ class DegradationParameters:
     blur: FrameBlur
     shutter: FrameShutter
     response: str
-    """The response curve, in words."""
+    """Description of the response curve."""
     deblur: Deblurring | None = None
     """None: not deblurred."""
 
     @property
     def deblur_method(self) -> str:
-        """``none`` where the frame was not deblurred."""
+        """The method, or ``none`` if the frame was not deblurred."""
         return "none" if self.deblur is None else self.deblur.method
 
     @property
     def expected_gain_db(self) -> float | None:
-        """None where it was not deblurred, or no neighbour confirms a gain."""
+        """The expected gain; None if the frame was not deblurred or the gain not tested on neighbours."""
         return None if self.deblur is None else self.deblur.expected_gain_db
 
     def as_json(self) -> Json:
-        """The part of a line of ``parameters.jsonl`` that this record holds."""
+        """The record's part of a line of ``parameters.jsonl``."""
         line: Json = _plain(self)
         return line if self.deblur is not None else line | {"deblur": {"method": "none"}}
 
 
 def _plain(value: Any) -> Any:
-    """Records as mappings, tuples as lists."""
+    """Records converted to mappings, and tuples to lists."""
     if is_dataclass(value):
         return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
     return [_plain(one) for one in value] if isinstance(value, tuple) else value
 
 
 def degradation_parameters(motion: RowMotion, trajectory: Trajectory) -> DegradationParameters:
-    """Motion (eqs 4-10), blur (eqs 12-18) and rolling shutter (eq 28) of one frame of which nothing was undone yet."""
+    """Motion (eqs 4-10), blur (eqs 12-18) and rolling shutter (eq 28) of one frame before any correction."""
     profile = motion.profile
     width, height = profile.width, profile.height
     centre = np.array([[(width - 1) / 2, (height - 1) / 2]])
@@ -178,7 +182,7 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory) -> Degrada
 
 
 def unknown_parameters(profile: CameraProfile) -> DegradationParameters:
-    """Of a frame whose motion is not known."""
+    """Parameters of a frame whose motion is unknown."""
     readout_s = profile.shutter.readout_time_s if profile.readout_known else None
     response = (profile.response or ResponseCurve("srgb")).describe()
     return DegradationParameters(ExposureMotion(), None, "none", FrameBlur(), FrameShutter(readout_s), response)
@@ -189,7 +193,7 @@ def _numbers(vector: NDArray[np.float64]) -> Numbers:
 
 
 def _depth(motion: RowMotion) -> tuple[float | None, str]:
-    """Depth at the picture's centre and where it is from; a plane at infinity has none."""
+    """Depth at the picture's centre and its source; None and ``none`` if unknown or infinite."""
     if motion.translation is None or motion.translation.depth_m is None or np.isinf(motion.translation.depth_m):
         return None, "none"
     return motion.translation.depth_m, motion.translation.source
@@ -200,7 +204,7 @@ def _in_metres(motion: RowMotion) -> bool:
 
 
 def _velocity_m_s(motion: RowMotion, time_s: float) -> Numbers | None:
-    """Velocity of the camera's centre at a time, in its axes at that time (eq 5)."""
+    """Velocity of the camera's centre at a time, in camera axes then (eq 5); None: unknown, or not in metres."""
     if motion.translation is None or not motion.translation.in_metres:
         return None
     rotation, _ = motion.pose(time_s)

@@ -1,4 +1,4 @@
-"""What planning notes about a capture: a code that later steps decide by, and the sentence that people read."""
+"""Notes of the planning stage about a capture: a code for later steps, and a text for the user."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from enum import Enum, auto
 
 
 class NoteCode(Enum):
-    """What a note is about."""
+    """Subject of a note."""
 
     DEFAULT_TAKEN = auto()
-    """A value that the profile leaves open is the documented default."""
+    """A value missing in the profile is set to its documented default."""
     TIME_OFFSET = auto()
-    """The offset that the profile leaves open: estimated, or why not."""
+    """The offset, missing in the profile, was estimated, or why it was not."""
     NOT_FOLLOWING = auto()
-    """At no offset does the gyroscope explain half of the rotation: stabilised in the camera, or another log."""
+    """At no offset does the gyroscope explain half of the rotation: stabilised in the camera, or the wrong log."""
     OTHER_OFFSET = auto()
     """The frames contradict a stated offset."""
     FOCAL_LENGTH = auto()
-    """The focal length that the profile leaves open could not be estimated."""
+    """The focal length, missing in the profile, could not be estimated."""
     BLUR_LENGTH = auto()
     """The frames show blur paths of another length."""
     PROFILE_CONFLICT = auto()
-    """Tracked points contradict the profile: what was put in its place, or that nothing explains them."""
+    """Tracked points contradict the profile: the values used instead, or that nothing explains them."""
     DISAGREEMENT = auto()
     """Frames and gyroscope do not belong together."""
     UNCHECKED = auto()
-    """Whether they do could not be tested."""
+    """Whether frames and gyroscope belong together could not be tested."""
     TRANSLATION = auto()
-    """Travel and depth: not estimated, or in some frames only."""
+    """Translation and depth: not estimated, or in some frames only."""
     TRUE_TIMES = auto()
-    """Frames are taken at other times than their stamps."""
+    """Frames are used at other times than their stamps."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanNote:
-    """One note."""
+    """A note about a capture."""
 
     code: NoteCode
     text: str

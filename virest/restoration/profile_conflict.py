@@ -1,9 +1,9 @@
-"""Tracked points against a profile: a wrong focal length, drifting clocks or a stabiliser, found and put right.
+"""Test a profile on tracked points, and correct a wrong focal length, clock skew, gyroscope scale or stabiliser.
 
-Where points lie further from the profile's prediction than tracking errs, each cause is fitted with what any profile
-may be a little off in (clock, bias, axes, readout) beside it.  The cause that best predicts the blocks of time that it
-was not fitted to enters, and the next is sought beside it.  Nothing is taken unless all of it together explains most
-of the contradiction.
+If points lie farther from the profile's prediction than tracking noise explains, each cause is fitted, together with
+the values that any profile may have slightly wrong (clock, bias, axes, readout).  The cause that best predicts held-out
+time blocks is added, and the next one is searched for in addition.  The result is used only if all causes together
+explain most of the contradiction.
 """
 
 from __future__ import annotations
@@ -33,64 +33,65 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 CONTRADICTED = 1.3
-"""Robust residual, in units of tracking's own noise, above which something is wrong with the model.  Right profiles
-leave 0.9 to 1.15 (simulated captures, hand-held and walking); a stabiliser of a tenth or a focal length 2 % off leave
-more than 2."""
+"""Robust residual, in units of the tracking noise, above which the model is wrong.  Correct profiles leave 0.9 to 1.15
+(simulated captures, hand-held and walking); a stabiliser that cancels 10 %, or a focal length 2 % off, leave more than
+2."""
 MOST_LEFT = 0.5
-"""Part of the contradiction, as a variance beyond tracking's, that may remain for what was found to be taken."""
+"""Largest remaining fraction of the contradiction, as variance beyond the tracking noise, for the result to be used."""
 HELD_OUT_P = 0.05
-"""One-sided, of the held-out blocks' mean gain by Student's t: what was fitted must carry over to other blocks."""
+"""Significance level, one-sided, of the mean gain on held-out blocks (Student's t): a fit must predict other blocks."""
 VALUE_P = 1e-5
-"""Of a value being nought, with tracking's own bias in its deviation: with nine trials at most, a false cause in fewer
-than one capture of ten thousand."""
+"""Significance level of a value, with the tracking bias included in its deviation: with at most nine trials, a false
+cause is found in fewer than one capture of ten thousand."""
 TOLD_SIGMA = 3.0
-"""A cause and its twin are told apart where they differ by more than this many deviations."""
+"""A cause is distinguished from its twin if, fitted beside it, it remains above this many standard deviations."""
 MAX_CAUSES = 3
 JUDGED = 2
-"""Causes judged on held-out blocks each time, those first that fit best."""
+"""Number of causes tested on held-out blocks in each round, those that fit best."""
 BLOCKS = 8
 POINTS, START_POINTS, STARTS = 1500, 400, 2
-"""Points of a fit, and of the search for where it may begin; fits begin at the best few starts."""
+"""Number of points in a fit, and in the ranking of starting values; number of starting values that are fitted."""
 MAX_ITERATIONS = 10
 START_INVERSE_DEPTH_PER_M = 0.5
 TRANSLATION_GAIN = 0.9
-"""A travelling camera is fitted where it leaves less than this part of what turning alone leaves."""
+"""Include camera translation if it reduces the residual below this fraction of that of rotation alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What points say of a profile."""
+    """Result of testing a profile on tracked points."""
 
     profile: CameraProfile
-    """As given, or with what was taken."""
+    """The given profile, or the corrected one."""
     contradicted: bool = False
-    """Whether points lie further off than tracking errs, by the profile given."""
+    """Whether the given profile leaves a larger residual than tracking noise explains."""
     taken: tuple[str, ...] = ()
-    """One line each, for people."""
+    """Messages about the corrected values."""
     before_px: float = 0.0
-    """Robust residual per coordinate, by the profile given."""
+    """Robust residual per coordinate with the given profile."""
     after_px: float = 0.0
+    """The same with the corrected profile."""
     noise_px: float = 0.0
-    """Typical noise of a tracked step."""
+    """Typical tracking noise between two frames."""
     offset: tuple[float, float] | None = None
-    """Clock offset at the profile's readout, and its standard deviation, s, as fitted beside all else."""
+    """Clock offset at the profile's readout time, and its standard deviation, s, fitted together with all else."""
     motion_px: float = 0.0
-    """Typical way of a point from frame to frame, on the scale of the residuals."""
+    """Typical motion of a point between frames, on the scale of the residuals."""
     focal: tuple[float, float] | None = None
-    """Focal length and its standard deviation, px, where that was unknown."""
+    """Focal length and its standard deviation, px; None if it was known."""
 
     @property
     def explained(self) -> float:
-        """Part of the points' motion, as a variance, that the profile explains with what was taken."""
+        """Fraction of the variance of the points' motion that the resulting profile explains."""
         return 1 - (self.after_px / self.motion_px) ** 2 if self.motion_px else 0.0
 
 
 def settle_conflict(
     observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, *, offset_known: bool, focal_known: bool = True
 ) -> Settled:
-    """Test a profile by tracked points, and put right what they contradict.
+    """Test a profile on tracked points, and correct the values that they contradict.
 
-    offset_known, focal_known: these are stated; otherwise they are fitted freely beside each cause.
+    offset_known, focal_known: whether these are stated; otherwise they are fitted freely together with each cause.
     """
     observed = observed.covered(imu, profile)
     if profile.intrinsics is None or len(observed.pairs) < MIN_PAIRS:
@@ -105,24 +106,26 @@ def settle_conflict(
     found = found if focal_known else replace(found, focal=_focal(base, noise_px))
     if base.scale < CONTRADICTED:
         return found
-    fit, causes = search.climbed(base)
+    fit, causes = search.add_causes(base)
     log.debug("points lie %.2f off; %s leave %.2f", base.scale, [cause.name for cause in causes], fit.scale)
     if not causes or fit.scale**2 - 1 > MOST_LEFT * (base.scale**2 - 1):
         return replace(found, contradicted=True)
     resolved = profile
     stds = [_std(fit, cause, noise_px) for cause in causes]
     for cause, std in zip(causes, stds, strict=True):
-        resolved = cause.adopted(resolved, fit.profile, std)
-    said = tuple(cause.said(profile, fit.profile, std) for cause, std in zip(causes, stds, strict=True))
-    said = tuple(text + search.rival(fit, causes, cause) for text, cause in zip(said, causes, strict=True))
+        resolved = cause.adopt(resolved, fit.profile, std)
+    messages = tuple(cause.message(profile, fit.profile, std) for cause, std in zip(causes, stds, strict=True))
+    messages = tuple(
+        text + search.ambiguity_note(fit, causes, cause) for text, cause in zip(messages, causes, strict=True)
+    )
     offset = _offset(fit, readout_s, noise_px)
     focal = None if focal_known else _focal(fit, noise_px)
     after_px = fit.scale * noise_px
-    return Settled(resolved, True, said, left_px, after_px, noise_px, offset, motion_px, focal)
+    return Settled(resolved, True, messages, left_px, after_px, noise_px, offset, motion_px, focal)
 
 
 def _offset(fit: TrackFit, readout_s: float, noise_px: float) -> tuple[float, float]:
-    """Clock offset that goes with a readout, the middle row kept where it was, and its deviation."""
+    """Clock offset converted to another readout time at a constant middle-row time, and its standard deviation."""
     offset_s = (fit.profile.time_offset_s or 0.0) + 0.5 * (fit.profile.shutter.readout_time_s - readout_s)
     return offset_s, float(np.hypot(fit.std("time_offset")[0], bias_std(fit, "time_offset", noise_px)[0]))
 
@@ -145,7 +148,7 @@ def _std(fit: TrackFit, cause: Cause, noise_px: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """A profile to begin from, the causes in it, and how the camera travels."""
+    """Starting point of a fit: profile, causes to fit, and camera translation."""
 
     profile: CameraProfile
     causes: tuple[Cause, ...]
@@ -154,7 +157,7 @@ class _Start:
 
 @dataclass(frozen=True, slots=True)
 class _Search:
-    """What stays the same through a search."""
+    """Stepwise search for causes; the fields stay constant during it."""
 
     imu: ImuSamples
     table: TrackTable
@@ -163,7 +166,7 @@ class _Search:
     nuisances: tuple[Term, ...]
 
     def base(self) -> TrackFit:
-        """The profile as given, with its nuisances: turning alone, or travelling where that explains more."""
+        """Fit of the given profile with its nuisances: rotation only, or with translation if that explains more."""
         plain = self.fit(_Start(self.given, (), None))
         depth_m = self.given.depth_m
         if plain.scale < CONTRADICTED or (depth_m is not None and np.isinf(depth_m)):
@@ -179,15 +182,15 @@ class _Search:
         return start_scene(self.imu, known, self.table, 1 / depth_m if depth_m else START_INVERSE_DEPTH_PER_M)
 
     def fit(self, start: _Start, use: NDArray[np.bool_] | None = None) -> TrackFit:
-        """Fit the nuisances and the causes; on some of the points, where only values count, without covariances."""
+        """Fit the nuisances and the causes; use: (n,) fit these points only, without covariances."""
         table = self.table if use is None else self.table.chosen(use)
         terms = (*self.nuisances, *(cause.term for cause in start.causes))
         return fit_tracks(
             self.imu, table, start.profile, terms, start.scene, max_iterations=MAX_ITERATIONS, covariances=use is None
         )
 
-    def climbed(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
-        """Causes that enter one after the other, and the fit with all of them."""
+    def add_causes(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
+        """Add causes one by one; returns the fit with all of them, and the causes."""
         here, fit = _Start(self.given, (), None if base.scene is None else self._travel()), base
         while len(here.causes) < MAX_CAUSES and fit.scale >= CONTRADICTED:
             entered = self._next(here, fit)
@@ -196,8 +199,8 @@ class _Search:
             here, fit = entered
         return fit, here.causes
 
-    def rival(self, fit: TrackFit, causes: tuple[Cause, ...], cause: Cause) -> str:
-        """What to add of a cause that points do not tell from its twin, fitted beside it; nothing where they do."""
+    def ambiguity_note(self, fit: TrackFit, causes: tuple[Cause, ...], cause: Cause) -> str:
+        """Text to append to the message about a cause that points do not distinguish from its twin; else empty."""
         twin = next((other for other in CAUSES if other.name == TWINS.get(cause.name)), None)
         fitted = {term.name for term in (*self.nuisances, *(other.term for other in causes))}
         if twin is None or twin.term.name in fitted:
@@ -205,15 +208,15 @@ class _Search:
         both = self.fit(_Start(fit.profile, (*causes, twin), fit.scene))
         change = cause.change(self.given, both.profile)
         std = _std(both, cause, float(np.median(self.table.noise_px)))[0]
-        return "" if abs(change) > TOLD_SIGMA * std else f" (or a {twin.name}, which this motion does not tell from it)"
+        return "" if abs(change) > TOLD_SIGMA * std else f" (or a {twin.name}: this motion cannot tell them apart)"
 
     def _next(self, here: _Start, fit: TrackFit) -> tuple[_Start, TrackFit] | None:
-        """The cause that best predicts held-out blocks, if it does so beyond chance and has a value of its own."""
+        """The first cause, by fit, that predicts held-out blocks significantly better and has a plausible value."""
         fitted = {term.name for term in (*self.nuisances, *(cause.term for cause in here.causes))}
         open_causes = [cause for cause in CAUSES if cause.term.name not in fitted]
-        tried = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
+        fitted_causes = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
         without = None
-        for start, found in sorted(tried, key=lambda one: one[1].cost)[:JUDGED]:
+        for start, found in sorted(fitted_causes, key=lambda one: one[1].cost)[:JUDGED]:
             if found.cost >= fit.cost or found.scale >= fit.scale or not self._has_value(start, found):
                 continue
             without = self._held_out(here, fit) if without is None else without
@@ -224,7 +227,7 @@ class _Search:
         return None
 
     def _best(self, here: _Start, fit: TrackFit, cause: Cause) -> tuple[_Start, TrackFit] | None:
-        """The cause's best fit from the best of its starts, of both clocks: as given, and as fitted without it."""
+        """The cause's best fit from its best starts, on the profile as it stood before the last fit and after it."""
         starts = [
             cause.term.change(profile, step)
             for profile in (here.profile, fit.profile)
@@ -234,26 +237,26 @@ class _Search:
             middle_s = float(np.mean(self.table.second_stamp_s))
             moved = [(profile.clock_skew - self.given.clock_skew) * middle_s for profile in starts]
             starts += [shift_offset(p, np.array([-moved_s])) for p, moved_s in zip(starts, moved, strict=True)]
-        off = [self._off(profile, here.scene) for profile in starts]
+        off = [self._typical_distance(profile, here.scene) for profile in starts]
         found = []
         for number in np.argsort(off)[:STARTS]:
             start = _Start(starts[int(number)], (*here.causes, cause), here.scene)
             found.append((start, self.fit(start)))
         return min(found, key=lambda one: one[1].cost, default=None)
 
-    def _off(self, profile: CameraProfile, scene: Motion | None) -> float:
-        """Typical distance of a few points from where a profile puts them."""
+    def _typical_distance(self, profile: CameraProfile, scene: Motion | None) -> float:
+        """Median normalised distance of START_POINTS points from a profile's prediction."""
         fit = fit_tracks(self.imu, self.few, profile, (), scene, max_iterations=0)
         return float(np.median(fit.distance))
 
     def _has_value(self, start: _Start, fit: TrackFit) -> bool:
-        """Whether the cause that entered last has a value that a phone can have, and not by chance."""
+        """Whether the last cause has a plausible value that differs significantly from the given one."""
         cause, found = start.causes[-1], fit.profile
         ratio = cause.change(self.given, found) / _std(fit, cause, float(np.median(self.table.noise_px)))[0]
         return cause.plausible(self.given, found) and chi2_tail(ratio**2, 1) < VALUE_P
 
     def _held_out(self, start: _Start, fit: TrackFit) -> Array:
-        """Whitened distances (n,) of all points from fits that did not see their block."""
+        """(n,) normalised distances of all points from the predictions of fits without their block."""
         block = self._block()
         distance = np.empty(len(self.table))
         for seen in halves(block):
@@ -262,9 +265,9 @@ class _Search:
         return distance
 
     def _block(self) -> NDArray[np.intp]:
-        """(n,) number of each point's block of time."""
+        """(n,) index of each point's time block."""
         return even_blocks(self.table.pair, self.table.n_pairs, min(BLOCKS, self.table.n_pairs))
 
     def _block_loss(self, distance: Array, scale: float) -> Array:
-        """(blocks,) mean Cauchy loss."""
+        """(blocks,) mean Cauchy loss of each block."""
         return group_means(loss(distance, scale), self._block())

@@ -1,4 +1,4 @@
-"""How much of a picture is worked on at a time, where several steps follow each other: it stays in the cache."""
+"""Processing of a picture in bands of rows, so that the data of successive steps stay in the cache."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from virest.image_formation.blur import Image
 
 BAND_ROWS = 64
 RowRenderer = Callable[[slice], Image]
-"""Grey levels of some rows of a picture, (rows, width, 3), from 0 to 255 and not rounded."""
+"""Renders some rows of a picture as grey levels, (rows, width, 3), 0 to 255 and not rounded."""
 
 
 def bands(height: int) -> Iterator[slice]:

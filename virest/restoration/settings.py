@@ -1,4 +1,4 @@
-"""What a restoration may be told."""
+"""Settings of a restoration, and the presets."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ DEBLUR_METHODS = (
     "hyper-laplacian-global",
 )
 JOINT_METHODS = ("gradient-wiener", "hyper-laplacian")
-"""Those that restore a frame together with its neighbours."""
+"""Methods that can restore a frame jointly with its neighbours."""
 SHUTTER_METHODS = ("none", "perspective", "rowwise")
 REFERENCES = ("exposure-start", "frame-middle")
 FEW_ITERATIONS = 2
-"""At or below this iteration count, use cheaper approximations elsewhere."""
+"""At or below this iteration count, cheaper approximations are used elsewhere too."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestorationSettings:
-    """How frames are restored; a preset is one such record."""
+    """How frames are restored; each preset is one such record."""
 
     preset: str = "balanced"
     deblur: str = "hyper-laplacian"
@@ -33,23 +33,24 @@ class RestorationSettings:
     reference: str = "exposure-start"
     """Time of the restored picture: exposure start of the first row read, or the frame's middle."""
     iterations: int = 4
-    """Of the iterative methods."""
+    """Iterations of the iterative methods."""
     joined_iterations: int = 5
     """Iteration limit for frames restored with neighbours: more measurements leave less to the prior."""
     inner_iterations: int = 4
-    """Of the whole-picture method: conjugate-gradient steps in each iteration."""
+    """Conjugate-gradient steps per iteration of ``hyper-laplacian-global``."""
     tile_px: int = 128
-    """Side of a tile; each has a kernel of its own."""
+    """Side of a tile; each has its own kernel."""
     strength: float = 1.0
-    """Multiplies the measured noise in the regularisation: 1 trusts it, more is smoother."""
+    """Factor on the measured noise in the regularisation: 1 uses it as measured, a larger value is smoother."""
     min_blur_px: float = 1.0
     """Frames whose longest blur path is shorter are not deblurred."""
     neighbours: int = 0
-    """A frame may be restored together with any of this many frames on each side."""
+    """Number of frames on each side among which neighbours for joint restoration are chosen."""
     most_joined: int = 6
-    """It is restored with at most this many of them, those that make up for what its own path cancels."""
+    """Largest number of neighbours used; those are chosen that best pass the frequencies that the frame's path cancels.
+    """
     undistort: bool = False
-    """Pictures of a pinhole with the profile's focal lengths and principal point: the lens's distortion is undone."""
+    """Correct lens distortion: output a pinhole picture with the profile's focal lengths and principal point."""
     keep_start_up: bool = False
     """Process the frames of the recorder's start-up too, although their content is later than their stamps."""
 

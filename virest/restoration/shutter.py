@@ -1,4 +1,4 @@
-"""Straightening: one warp from the picture whose rows were seen one after another to the picture of one instant."""
+"""Straightening: one warp from the picture with rows exposed at different times to the picture of one instant."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from virest.restoration.row_chunks import bands
 from virest.restoration.undistortion import distorted_points
 
 USUAL_SPACING_PX, LEAST_SPACING_PX = 16, 4
-"""Grid of a map; where it holds a lens's distortion, finer for wide lenses."""
+"""Largest and least grid spacing of a map that includes lens distortion; wide lenses need a finer grid."""
 LINES_OFF_PX = 0.01
-"""Largest error of linear interpolation over a grid's cells, in pixels."""
+"""Largest error of linear interpolation over a grid's cells, px."""
 
 
 def rowwise_map(motion: RowMotion, anchor: float, *, undistort: bool = False) -> NDArray[np.float32]:
-    """Where each pixel of the straightened picture was recorded, (height, width, 2): every row at its own time.
+    """Where each pixel of the straightened picture was recorded, (height, width, 2), with each row at its own time.
 
-    undistort: of the straightened picture of a pinhole, so that one warp reads what both steps move.
+    undistort: also correct lens distortion, so that one warp does both.
     """
     if not undistort:
         return dense_map(motion, anchor)
@@ -40,13 +40,13 @@ def rowwise_map(motion: RowMotion, anchor: float, *, undistort: bool = False) ->
 
 
 def _lens_spacing_px(motion: RowMotion) -> int:
-    """Grid over which a distortion bends by :data:`LINES_OFF_PX`: its slope changes by up to about 1 over f pixels."""
+    """Grid spacing at which interpolating the distortion errs by :data:`LINES_OFF_PX`: its curvature is up to 1 / f."""
     focal_px = min(motion.optics.lens.fx_px, motion.optics.lens.fy_px)
     return int(np.clip(np.sqrt(8 * LINES_OFF_PX * focal_px), LEAST_SPACING_PX, USUAL_SPACING_PX))
 
 
 def perspective_map(motion: RowMotion, anchor: float, *, undistort: bool = False) -> NDArray[np.float32]:
-    """The same by the paper's four corners (eqs 23-28): one homography between recorded and straightened corners."""
+    """As :func:`rowwise_map`, by the paper's homography between four recorded and straightened corners (eqs 23-28)."""
     width, height = motion.profile.width, motion.profile.height
     recorded = corner_points(width, height)
     straightened = straightened_points(motion, recorded, anchor)
@@ -63,9 +63,10 @@ def perspective_map(motion: RowMotion, anchor: float, *, undistort: bool = False
 
 
 def warp(picture: NDArray[np.uint8 | np.float32], source_px: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Cubic interpolation of grey levels of 255 at ``source_px``; where there are no data the edge is repeated.
+    """Resample grey levels, 0 to 255, at ``source_px`` by cubic interpolation; the picture's edges are replicated.
 
-    In floats, since OpenCV's fixed-point sums take half as long again; band by band: what is read stays in the cache.
+    It uses floats, since OpenCV's fixed-point arithmetic takes half as long again, and works band by band, so that the
+    data stay in the cache.
     """
     levels = picture.astype(np.float32, copy=False)
     warped = np.empty((*source_px.shape[:2], *picture.shape[2:]), np.uint8)
@@ -76,16 +77,15 @@ def warp(picture: NDArray[np.uint8 | np.float32], source_px: NDArray[np.float32]
 
 
 def rounded(levels: NDArray[np.float32], into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-    """The nearest of 256 grey levels."""
+    """Round to 8-bit grey levels."""
     return np.asarray(cv2.convertScaleAbs(cv2.max(levels, 0.0), into), np.uint8)
 
 
 def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int, int, int, int]:
-    """(x0, y0, x1, y1), x1 and y1 one past the end: a large rectangle whose every pixel was recorded.
+    """(x0, y0, x1, y1), x1 and y1 exclusive: a large rectangle in which every pixel was recorded; all 0 if none exists.
 
-    Its sides move in from the picture's own, always the one with the largest part of missing pixels.  The map is
-    smooth, so every ``step``-th pixel is looked at; the rectangle begins and ends on such pixels.
-    All 0 where there is none.
+    Starting from the whole picture, the side with the largest fraction of missing pixels is moved inwards, repeatedly.
+    The map is smooth, so only every ``step``-th pixel is tested; the rectangle begins and ends on such pixels.
     """
     height, width = source_px.shape[:2]
     columns, rows = _every(width, step), _every(height, step)

@@ -1,4 +1,4 @@
-"""How much of a restored picture to take: where it was blurred, and as far as it is to be trusted."""
+"""Weight of the restored picture in the output: by the local blur, and by the expected gain."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from virest.restoration.clipped_light import near_clipped
 from virest.restoration.statistics.records import PictureStatistics
 
 MIN_GAIN_DB = 0.1
-"""A picture of which the measured noise promises less is left alone: the promise is an ideal filter's."""
+"""Do not deblur a frame with a lower expected gain: the expectation is that of an ideal filter."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
-"""Part of a restored picture that is taken where next to nothing is to be gained, and gain from which all of it is."""
+"""Weight of the restored picture at an expected gain of 0 dB, and gain, dB, at which the weight reaches 1."""
 SURE_GAIN_DB = 3.0
-"""Above this gain the loss of gradients that the noise drowns does not matter."""
+"""Above this gain, dB, the loss of gradients that are weaker than the noise does not matter."""
 PART_STEP_PX = 80
 """Grid spacing of the minimum-blur test."""
 
 
-def too_little_to_gain(luma: PictureStatistics, expected_db: float) -> str:
-    """Why the picture is better left as it was recorded; empty: it is not."""
+def no_gain_reason(luma: PictureStatistics, expected_db: float) -> str:
+    """Why the picture is not deblurred; empty: it is."""
     if not luma.measured:
-        return "picture too small, or its blur too long, for its noise to be measured: left alone"
+        return "picture too small, or its blur too long, for its noise to be measured: not deblurred"
     if expected_db < MIN_GAIN_DB:
-        return f"deblurring is expected to gain only {max(expected_db, 0.0):.2f} dB, left alone"
+        return f"deblurring is expected to gain only {max(expected_db, 0.0):.2f} dB: not deblurred"
     return ""
 
 
 def blurred_part(motion: RowMotion, min_blur_px: float, tile_px: int) -> NDArray[np.float32] | np.float32:
-    """0 where the blur path is shorter than ``min_blur_px`` and nothing is to be gained, 1 from twice that on.
+    """Weight 0 where the blur path is shorter than ``min_blur_px``, rising to 1 at twice that length.
 
-    So too where it is shorter than the path changes from a tile's middle to its side, as around the centre of a turn
-    about the optical axis: the tile has the kernel of its middle.  tile_px: its side, 0 where kernels go over into each
-    other.  (height, width), or one number for all.
+    The limit is larger where the path changes by more than ``min_blur_px`` from a tile's centre to its side, as around
+    the centre of rotation about the optical axis: the tile uses its centre's kernel.  tile_px: side of a tile; 0 if
+    kernels vary smoothly.  Returns (height, width), or one number for the whole picture.
     """
     width, height = motion.profile.width, motion.profile.height
     x, y = (np.linspace(0, length - 1, max(2, length // PART_STEP_PX)) for length in (width, height))
@@ -53,22 +53,22 @@ def blurred_part(motion: RowMotion, min_blur_px: float, tile_px: int) -> NDArray
 
 
 def share_map(blurred: BlurredPicture, share: float) -> NDArray[np.float32] | np.float32:
-    """How much to take of each pixel: all along the streaks of clipped light, where what is gained is not the texture.
+    """Weight of each pixel: ``share``, rising to 1 along the streaks of clipped light, where the gain is not texture.
 
-    (height, width), or one number for all.
+    (height, width), or one number for the whole picture.
     """
     near = near_clipped(blurred) if share < 1.0 else None
     return np.float32(share) if near is None else np.float32(share) + np.float32(1.0 - share) * near
 
 
 def trusted_share(luma: PictureStatistics) -> float:
-    """How much of a restored picture to take, the rest being the recorded one.
+    """Weight of the restored picture in the output, 0 to 1; the rest is the recorded one.
 
-    Where little can be gained the regularisation's own error weighs as much as the blur; the two differ, so a mean of
-    both pictures is better than either.  Under noise about as large as the picture's own gradients (a very coarsely
-    coded movie) the prior wipes out texture that the recorded picture has; where much is promised that is little,
-    unless nothing stands out of the noise and the promise is empty.
+    With little expected gain, the regularisation's error is as large as the blur's.  The two errors differ, so a
+    mean of both pictures is better than either.  With noise as large as the picture's gradients (a very coarsely coded
+    movie), the prior removes texture that the recorded picture has.  This matters little if the expected gain is large,
+    unless the gradients are below the noise, so that the expectation is unreliable.
     """
     share = LEAST_SHARE + (1 - LEAST_SHARE) * min(1.0, luma.expected_gain_db / FULL_TRUST_DB)
     sure = min(1.0, luma.expected_gain_db / SURE_GAIN_DB) * min(1.0, luma.gradient_scale / luma.noise_levels)
-    return float(share * (1 - luma.drowned * (1 - sure)))
+    return float(share * (1 - luma.below_noise * (1 - sure)))

@@ -1,4 +1,4 @@
-"""How a picture is cut into tiles, and the noise that each of them is taken to have."""
+"""Layout of a picture's tiles, and the noise-to-signal ratio assumed for them."""
 
 from __future__ import annotations
 
@@ -17,51 +17,52 @@ from virest.restoration.statistics.on_tiles import on_spectrum, packed, packed_f
 from virest.restoration.statistics.records import PictureStatistics
 
 Surroundings = tuple[float, int, int]
+"""Fraction of the overlap that the margin is reduced by, least margin, px, and least bridge, px."""
 FULL_MARGIN, THIN_MARGIN, THINNEST_MARGIN = (0.0, 16, 16), (0.3, 4, 16), (0.3, 3, 12)
-"""What a tile sees around it is as long as the blur path, less this part of the tiles' overlap; its least length, px;
-and the least length of the tile's bridge.
+"""The margin is as long as the longest blur path, minus the given fraction of the overlap; the bridge is as long as the
+path.
 
-The bridge is as long as the path: a steep one is an edge that the deconvolution carries into the tile.  Where tiles
-overlap widely, a window's ramp gives next to no weight to what a margin would keep away; the thinnest margins are for
-pictures that are reduced.
+A short bridge is a steep edge, whose ringing would reach into the tile.  Where tiles overlap widely, the window's ramp
+gives almost no weight to what a margin would keep out.  THINNEST_MARGIN is for pictures at reduced size.
 """
 COARSE_OVERLAP, FINE_OVERLAP, WIDE_OVERLAP = 6, 4, 3
-"""Tiles overlap by this part of their side: those of colour, those of luma, and those of luma in few iterations."""
+"""Tile side over overlap: of colour, of luma, and of luma with few iterations."""
 MOST_WRONG, LEAST_TILE, LEAST_TILE_PX, FIELD_SAMPLES = 0.7, 0.7, 48.0, (6, 5)
-"""Error in noises that a tile's kernel may make of edges half a step away; part of the preset's side to which tiles
-shrink for their paths, and side to which they do for an uneven defocus; rows and columns of places at which the
-kernels' change is looked at."""
+"""Largest error at edges, in noise standard deviations, by using a tile's kernel half a tile step away; least fraction
+of the preset's side that varying paths shrink tiles to; least side, px, that uneven defocus shrinks them to; rows and
+columns of the grid on which the kernels' variation is evaluated."""
 OVERLAP_GIVE = 0.1
-"""Wide overlaps may be narrower by this part, where fewer tiles then reach to the picture's edge."""
+"""Wide overlaps may be narrower by this fraction, if fewer tiles then cover the picture."""
 BORDER_NOISE_TO_SIGNAL = 0.003
-"""Least N / S of tiles that see beyond the picture."""
+"""Least N / S of tiles that reach beyond the picture."""
 UNEVEN_NOISE_TO_SIGNAL = 0.03
-"""Least N / S of a picture whose power lies at few places: an error of the kernel there, or of what a tile sees around
-itself, is proportional to the power, and exceeds the noise."""
+"""Least N / S of a picture whose power lies at few frequencies: errors of the kernel or of a tile's surroundings are
+proportional to the power there, and exceed the noise."""
 
 
 STD_STEP_PX = 0.05
-"""Steps in which the deviation of a neighbour's place counts."""
+"""Step, px, to which registration deviations are rounded, so that their spectra can be cached."""
 
 
 def luma_tiles(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> tiles.TileDeconvolution:
-    """Tiles over the picture."""
-    path_holds_px, defocus_holds_px = _kernel_holds_px(blurred)
+    """Tiles over the picture's luma, smaller than the preset's where the kernels vary fast."""
+    path_side_px, defocus_side_px = _largest_sides_px(blurred)
     side_px = float(settings.tile_px)
     if around is not FULL_MARGIN:
-        side_px = float(np.clip(path_holds_px, LEAST_TILE * side_px, side_px))
-    side_px = min(side_px, max(defocus_holds_px, LEAST_TILE_PX))
+        side_px = float(np.clip(path_side_px, LEAST_TILE * side_px, side_px))
+    side_px = min(side_px, max(defocus_side_px, LEAST_TILE_PX))
     overlap_parts = FINE_OVERLAP if around is FULL_MARGIN else WIDE_OVERLAP
     return tile_deconvolution(blurred, int(side_px), overlap_parts, around=around)
 
 
-def _kernel_holds_px(blurred: BlurredPicture) -> tuple[float, float]:
-    """Side of a tile at whose middle's kernel half a step away, a third of its side, changes edges by a noise's worth.
+def _largest_sides_px(blurred: BlurredPicture) -> tuple[float, float]:
+    """Largest tile sides, px, for which the centre's kernel is accurate enough: for the paths, and for the defocus.
 
-    Of the paths, which change over the picture as the camera rolls and as the rows go by, and of the defocus, which a
-    lens makes softer towards the corners; under noise both matter less.
+    Half a tile step from the centre, a third of the side, the wrong kernel changes edges by MOST_WRONG noise standard
+    deviations.  Paths vary over the picture with camera roll and row time; defocus increases towards the corners.  With
+    more noise both matter less.
     """
     height, width = blurred.light[0].shape
     y, x = (
@@ -74,8 +75,8 @@ def _kernel_holds_px(blurred: BlurredPicture) -> tuple[float, float]:
     sigma_px = np.broadcast_to(field.defocus_sigma_px, len(field.paths_px)).reshape(len(y), len(x))
     softer = np.mean(np.hypot(*np.gradient(sigma_px, y, x)))
     wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
-    path_holds_px, defocus_holds_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer))
-    return path_holds_px, defocus_holds_px
+    path_side_px, defocus_side_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer))
+    return path_side_px, defocus_side_px
 
 
 def tile_deconvolution(
@@ -85,7 +86,7 @@ def tile_deconvolution(
     scale: float = 1.0,
     around: Surroundings = FULL_MARGIN,
 ) -> tiles.TileDeconvolution:
-    """Tiles over the picture, or over one that is ``scale`` times smaller, with kernels to its measure."""
+    """Tiles over the picture, or over one ``scale`` times smaller, with kernels scaled to match."""
     height, width = (int(np.ceil(length / scale)) for length in blurred.light[0].shape)
     per_overlap, least_margin_px, least_bridge_px = around
     seen_px = blurred.longest_px - per_overlap * side / overlap_parts
@@ -107,7 +108,7 @@ def noise_to_signal(
     statistics: PictureStatistics,
     scale: float = 1.0,
 ) -> tuple[Image, Image]:
-    """Measured N / S on a tile's spectrum: for tiles inside the picture, and for those that see beyond it."""
+    """Measured N / S on a tile's packed spectrum: for tiles inside the picture, and for those that reach beyond it."""
     ratio = on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size, scale)
     guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)
     if statistics.unevenness:
@@ -128,28 +129,29 @@ def join_neighbours(
 ) -> None:
     """Add the neighbours to the data term of all tiles.
 
-    own: channels of the frame, at the deconvolution's scale.  channels: of a neighbour.  ratio: N / S of a tile.
+    own: the frame's channels, at the deconvolution's scale.  channels: gives those of a neighbour.  ratio: N / S on a
+    tile's packed spectrum.
     """
     if not blurred.neighbours:
         return
     centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
-    size, lamps, further = own[0].shape[::-1], _lit_by_lamps(blurred), []
+    size, highlights, further = own[0].shape[::-1], _reached_by_highlights(blurred), []
     for neighbour in blurred.neighbours:
-        one = neighbour.place
+        one = neighbour.registration
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
         stds_px = STD_STEP_PX * np.round(one.std_at_px(centres_px) / STD_STEP_PX)
         kept = [_kept_sharpness(std_px / scale, deconvolution.size) for std_px in stds_px.tolist()]
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
-        if lamps is not None:
-            trust[cv2.resize(lamps, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
-        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, one.finer))
+        if highlights is not None:
+            trust[cv2.resize(highlights, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
+        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, one.coding_noise_ratio))
     deconvolution.join(own, further, ratio)
 
 
-def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
-    """1.0 where light that is clipped in the frame may reach in any neighbour, (height, width); None: nowhere.
+def _reached_by_highlights(blurred: BlurredPicture) -> Image | None:
+    """1.0 where the frame's clipped highlights may reach in any neighbour, (height, width); None: nowhere.
 
-    It was taken out of the frame's tiles, and the neighbour still has it.
+    They were removed from the frame's tiles, but not from the neighbours.
     """
     if blurred.holes is None:
         return None
@@ -159,6 +161,6 @@ def _lit_by_lamps(blurred: BlurredPicture) -> Image | None:
 
 @lru_cache(maxsize=128)
 def _kept_sharpness(shift_std_px: float, size: int) -> tuple[Image, Image]:
-    """What is left on average of a picture that lies this far off, each axis, on a packed spectrum: s, and 1 − s²."""
+    """Mean attenuation s by a registration error of this deviation per axis, packed (size, size), and 1 − s²."""
     kept = np.exp(-0.5 * (2 * np.pi * shift_std_px * packed_frequency(size)) ** 2)
     return kept, 1 - kept * kept

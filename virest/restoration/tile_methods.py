@@ -1,4 +1,4 @@
-"""Methods that restore a picture tile by tile: filters, and the hyper-Laplacian by half-quadratic splitting."""
+"""Methods that restore a picture tile by tile: linear filters, and the hyper-Laplacian by half-quadratic splitting."""
 
 from __future__ import annotations
 
@@ -31,19 +31,20 @@ from virest.restoration.tile_layout import (
 )
 
 REDUCTIONS = (1.5, 4 / 3)
-"""Reductions of the picture that lose nothing with few iterations where noise hides all finer detail."""
+"""Size reductions tried with few iterations; they lose nothing where noise hides all finer detail."""
 FEW_SCALE = 0.6
-"""Few steps do not reach as far into the weak gradients; a smaller unit compensates for that."""
+"""Factor on the gradient unit with few iterations: they do not converge for weak gradients, and this compensates."""
 FIRST_BETA, LAST_BETA, FEW_BETAS = 0.2, 12.0, (0.25, 1.0)
-"""Penalties of the splitting, in units of the gradients' own scale; those of few iterations."""
+"""First and last penalty of the splitting, in units of the gradients' own scale, and all of those with few iterations.
+"""
 RESIDUAL_SHARE = 0.05
-"""Part of the picture's power that a residual holds: texture too faint for the sparse prior."""
+"""Fraction of the picture's power in the residual: texture too faint for the sparse prior."""
 LINEAR_SHARE = 0.5
-"""Of a picture whose power lies at few places, the linear filter's part: the prior makes its waves steps."""
+"""Weight of the linear filter for a picture whose power lies at few frequencies: the prior turns its waves to steps."""
 
 
 def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
-    """One linear filter for each tile."""
+    """Luma by one linear filter per tile."""
     deconvolution = luma_tiles(blurred, settings)
     projected = _projected_luma(blurred, deconvolution, settings)
     factors = _tile_factors(deconvolution, settings, blurred.statistics)
@@ -54,7 +55,7 @@ def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> Ro
 def _tile_factors(
     deconvolution: tiles.TileDeconvolution, settings: RestorationSettings, statistics: PictureStatistics
 ) -> Iterator[Image]:
-    """What follows conj(K) in each tile: by the method that the settings name, the measured N / S one by default."""
+    """Each tile's factor after conj(K) for the method in the settings; by default Wiener with the measured N / S."""
     match settings.deblur:
         case "inverse":
             return deconvolution.filters(tiles.inverse_filter)
@@ -62,7 +63,7 @@ def _tile_factors(
             weight = statistics.frequency
             flat = float(np.sum(statistics.noise * weight) / np.sum(statistics.signal * weight))
             ratio = np.full((deconvolution.size,) * 2, settings.strength**2 * flat, np.float32)
-            ratio[0, 0] = 0.0  # the mean is no noise
+            ratio[0, 0] = 0.0  # keep the mean unchanged
             return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
     ratio, guarded = noise_to_signal(deconvolution, settings, statistics.between_rings_and_level)
     return deconvolution.filters(
@@ -73,7 +74,7 @@ def _tile_factors(
 def _projected_luma(
     blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
 ) -> Image:
-    """Spectra of Kᵀ g, (tiles, size, size), with those of the neighbours; tiles with clipped light are tamed."""
+    """Spectra of Kᵀ g, (tiles, size, size), neighbours included; clipped highlights are removed from the tiles."""
     luma, holes = luma_of(blurred.light), blurred.holes
     if holes is not None:
         numbers = deconvolution.touched(holes)
@@ -86,7 +87,7 @@ def _projected_luma(
 
 
 def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
-    """Hyper-Laplacian for the luma, measured Wiener for the colour differences."""
+    """Hyper-Laplacian for the luma, Wiener filter with the measured N / S for the colour differences."""
     times = _reduction(blurred.statistics, settings)
     if times == 1.0:
         around = THIN_MARGIN if settings.iterations <= FEW_ITERATIONS else FULL_MARGIN
@@ -96,7 +97,7 @@ def by_tile_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettin
 
 
 def _reduction(statistics: PictureStatistics, settings: RestorationSettings) -> float:
-    """How many times smaller the luma is restored: as much as loses nothing that stands out of the noise."""
+    """How many times smaller to restore the luma: as much as loses no detail above the noise."""
     few = settings.iterations <= FEW_ITERATIONS
     return next((times for times in REDUCTIONS if few and statistics.finest < 0.5 / times), 1.0)
 
@@ -106,8 +107,8 @@ def tile_hyper_laplacian(
 ) -> Image:
     """The sharp luma, (height, width): Krishnan & Fergus 2009, each step over all tiles.
 
-    Few iterations give back no texture that the prior took for noise: where noise drowns the gradients, the linear
-    filter's picture, which weighs them frequency by frequency, takes the prior's place.
+    With few iterations, texture that the prior removed as noise is not restored afterwards.  The result is blended with
+    the linear filter's, which weighs each frequency by its own N / S, the more the noise hides the gradients.
     """
     deconvolution = luma_tiles(blurred, settings, around)
     statistics, few = blurred.statistics, settings.iterations <= FEW_ITERATIONS
@@ -131,14 +132,14 @@ def tile_hyper_laplacian(
         if step == len(betas) - 1 and not few:
             solved = _with_residual(deconvolution, projected, solved, statistics)
         sharp = deconvolution.blend(solved)
-    share = max(LINEAR_SHARE * statistics.unevenness, statistics.drowned if few else 0.0)
+    share = max(LINEAR_SHARE * statistics.unevenness, statistics.below_noise if few else 0.0)
     if share:
         sharp = cv2.addWeighted(linear, share, sharp, 1 - share, 0.0)
     return deconvolution.restore_highlights(sharp)
 
 
 def _extra_noise(statistics: PictureStatistics, size: int) -> Image | np.float32:
-    """N / S beyond that of the rings: a prior of gradients lets noise through where a grating leaves nothing."""
+    """N / S per frequency beyond that of the rings: the gradient prior passes noise at frequencies a grating lacks."""
     if not statistics.unevenness:
         return np.float32(0)
     rings = on_spectrum(statistics, statistics.noise_to_signal, size, by_place=False)
@@ -150,7 +151,7 @@ def _extra_noise(statistics: PictureStatistics, size: int) -> Image | np.float32
 
 
 def _extrapolated(sharp: Image, before: Image, step: int) -> Image:
-    """The picture on along its last step, by more as the steps settle: it takes two thirds as many of them.
+    """The picture extrapolated along its last step, further as the iterations converge: it saves a third of them.
 
     Nesterov 1983's momentum, as Beck and Teboulle 2009 (doi:10.1137/080716542) apply it to shrinkage.
     """
@@ -159,7 +160,7 @@ def _extrapolated(sharp: Image, before: Image, step: int) -> Image:
 
 
 def _border_noise(blurred: BlurredPicture) -> float:
-    """Noise to assume where tiles see beyond the picture, grey levels: what is guessed there is a rough guess.
+    """Noise, grey levels, to assume where tiles reach beyond the picture, whose content there is a rough guess.
 
     A weakly regularised inverse would carry the guess's error many blur lengths inwards.
     """
@@ -171,9 +172,9 @@ def _border_noise(blurred: BlurredPicture) -> float:
 def _with_residual(
     deconvolution: tiles.TileDeconvolution, projected: Image, solved: Iterable[Image], statistics: PictureStatistics
 ) -> Iterator[Image]:
-    """Each tile's spectrum with fine texture that the prior took for noise.
+    """Each tile's spectrum with the fine texture added that the prior removed as noise.
 
-    That is the residual g − K f, filtered as a picture of little power.  Good until the next.
+    That is the residual g − K f, filtered as a picture of little power.  A spectrum is valid until the next.
     """
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
     guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
@@ -187,9 +188,9 @@ def _with_residual(
 
 
 def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:
-    """Dᵀ w, with w the shrunk gradients; factors: w / v over |v| · 32, as :func:`shrinkage_levels` tabulates it.
+    """Dᵀ w, with w the shrunk gradients; factors: w / v at |v| · LEVELS_PER_UNIT, from :func:`shrinkage_levels`.
 
-    Band by band: what is worked on stays in the cache.
+    It works band by band, so that the data stay in the cache.
     """
     pull = np.zeros_like(sharp)
     for rows in bands(len(sharp)):
@@ -203,7 +204,7 @@ def _gradient_targets(sharp: Image, scale: Image, factors: Image) -> Image:
 def _pull_along(
     behind: Image, ahead: Image, steepness: Image, factors: Image, pull_behind: Image, pull_ahead: Image
 ) -> None:
-    """Add the shrunk gradient between neighbours to the pull on the one ahead, and take it from the one behind."""
+    """Add the shrunk gradient between adjacent pixels to the one ahead, and subtract it from the one behind."""
     if not len(behind):
         return
     gradient = cv2.subtract(ahead, behind)
@@ -214,7 +215,7 @@ def _pull_along(
 
 
 def beta_schedule(iterations: int, first: float = FIRST_BETA) -> tuple[float, ...]:
-    """Rising penalties of the half-quadratic splitting, in units of the gradients' own scale."""
+    """Increasing penalties of the half-quadratic splitting, in units of the gradients' own scale."""
     if iterations <= FEW_ITERATIONS:
         return FEW_BETAS[-max(iterations, 1) :]
     return tuple(float(b) for b in np.geomspace(first, LAST_BETA, iterations))

@@ -1,8 +1,8 @@
 """Deconvolution tile by tile in the Fourier domain.
 
-A tile is a window of the picture with a margin around it, closed to a period by a smooth bridge, so that nothing rings
-in from a border that is not there.  Its spectrum is kept in OpenCV's packed form, real and imaginary parts side by
-side, so real filters are plain products.
+A tile is a window of the picture with a margin around it, made periodic by a smooth bridge, so that no artificial edge
+causes ringing.  Its spectrum is kept in OpenCV's packed form, real and imaginary parts side by side, so real filters
+are plain products.
 """
 
 from __future__ import annotations
@@ -21,43 +21,44 @@ from virest.image_formation.blur import FAST_SIZES, Image, TileGrid, fast_size, 
 from virest.restoration.deconvolution import richardson_lucy
 
 LEAST_SIDE, LARGEST_SIDE = 0.8, 1.15
-"""Least and largest side of tiles over the requested one, where that makes their transforms fast."""
+"""Least and largest side of tiles, relative to the requested one, when searching for a fast transform size."""
 LITTLE_LONGER = 1.05
-"""Time that tiles may take over the quickest ones, where their side is nearer to what was asked for."""
+"""Accept a grid that takes up to this many times the fastest one's time if its side is nearer to the requested one."""
 SETTLING_ITERATIONS, SETTLING_RELAXATION = 4, 1.7
-"""About as good as seven plain steps of Richardson-Lucy's."""
-LAMP_DOUBT = 0.02
+"""About as good as seven plain Richardson–Lucy steps."""
+HIGHLIGHT_BLEND_LEVEL = 0.02
 """Highlight level, in units of the recorded range, at which the blend is half Richardson–Lucy."""
 LEAST_TRUSTED = 0.3
-"""Part of a tile that must be trusted for it to be joined: less is not worth its transforms."""
+"""Least mean trust of a tile for a further picture to be joined to it: below, it is not worth the transforms."""
 Filter = Callable[[Image], Image]
-"""Turns a kernel's power spectrum |K|² (packed, real parts doubled) into the real factor that follows conj(K)."""
+"""Turns a kernel's |K|² (packed, each value on both parts) into the real factor to be applied after conj(K)."""
 
 
 @dataclass(frozen=True, slots=True)
 class FurtherPicture:
-    """Another picture of the scene that some tiles show, brought to their picture's pixels."""
+    """Another picture of the same scene, registered to the pixels of the tiles' picture."""
 
     channels: Sequence[Image]
     """(height, width) each."""
     kernels: Image
     """(tiles, k, k)."""
     sharpness: Sequence[tuple[Image, Image]]
-    """What its uncertain place leaves of it on average in each tile, a packed real factor s, and 1 − s²."""
+    """Mean attenuation by its registration error, per tile: a packed real factor s, and 1 − s²."""
     trust: Image
     """(height, width) 0 to 1."""
     weight: float = 1.0
-    """Of all that is trusted."""
+    """Multiplies the trust."""
 
 
 LEAST_RATIO = 1e-12
-"""Added to N / S, which is 0 for a mean."""
+"""Keeps divisors above 0 where N / S is 0, as at frequency 0."""
 
 
 class TileDeconvolution:
-    """Windows, margins and kernels of one picture, ready to filter any number of its channels.
+    """Windows, margins and kernels of one picture, to filter any number of its channels.
 
-    Methods that give spectra give them one by one: a tile that is filtered and blended at once stays in the cache.
+    Methods that return iterators yield one spectrum at a time: a tile that is filtered and blended at once stays in
+    the cache.
     """
 
     def __init__(
@@ -68,9 +69,9 @@ class TileDeconvolution:
         bridge: int | None = None,
         variance: Callable[[int], Image] | None = None,
     ) -> None:
-        """bridge: its least length; None: the margin's.  variance: Var K on a packed spectrum; None: kernels are known.
+        """bridge: its least length, px; None: the margin.  variance: Var K on a packed spectrum; None: exact kernels.
 
-        With E[K] for K and E|K|² for |K|², all that follows minimises the expected data term.
+        With E[K] for K and E|K|² for |K|², all filters minimise the expected data term.
         """
         self.grid = grid
         self.margin = margin
@@ -87,33 +88,33 @@ class TileDeconvolution:
         self._bridge = _bridge(self.size - self.patch)
         self._tile, self._spectrum, self._divisor = np.empty((3, self.size, self.size), np.float32)
         self.kernels = np.empty((len(kernels), self.size, self.size), np.float32)
-        """Packed spectra, (tiles, size, size): of the flipped kernels, see :func:`_kernel_spectra`."""
+        """(tiles, size, size) packed spectra, see :func:`_kernel_spectra`."""
         self.powers = np.empty_like(self.kernels)
-        """Their E|K|², as real factors."""
+        """(tiles, size, size) E|K|², as real factors."""
         for _ in map(_power_inside, _kernel_spectra(kernels, self.size, self.kernels), self.powers):
             pass
         _power_at_ends(self.kernels, self.powers)
         if variance is not None:
             self.powers += variance(self.size)
         self._joined: list[Image] = []
-        """Σ w K_kᵀ g_k of all pictures, (tiles, size, size) spectra of each channel; none: there are no others."""
+        """Σ w K_kᵀ g_k over all pictures: per channel, (tiles, size, size) spectra; empty: no further pictures."""
         self._without_highlights: dict[int, Image] = {}
-        """Spectra of tiles as they were recorded but for their lamps, by number."""
+        """By tile number: spectrum of the recorded tile with its clipped highlights removed."""
         self._rest: dict[int, Image] = {}
-        """Spectra of what those steps found beside the lamps."""
+        """By tile number: spectrum of the Richardson–Lucy solution without the highlights."""
         self._highlights: dict[int, tuple[Image, Image]] = {}
-        """How much of the steps' own light to take in those tiles, and that light, (side, side) each."""
+        """By tile number: weight of the Richardson–Lucy solution and its weighted light, (side, side) each."""
 
     def filters(self, make: Filter, at_border: Filter | None = None) -> Iterator[Image]:
-        """The packed real factor of each tile; ``at_border`` makes those of tiles that see beyond the picture."""
+        """The packed real factor of each tile; ``at_border`` makes it for tiles that reach beyond the picture."""
         for power, border in zip(self.powers, self.at_border, strict=True):
             yield (at_border or make)(power) if border else make(power)
 
     def back_projected(self, channel: Image, number_joined: int = 0) -> Image:
-        """Spectra of Kᵀ g, (tiles, size, size); channel (height, width) is extended, never wrapped.
+        """Spectra of Kᵀ g, (tiles, size, size); channel (height, width) is extended by replication, never wrapped.
 
-        number_joined: which of the channels that were joined it is: what was summed up then is returned.
-        Of tamed tiles, g is what they would have recorded without their lamps.
+        After :meth:`join`, the sum over all pictures for the channel ``number_joined`` instead.  In tiles whose
+        highlights were removed, g is the recorded light without them.
         """
         if self._joined:
             return self._joined[number_joined]
@@ -128,25 +129,24 @@ class TileDeconvolution:
         return projected
 
     def _recorded(self, padded: Image, number: int, corner: tuple[int, int]) -> Image:
-        """Spectrum of what a tile recorded, or would have without its lamps; good until the next."""
+        """Spectrum of a recorded tile, without its highlights where these were removed; valid until the next call."""
         spectrum = self._without_highlights.get(number)
         return transforms.forward(self.periodic(padded, *corner), self._spectrum) if spectrum is None else spectrum
 
     def join(self, channels: Sequence[Image], further: Sequence[FurtherPicture], ratio: Image) -> None:
-        """Take further pictures of the same scene into account; channels (height, width) of the tiles' own picture.
+        """Add further pictures of the same scene to the data term; channels (height, width) of the tiles' own picture.
 
-        What an uncertain place makes wrong, (1 − s²) |K|² of the signal, is noise of its own beside that of a frame,
-        N / S ``ratio``, and the further picture weighs as much less; the power |K|² stays, as in any expected data
-        term.  A tile weighs by its mean trust.  Where it is left out there stands in its place what the linear filter
-        finds in the tile without it, blurred as the other is, which says nothing new: pictures that are trusted all
-        over a tile come first.
+        Registration error acts as extra noise, (1 − s²) |K|² of the signal, beside the frame's own, N / S ``ratio``,
+        and reduces the further picture's weight accordingly.  Its power |K|² stays, as in any expected data term.  A
+        tile weighs by its mean trust.  Untrusted pixels are replaced by the linear filter's estimate from the pictures
+        joined so far, blurred by the further picture's kernel, which adds no information; so pictures that are trusted
+        all over a tile are joined first.
 
-        What the others add counts as the noise that they may share allows, since a coder repeats a still scene with its
-        noise.  Noise N common to all is projected back to |Σ w K|² N, where independent noise makes Σ w |K|² N: that is
-        no less along different paths, and along one path nothing is gained.  The data term weighs by the ratio of both,
-        at most 1.
+        Noise may be common to all pictures, since a coder repeats a still scene with its noise.  Common noise N is
+        back-projected to |Σ w K|² N, independent noise to Σ w |K|² N.  Along different paths the former is no larger;
+        along one path it is, and nothing is gained.  The data term is weighted by the ratio of the two, at most 1.
 
-        Tile by tile, so that what is worked on stays in the cache.
+        The work is done tile by tile, so that the data stay in the cache.
         """
         padded = [self.padded(channel) for channel in channels]
         others = [_Joining(self, one) for one in further]
@@ -176,7 +176,7 @@ class TileDeconvolution:
                 cv2.multiply(spectrum, evidence, spectrum)
 
     def touched(self, mask: Image) -> list[int]:
-        """Numbers of the tiles that see anything of a mask (height, width)."""
+        """Numbers of the tiles that overlap a mask (height, width), margins included."""
         padded, patch = self.padded(mask), self.patch
         return [
             number
@@ -187,13 +187,13 @@ class TileDeconvolution:
     def remove_highlights(
         self, numbers: list[int], kernels: Image, channel: Image, weight: Image, top_light: float
     ) -> None:
-        """Take the lamps out of some tiles: what is left is a picture of ordinary light, all of it recorded.
+        """Remove clipped highlights from some tiles, so that only light within the recorded range is left.
 
-        Around a lamp a linear filter rings, since the light that is missing there is many times what was recorded;
-        Richardson-Lucy's multiplicative steps keep light positive and leave the dark beside it alone.  They find the
-        light f; then f = lamp + rest, the lamp being what exceeds ``top_light``, and the blurred rest is g − K lamp
-        where that was measured, and K rest where it was not.  kernels: of these tiles, nowhere negative.  channel,
-        weight: (height, width); the bridges have no weight.
+        A linear filter rings around a highlight, since the missing light there is many times what was recorded.
+        Richardson–Lucy's multiplicative steps keep light positive and do not change the dark surroundings.  They
+        estimate the light f = highlight + rest, where the highlight is the part above ``top_light``.  The blurred rest
+        is then g − K highlight where g was measured, and K rest elsewhere.  kernels: of these tiles, non-negative.
+        channel, weight: (height, width); the bridges have weight 0.
         """
         light, weights = self.padded(channel), self.padded(weight)
         corners, patch, margin = list(self.grid.corners()), self.patch, self.margin
@@ -205,48 +205,49 @@ class TileDeconvolution:
             found = _sharpened(recorded, kernel, measured)
             rest = cv2.min(found, top_light)
             self._rest[number] = transforms.forward(rest)
-            lamp = cv2.subtract(found, rest)
-            blurred_rest, blurred_lamp = (_through(part, self.kernels[number], True) for part in (rest, lamp))
-            left_over = recorded - blurred_lamp - blurred_rest
+            highlight = cv2.subtract(found, rest)
+            blurred_rest, blurred_highlight = (_through(part, self.kernels[number], True) for part in (rest, highlight))
+            left_over = recorded - blurred_highlight - blurred_rest
             self._without_highlights[number] = transforms.forward(
                 cv2.add(blurred_rest, cv2.multiply(measured, left_over))
             )
-            near = cv2.max(_through(blurred_lamp, self.kernels[number], False), 0.0)
-            share = near / (near + np.float32(LAMP_DOUBT * top_light))
+            near = cv2.max(_through(blurred_highlight, self.kernels[number], False), 0.0)
+            share = near / (near + np.float32(HIGHLIGHT_BLEND_LEVEL * top_light))
             inner = np.s_[margin : margin + self.grid.side, margin : margin + self.grid.side]
-            self._highlights[number] = share[inner].copy(), (lamp + share * rest)[inner]
+            self._highlights[number] = share[inner].copy(), (highlight + share * rest)[inner]
 
     def restore_highlights(self, picture: Image) -> Image:
-        """A picture (height, width) restored from tamed tiles, with the lamps that were taken out of them.
+        """A picture (height, width) restored from tiles without highlights, with the highlights put back.
 
-        Along a lamp's streak the steps' own light is taken: what the movie's codec got wrong there is a part of the
-        lamp's light, and a linear filter would carry it on.
+        Along a highlight's streak the Richardson–Lucy solution is used: the codec's error there is proportional to the
+        highlight's light, and a linear filter would spread it.
         """
         if not self._highlights:
             return picture
         grid, side = self.grid, self.grid.side
-        shares, lamps = np.zeros((2, grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
+        shares, highlights = np.zeros((2, grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
         corners = list(grid.corners())
         for number, parts in self._highlights.items():
             top, left = corners[number]
-            for part, whole in zip(parts, (shares, lamps), strict=True):
+            for part, whole in zip(parts, (shares, highlights), strict=True):
                 cv2.accumulateProduct(part, self._windows[number], whole[top : top + side, left : left + side])
-        shares, lamps = (whole[: grid.height, : grid.width] for whole in (shares, lamps))
-        return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), lamps)
+        shares, highlights = (whole[: grid.height, : grid.width] for whole in (shares, highlights))
+        return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), highlights)
 
     def solutions(self, projected: Iterable[Image], inner: Image, at_border: Image) -> Iterator[Image]:
-        """Each tile's spectrum over |K|² + R, with the regularisation R of tiles inside and of those at the border.
+        """Each tile's spectrum over |K|² + R; R: regularisation, ``inner`` or ``at_border``.
 
-        Good until the next, as those of :meth:`pulled` are.
+        A spectrum is valid until the next is requested, as those of :meth:`pulled` are.
         """
         divisor = self._divisor
         for spectrum, power, border in zip(projected, self.powers, self.at_border, strict=True):
             yield cv2.divide(spectrum, cv2.add(power, at_border if border else inner, divisor), divisor)
 
     def pulled(self, projected: Iterable[Image], pull: Image, inner: float, at_border: float) -> Iterator[Image]:
-        """Each tile's spectrum plus that of a picture (height, width) times a factor, of tiles inside or at the border.
+        """Each tile's spectrum plus a factor times that of ``pull`` (height, width).
 
-        Beyond its edges the picture is 0, and so it is on a tile's bridge: there the solution is a guess anyway.
+        The factor is ``inner`` or ``at_border``.  Beyond the picture's edges and on the bridges ``pull`` counts as 0:
+        there the solution is a guess anyway.
         """
         padded, patch = self.padded(pull, cv2.BORDER_CONSTANT), self.patch
         tile, spectrum = np.zeros_like(self._tile), self._spectrum
@@ -256,7 +257,7 @@ class TileDeconvolution:
             yield cv2.scaleAdd(spectrum, at_border if border else inner, back, spectrum)
 
     def blend(self, spectra: Iterable[Image]) -> Image:
-        """Tiles back into one picture (height, width), through the windows."""
+        """Transform tiles back and blend them, weighted by the windows, into one picture (height, width)."""
         grid, side, margin = self.grid, self.grid.side, self.margin
         result = np.zeros((grid.tops[-1] + side, grid.lefts[-1] + side), np.float32)
         tile = self._tile
@@ -267,14 +268,14 @@ class TileDeconvolution:
         return result[: grid.height, : grid.width]
 
     def padded(self, channel: Image, border: int = cv2.BORDER_REPLICATE) -> Image:
-        """The channel with the margin that the outermost tiles need; border: what OpenCV fills it with."""
+        """The channel with the margin that the outermost tiles need; border: OpenCV's border mode."""
         grid, margin = self.grid, self.margin
         below = grid.tops[-1] + grid.side + margin - grid.height
         right = grid.lefts[-1] + grid.side + margin - grid.width
         return cv2.copyMakeBorder(channel, margin, below, margin, right, border)
 
     def periodic(self, padded: Image, top: int, left: int) -> Image:
-        """One tile with its margin, bridged from each edge to the opposite one, (size, size); good until the next."""
+        """One tile with its margin, bridged from each edge to the opposite one, (size, size); valid until the next."""
         patch, tile, bridge = self.patch, self._tile, self._bridge
         tile[:patch, :patch] = padded[top : top + patch, left : left + patch]
         np.matmul(tile[:patch, patch - 1 :: 1 - patch], bridge, out=tile[:patch, patch:])
@@ -283,7 +284,7 @@ class TileDeconvolution:
 
 
 class _Joining:
-    """A further picture while it is joined to tiles."""
+    """A further picture while it is being joined to the tiles."""
 
     def __init__(self, tiles: TileDeconvolution, picture: FurtherPicture) -> None:
         self._tiles, self._sharpness = tiles, picture.sharpness
@@ -293,9 +294,9 @@ class _Joining:
         bounds = [cv2.minMaxLoc(part)[:2] for part in parts]
         means = [cv2.mean(part)[0] for part in parts]
         self.used = [mean > LEAST_TRUSTED for mean in means]
-        """Tiles that it is joined to."""
+        """(tiles,) whether it is joined to a tile."""
         self.whole = [least > 0 for least, _ in bounds]
-        """Those without a place where it is left out."""
+        """(tiles,) whether it is trusted all over a tile."""
         self._weights, self._most = [picture.weight * mean for mean in means], [most for _, most in bounds]
         chosen = picture.kernels[np.array(self.used, bool)]
         self._spectra = _kernel_spectra(chosen, tiles.size, repeat(np.empty_like(tiles.powers[0])))
@@ -309,15 +310,15 @@ class _Joining:
         projected: Sequence[Image],
         buffers: Image,
     ) -> None:
-        """Add it to a tile's power and projected channels, and w K to the second of the buffers; tiles in order.
+        """Add it to a tile's power and projected channels, and w K to the second buffer; call with tiles in order.
 
-        known: what is known of the sharp channels without it.  ratios: N / S, and the same and a little more.
+        known: spectra of the sharp channels estimated without it.  ratios: N / S, and the same plus LEAST_RATIO.
         """
         one, sums, weight, back = buffers
         kernel = next(self._spectra)
         tiles, corner, share = self._tiles, self._corners[number], None
         if not self.whole[number]:
-            share = np.zeros_like(one)  # a bridge is no measurement
+            share = np.zeros_like(one)  # 0 on the bridge, which is not a measurement
             top, left = corner
             part = self._trusted[top : top + tiles.patch, left : left + tiles.patch]
             cv2.multiply(part, 1 / self._most[number], share[: tiles.patch, : tiles.patch])
@@ -341,7 +342,7 @@ class _Joining:
 
 
 def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
-    """Richardson-Lucy over a periodic tile."""
+    """Richardson–Lucy on a periodic tile."""
 
     def blur(sharp: Image) -> Image:
         return _through(sharp, kernel, True)
@@ -353,16 +354,16 @@ def _sharpened(tile: Image, kernel: Image, weight: Image) -> Image:
 
 
 def _through(picture: Image, kernel: Image, forward: bool) -> Image:
-    """A periodic tile blurred by a kernel's spectrum, or with ``forward`` False, by its transpose."""
+    """A periodic tile blurred by a kernel's spectrum, or by the transpose if ``forward`` is False."""
     return transforms.inverse(cv2.mulSpectrums(transforms.forward(picture), kernel, 0, conjB=forward))
 
 
 @lru_cache(maxsize=64)
 def quick_grid(height: int, width: int, side: int, around: int, overlap_parts: int, give: float = 0.0) -> TileGrid:
-    """Tiles of about ``side``, of a size at which all their transforms together take little time.
+    """Tiles of about ``side`` px, of a size at which all their transforms together are fast.
 
-    They overlap by a part of their side, 1 / overlap_parts, or by up to ``give`` of that less.  around: rows or columns
-    that come on top of each tile's, its margins and its bridge.
+    They overlap by side / overlap_parts, or by up to the fraction ``give`` less.  around: rows or columns that margins
+    and bridge add to each tile.
     """
     sides = [size - around for size in FAST_SIZES]
     fitting = [s for s in sides if LEAST_SIDE * side <= s <= LARGEST_SIDE * side] or [side]
@@ -377,9 +378,9 @@ def quick_grid(height: int, width: int, side: int, around: int, overlap_parts: i
 
 
 def _kernel_spectra(kernels: Image, size: int, into: Iterable[Image] | None = None) -> Iterator[Image]:
-    """Spectra of the *flipped* use: conj, so that mulSpectrums applies the transpose of a correlation.
+    """Packed spectra of kernels that the blur applies by correlation: a plain product applies the blur's transpose.
 
-    into: where to put them, (size, size) each.
+    into: output arrays, (size, size) each.
     """
     radius = kernels.shape[1] // 2
     buffer = np.zeros((size, size), np.float32)
@@ -392,24 +393,24 @@ def _kernel_spectra(kernels: Image, size: int, into: Iterable[Image] | None = No
 
 
 def _bridge(length: int) -> Image:
-    """Weights of the last and of the first sample on the way from the one to the other, (2, length)."""
+    """Weights (2, length) of a tile's last and first sample along the smooth bridge between them."""
     rise = (np.arange(length, dtype=np.float32) + 1) / (length + 1)
     smooth = rise * rise * (3 - 2 * rise)
     return np.stack([1 - smooth, smooth]).astype(np.float32)
 
 
 def _power_inside(spectrum: Image, power: Image) -> None:
-    """Write |K|² of all numbers but those of :func:`_ends`, as a real factor for packed spectra.
+    """Write |K|² of all numbers except those of :func:`_ends`, as a real factor for packed spectra.
 
-    OpenCV's own products take nearly twice as long, since they do not use the processor's vectors.
+    OpenCV's own products take nearly twice as long, since they are not vectorised.
     """
     numbers, powers = _inner_numbers(spectrum), _inner_numbers(power)
     np.multiply(numbers, np.conjugate(numbers, out=powers), out=powers)
-    powers *= np.complex64(1 + 1j)  # what is real, onto the imaginary places too
+    powers *= np.complex64(1 + 1j)  # copy the real part to the imaginary one
 
 
 def _power_at_ends(spectrum: Image, power: Image) -> None:
-    """Write |K|² of the numbers of :func:`_ends`, real parts on the imaginary places too."""
+    """Write |K|² of the numbers of :func:`_ends`, with the real part's value on the imaginary part too."""
     ends = np.array(_ends(spectrum))
     ends *= ends
     ends[..., 1:-1:2, :] += ends[..., 2:-1:2, :]
@@ -418,20 +419,20 @@ def _power_at_ends(spectrum: Image, power: Image) -> None:
 
 
 def _inner_numbers(packed: Image) -> NDArray[np.complex64]:
-    """All that lies side by side in packed spectra as one row of complex numbers; a view.
+    """A view of packed spectra as one row of complex numbers.
 
-    From a row's last place to the next one's first it pairs what does not belong together: see :func:`_ends`.
+    It wrongly pairs a row's last value with the next row's first: these are handled by :func:`_ends`.
     """
     return packed.reshape(-1)[1:-1].view(np.complex64)
 
 
 def _ends(packed: Image) -> Image:
-    """The first and the last column of packed spectra, where the parts of a number lie in alternate rows; a view."""
+    """A view of the first and last column of packed spectra, where a number's two parts lie in alternate rows."""
     return packed[..., :: packed.shape[-1] - 1]
 
 
 def _product(first: Image, second: Image, into: Image) -> None:
-    """Write the product of two packed spectra, which may be one of the two."""
+    """Write the product of two packed spectra; ``into`` may be one of the two."""
     ends = _ends_product(np.array(_ends(first)), np.array(_ends(second)))
     np.multiply(_inner_numbers(first), _inner_numbers(second), out=_inner_numbers(into))
     _ends(into)[:] = ends
@@ -445,7 +446,7 @@ def _whole_power(spectrum: Image, power: Image) -> None:
 
 @lru_cache(maxsize=8)
 def _conjugating(size: int) -> Image:
-    """Signs by which a packed spectrum becomes its conjugate, (size, size)."""
+    """Signs (size, size) that turn a packed spectrum into its conjugate."""
     signs = np.ones((size, size), np.float32)
     signs[:, 2:-1:2] = -1
     signs[:, :: size - 1] = 1
@@ -454,7 +455,7 @@ def _conjugating(size: int) -> Image:
 
 
 def _ends_product(first: Image, second: Image) -> Image:
-    """The product of two :func:`_ends`: all numbers are complex but the corners, which are real."""
+    """The product of two :func:`_ends`: all numbers are complex except the corners, which are real."""
     product = first * second
     real, imaginary = np.s_[..., 1:-1:2, :], np.s_[..., 2:-1:2, :]
     product[real] -= product[imaginary]
@@ -474,10 +475,10 @@ def gradient_power(size: int) -> Image:
 
 
 def inverse_filter(power: Image, floor: float = 1e-3) -> Image:
-    """1 / |K|², held where |K| falls below the square root of ``floor``: the naive inverse, for comparison."""
+    """1 / |K|², limited to 1 / ``floor``: the naive inverse filter, for comparison."""
     return (1.0 / np.maximum(power, floor)).astype(np.float32)
 
 
 def wiener_filter(power: Image, noise_to_signal: Image) -> Image:
-    """1 / (|K|² + N/S), with the noise-to-signal ratio at each place of the packed spectrum."""
+    """1 / (|K|² + N / S), with the noise-to-signal ratio of each packed frequency."""
     return 1.0 / (power + noise_to_signal)

@@ -1,4 +1,4 @@
-"""One frame's luma, quickly restored: what its neighbours are asked to judge at planning."""
+"""Restore one frame's luma quickly at planning, for comparison with its neighbours."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.tile_power import FEW_TILES
-from virest.restoration.taken_part import blurred_part, too_little_to_gain, trusted_share
+from virest.restoration.taken_part import blurred_part, no_gain_reason, trusted_share
 from virest.restoration.tile_layout import THIN_MARGIN
 from virest.restoration.tile_methods import tile_hyper_laplacian
 
 ANCHOR = 0.5
-"""Rows are restored to the middles of their exposures, at which neighbours are seen."""
+"""Fraction of the exposure at which rows are restored: mid-exposure, as in the comparison with neighbours."""
 
 
-def tried(
+def try_restoration(
     luma: NDArray[np.uint8],
     motion: RowMotion,
     settings: RestorationSettings,
     refined: RefinedMotion | None,
     coding_step: float | None,
 ) -> tuple[Image, Image] | None:
-    """Restore a luma (height, width); None where it is left alone.
+    """Restore a luma (height, width); None if it would not be deblurred.
 
-    Returns its light as recorded and as restored, of the size at which neighbours are compared.
+    Returns its linear light as recorded and as restored, at the reduced size at which neighbours are compared.
     """
     height, width = luma.shape
     centres_px = tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px
@@ -50,8 +50,8 @@ def tried(
     statistics = picture_statistics(luma, field(most_blurred(motion, centres_px)), curve, FEW_TILES, coding_step)
     covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
     spread = kernel_spread(field, width, height, covariance_px2)
-    model = statistics[0].doubted_by(spread)
-    if too_little_to_gain(model, model.expected_gain_db):
+    model = statistics[0].with_kernel_variance(spread)
+    if no_gain_reason(model, model.expected_gain_db):
         return None
     blurred = blurred_picture(cv2.merge([luma] * 3), curve, statistics, field, longest_px)
     sharp, recorded = tile_hyper_laplacian(replace(blurred, spread=spread), settings, THIN_MARGIN), blurred.light[0]

@@ -1,6 +1,6 @@
-"""The lens's distortion undone: where the lens shows what a pinhole of the same intrinsics shows at a pixel.
+"""Lens undistortion: the position at which the lens shows what a pinhole of the same intrinsics shows at a pixel.
 
-A point p of the pinhole's picture is seen along the ray K⁻¹ p, and the lens shows that ray at its own place.
+A pixel p of the pinhole picture is seen along the ray K⁻¹ p, and the lens projects that ray to another position.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from virest.restoration.row_chunks import bands
 
 Array = NDArray[np.float64]
 MARGIN_PX = 16
-"""So far around the picture a lens must be invertible: a map's grid reaches out of it."""
+"""A lens must be invertible this far around the picture, since the grid of a map extends beyond it."""
 WITHIN_PX = 0.1
-"""The lens leads from where it shows a ray back to that ray at least so closely."""
+"""Largest error when a ray is projected and back-projected by the lens."""
 
 
 def distorted_points(lens: MovingLens, points_px: Array, at_s: float = 0.0) -> Array:
-    """Where a lens shows, at a time, what its pinhole shows at pixels (..., 2).
+    """Where a lens shows, at a given time, what its pinhole shows at pixels (..., 2).
 
-    The stabiliser shifts both alike and the focal length at that time is that of both, so they stay as they are.
+    The stabiliser's shift is the same for both and is left out; both have the focal length at that time.
     """
     still = replace(lens, shift=None)
     return still.project(replace(still, lens=lens.lens.pinhole).rays(points_px, at_s), at_s)
@@ -34,9 +34,9 @@ def distorted_points(lens: MovingLens, points_px: Array, at_s: float = 0.0) -> A
 
 @lru_cache(maxsize=1)
 def undistortion_map(lens: Intrinsics) -> NDArray[np.float32] | None:
-    """Where each pixel of the pinhole's picture is in the lens's, (height, width, 2); None without distortion.
+    """Where each pixel of the pinhole picture is in the lens's picture, (height, width, 2); None without distortion.
 
-    The same for all frames that no other step moves; not to be written to.
+    The map is cached and read-only; it is used for frames that no other step warps.
     """
     if not lens.is_distorted:
         return None
@@ -50,7 +50,7 @@ def undistortion_map(lens: Intrinsics) -> NDArray[np.float32] | None:
 
 
 def require_undistortable(lens: Intrinsics) -> None:
-    """Raise SettingsError where different rays are shown at one place: a polynomial that turns back in the picture."""
+    """Raise SettingsError if the lens projects different rays to one point: its distortion polynomial turns back."""
     x, y = (np.linspace(-MARGIN_PX, length - 1 + MARGIN_PX, 33) for length in (lens.width, lens.height))
     rays = lens.pinhole.rays(np.stack(np.meshgrid(x, y), -1))
     back = lens.rays(lens.project(rays))

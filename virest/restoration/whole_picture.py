@@ -1,4 +1,4 @@
-"""Methods that restore a picture as a whole, by its space-variant blur and that one's transpose."""
+"""Methods that restore a picture as a whole, with its space-variant blur operator and the adjoint."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from virest.image_formation.blur import Image, SpaceVariantBlur, TileGrid, tile_grid
-from virest.restoration.blurred import BlurredPicture, as_kept, luma_of
+from virest.restoration.blurred import BlurredPicture, luma_of, with_vignetting
 from virest.restoration.clipped_light import near_clipped
 from virest.restoration.colour import with_colour
 from virest.restoration.deconvolution import hyper_laplacian, richardson_lucy
@@ -18,13 +18,13 @@ from virest.restoration.settings import RestorationSettings
 from virest.restoration.tile_methods import beta_schedule, tile_hyper_laplacian
 
 START_ITERATIONS, SETTLED_BETA = 5, 0.3
-"""The whole-picture method starts from that many steps of the tiled one, so its penalties can start higher."""
+"""The whole-picture method starts from this many iterations of the tiled one, so its penalties can start higher."""
 WEIGHED_PX = 5
-"""Side of the neighbourhood whose light tells a pixel's slope: in it the recorded noise evens out."""
+"""Side of the neighbourhood whose mean light gives a pixel's curve slope: it averages the noise out."""
 
 
 def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
-    """Each channel by itself; what is censored has no weight."""
+    """Richardson–Lucy on each channel separately; censored pixels have no weight."""
     operator = _whole_operator(blurred, positive=True)
     sharp = []
     for light, dark, clipped in zip(blurred.light, blurred.dark, blurred.clipped, strict=True):
@@ -32,14 +32,14 @@ def by_richardson_lucy(blurred: BlurredPicture, settings: RestorationSettings) -
         start = _extended(light, operator.border)
         result = richardson_lucy(light, operator.apply, operator.adjoint, start, weight, settings.iterations)
         sharp.append(_inner(result, operator.border))
-    sharp = [grey_levels(as_kept(plane, blurred), blurred.curve) for plane in sharp]
+    sharp = [grey_levels(with_vignetting(plane, blurred), blurred.curve) for plane in sharp]
     return lambda rows: cv2.merge([plane[rows] for plane in sharp])
 
 
 def by_global_hyper_laplacian(blurred: BlurredPicture, settings: RestorationSettings) -> RowRenderer:
-    """Luma over the whole operator, where censored pixels have no weight; colour as in tiles, all that a movie stores.
+    """Luma with the whole-picture operator, censored pixels without weight; colour by tiles at reduced resolution.
 
-    Near clipped light the tiles' solution stays: its lamps were found with light held positive.
+    Near clipped light the tiled solution is kept: its highlights were estimated with light constrained to be positive.
     """
     operator, near = _whole_operator(blurred), near_clipped(blurred)
     height, width = blurred.light[0].shape
@@ -80,7 +80,7 @@ def _extended(channel: Image, border: int) -> Image:
 
 
 def _data_weight(slope: Image, blurred: BlurredPicture) -> Image:
-    """Weight of each pixel's luma: none where any channel is clipped, with its neighbours, or all are too dark."""
+    """Weight of each pixel's luma: its curve slope; 0 within one pixel of ``holes`` and where all channels are dark."""
     holes, dark = blurred.holes, [mask for mask in blurred.dark if mask is not None]
     if holes is not None:
         slope = slope * (1 - cv2.dilate(holes, np.ones((3, 3), np.uint8)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
-from virest.restoration.neighbours.survey import lively_frames
+from virest.restoration.neighbours.survey import gain_test_candidates
 from virest.restoration.statistics.records import Misplaced
 
 FRAMES, PLACES = 2000, 16
@@ -138,9 +138,9 @@ def test_a_pair_that_changed_little_does_not_decide():
     assert found.share > 0.8
 
 
-def test_lively_frames_are_asked():
+def test_candidates_for_the_gain_test_are_blurred_enough():
     """The first frame of each run that was blurred enough, then the others; those without two neighbours never."""
     path_px = dict(enumerate([1.0, 2.0, 3.0, 9.0, 8.0, 2.0, 1.0, 12.0]))
-    assert lively_frames([(0, 1, 2, 3), (4, 5, 6, 7)], path_px) == [2, 4, 3, 1, 5, 6]
-    assert lively_frames([(0, 1, 2, 3)], {n: path_px[n] / 4 for n in range(4)}) == [2, 1]
-    assert lively_frames([(4, 5, 6, 7)], {n: path_px[n] for n in (4, 5, 7)}) == []
+    assert gain_test_candidates([(0, 1, 2, 3), (4, 5, 6, 7)], path_px) == [2, 4, 3, 1, 5, 6]
+    assert gain_test_candidates([(0, 1, 2, 3)], {n: path_px[n] / 4 for n in range(4)}) == [2, 1]
+    assert gain_test_candidates([(4, 5, 6, 7)], {n: path_px[n] for n in (4, 5, 7)}) == []

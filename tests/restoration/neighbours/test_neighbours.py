@@ -184,7 +184,7 @@ def test_things_that_move_are_not_made_worse(simulated):
     joint = _gains(capture, plan)
     single = _gains(capture, replace(plan, settings=replace(plan.settings, neighbours=0)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("virest.restoration.frame.still_part", lambda _: None)
+        patch.setattr("virest.restoration.frame.static_part", lambda _: None)
         all_taken = _gains(capture, plan)
     assert joint.min() > -0.1
     assert np.all(joint > single - 0.1)

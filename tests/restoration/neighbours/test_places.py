@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from virest.restoration.neighbours.joint import _cubic_error, _lasting_px, _trust, is_detailed
+from virest.restoration.neighbours.joint import _common_shift_px, _cubic_error, _trust, is_detailed
 from virest.restoration.neighbours.reduced_tiles import AROUND, TILE, WIDE, wide_spectra
 from virest.restoration.neighbours.registration import TileAgreement
 from virest.restoration.statistics.records import unknown_picture
@@ -19,7 +19,7 @@ CENTRES_PX = np.stack(np.meshgrid(np.arange(12), np.arange(9)), axis=-1).reshape
 
 def test_shifts_that_scatter_alone_are_no_error_of_the_field(rng: np.random.Generator) -> None:
     """Noise of tiles side by side is independent: no more of it is taken for the field's than chance makes."""
-    lasting = [_lasting_px(CENTRES_PX, rng.normal(0, 0.2, CENTRES_PX.shape), 0.2, SPACING_PX) for _ in range(200)]
+    lasting = [_common_shift_px(CENTRES_PX, rng.normal(0, 0.2, CENTRES_PX.shape), 0.2, SPACING_PX) for _ in range(200)]
     assert np.mean(np.square(lasting)) < 0.05 * 0.2**2
 
 
@@ -30,7 +30,7 @@ def test_a_smooth_rest_is_an_error_of_the_field(rng: np.random.Generator, noise_
     off = waves + rng.normal(0, noise_px, waves.shape)
     typical = float(np.median(np.linalg.norm(off, axis=1)) / 1.1774)
     expected = float(np.sqrt(np.mean(waves**2)))
-    assert _lasting_px(CENTRES_PX, off, typical, SPACING_PX) == pytest.approx(expected, rel=0.25)
+    assert _common_shift_px(CENTRES_PX, off, typical, SPACING_PX) == pytest.approx(expected, rel=0.25)
 
 
 def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:

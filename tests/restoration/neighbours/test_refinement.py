@@ -9,7 +9,7 @@ import pytest
 from laws import TurningCamera, phone
 
 from virest.motion.trajectory import Trajectory
-from virest.restoration.neighbours.refinement import FollowingTurn, RefinedMotion, believed_turn, following_turn
+from virest.restoration.neighbours.refinement import FollowingTurn, RefinedMotion, accepted_turn, following_turn
 from virest.restoration.neighbours.registration import PairTurn
 
 PERIOD_S = 1 / 30
@@ -49,7 +49,7 @@ def test_a_lag_and_a_scale_come_back(rng: np.random.Generator, lag_s: float, par
     found = following_turn(turns, waving)
     assert found.lag_s == pytest.approx(lag_s, abs=3e-4)
     assert found.part == pytest.approx(part, abs=0.01)
-    left = [found.left_of(turn, waving).rate_rad_s for turn in turns]
+    left = [found.residual_of(turn, waving).rate_rad_s for turn in turns]
     assert np.std(left) < 0.008
     assert found.at(waving, np.zeros(1)) == pytest.approx(
         found.lag_s * waving.angular_acceleration_rad_s2(np.zeros(1)) + found.part * waving.rate_rad_s(np.zeros(1))
@@ -61,7 +61,7 @@ def test_turns_that_follow_nothing_are_not_explained(rng: np.random.Generator) -
     found = following_turn(_turns(0.0, 0.0, 0.05, rng), _Waving())
     assert abs(found.lag_s) < 1.5e-3
     assert abs(found.part) < 0.03
-    assert FollowingTurn().left_of(_turns(0.0, 0.0, 0.05, rng)[0], _Waving()).rate_rad_s.any()
+    assert FollowingTurn().residual_of(_turns(0.0, 0.0, 0.05, rng)[0], _Waving()).rate_rad_s.any()
 
 
 def test_a_rest_that_interpolation_tells_better_follows_nothing(rng: np.random.Generator) -> None:
@@ -70,8 +70,8 @@ def test_a_rest_that_interpolation_tells_better_follows_nothing(rng: np.random.G
         replace(turn, rate_rad_s=turn.rate_rad_s + 0.2 * np.sin(2 * np.pi * 0.8 * turn.start_s + PHASE_RAD))
         for turn in _turns(0.0, 0.0, 0.002, rng)
     ]
-    assert believed_turn([slow], _Waving())[0] == FollowingTurn()
-    following, bend = believed_turn([_turns(0.004, 0.0, 0.002, rng)], _Waving())
+    assert accepted_turn([slow], _Waving())[0] == FollowingTurn()
+    following, bend = accepted_turn([_turns(0.004, 0.0, 0.002, rng)], _Waving())
     assert following.lag_s == pytest.approx(0.004, abs=5e-4)
     assert bend is not None
     assert bend < 0.01**2
@@ -85,5 +85,5 @@ def test_rows_lie_off_by_what_is_unknown_of_the_speed() -> None:
     middles_s = motion.row_time_s(along, 0.5)
     speed_px_s = np.sqrt(np.trace(refined.path_covariance_px2()) / 2) / motion.exposure_s
     off_px = speed_px_s * (middles_s - motion.reference_s)
-    assert refined.place_std_px() == pytest.approx(np.sqrt(np.mean(off_px**2)), rel=1e-3)
-    assert RefinedMotion(motion, np.zeros((3, 3)), 0.0).place_std_px() == 0.0
+    assert refined.position_std_px() == pytest.approx(np.sqrt(np.mean(off_px**2)), rel=1e-3)
+    assert RefinedMotion(motion, np.zeros((3, 3)), 0.0).position_std_px() == 0.0

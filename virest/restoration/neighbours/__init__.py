@@ -1,6 +1,6 @@
-"""What a frame's neighbours tell of it: where the picture really moved, and how well the restored frame predicts them.
+"""Use of a frame's neighbours: to correct its motion, to restore it jointly, and to check the gain.
 
-A movie holds its own truth.  Two neighbours show one scene, blurred along different paths; each, blurred as the other
-was, must look the same.  Where they lie apart, the camera moved otherwise than predicted between the two, and so it did
-over the exposures: the blur paths are corrected by what the frames show, whatever the cause.
+Two neighbouring frames show one scene, blurred along different paths.  Each of them, blurred along the other's path,
+must look the same.  If they are displaced, the camera moved otherwise than predicted between them, and therefore also
+during the exposures: the blur paths are corrected by what the frames show, whatever the cause.
 """

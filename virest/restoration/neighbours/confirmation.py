@@ -1,11 +1,11 @@
-"""What deblurring really gains on a capture, confirmed by neighbours that were blurred along other paths.
+"""The true gain of deblurring on a capture, measured on neighbours that were blurred along other paths.
 
-Restoring changes a picture by D, and takes its error from |M|² to |M − D|².  Where D is the best that the data allow,
-what is left is unrelated to it, and |M|² − |M − D|² = |D|² (the projection theorem): a restored picture tells by itself
-what it gained, if it is right.  Whether it is, its neighbours tell: blurred as each was, the share
-(|M|² − |M − D|²) / |D|² is 1 for the best restoration, 0 for one that changes as much for the worse as for the better,
-and less for one that harms.  Noise of the neighbour's own and what it cannot see cancel in it, since D holds none of
-that.  Where the share s is below 1, too much is changed: of a D, (1 + s) / 2 leaves the least error, and that is taken.
+Restoring changes a picture by D and reduces its error from |M|² to |M − D|².  If D is the best estimate that the data
+allow, the remaining error is uncorrelated with it, and |M|² − |M − D|² = |D|² (the projection theorem): the size of the
+change then equals the gain.  Neighbours test whether that holds.  With all blurred along the neighbour's path, the
+share (|M|² − |M − D|²) / |D|² is 1 for the best restoration, 0 for one that does as much harm as good, and negative for
+one that does more harm.  The neighbour's own noise, and what it cannot show, cancel, since D contains neither.  If the
+share s is below 1, the change is too large: (1 + s) / 2 of D leaves the least error, and that is used.
 """
 
 from __future__ import annotations
@@ -21,57 +21,59 @@ from virest.restoration.statistics.records import Misplaced
 
 Array = NDArray[np.float64]
 LEAST_PAIRS = 2
-"""A single one has no scatter."""
+"""A single pair has no scatter."""
 LEAST_SEEN_DB = 0.1
-"""Least improvement in predicting neighbours, in dB; a frame is not deblurred for less either."""
+"""Least improvement in predicting neighbours, dB; a frame is not deblurred for less either."""
 USUAL_SHARE, USUAL_SHARE_STD = 1.0, 0.5
-"""The share before any pair is asked: 1 is that of a right restoration.  On 8 simulated captures that were looked at,
-obedient ones and phones, it scattered by 0.3 from capture to capture; models that are wrong are to be found out, so
-the width is more, and a few pairs that contradict each other still do not outweigh it."""
+"""Prior of the share: 1 for a correct restoration.  On 8 simulated captures, with exact profiles and with a phone's
+errors, it scattered by 0.3 between captures.  The prior is wider, so that wrong models are detected, while a few pairs
+that contradict each other still do not outweigh it."""
 LEFT_OVER = (3.51, 0.59, 0.26)
-"""ln of the squared error that is left in a restored picture, grey levels squared: a constant, and how much it grows
-with the logarithms of what the spectra leave and of the part that neighbours see left.
+"""Coefficients of ln of the remaining squared error, grey levels squared: a constant, and the slopes over ln of the
+spectra's ideal error and over ln of the part that neighbours do not find restored.
 
-Each of the two tells it to a factor only.  ``python -m virest.app.bench --only fits`` fits them to pictures with
-truth: 3.51 ± 0.36, 0.59 ± 0.08, 0.26 ± 0.06 on 18 captures, together to 0.59 dB in the median."""
+Each of the two predicts the error only to a factor.  ``python -m virest.app.bench --only fits`` fits the coefficients
+to pictures with ground truth: 3.51 ± 0.36, 0.59 ± 0.08, 0.26 ± 0.06 on 18 captures; median error 0.59 dB."""
 LEFT_OVER_STD = 0.50
-"""One standard deviation of that logarithm; by the same bench."""
+"""Standard deviation of that logarithm, from the same benchmark."""
 IN_PLACE = Misplaced()
-"""Rows that are where they belong."""
+"""No row displacement."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfirmedGain:
-    """How much of what restoring changes on this capture is for the better, by its neighbours."""
+    """How much of the change by restoring is an improvement on this capture, according to neighbouring frames."""
 
     share: float
-    """Of the square of the change, what the error's square falls by."""
+    """Decrease of the squared error over the squared change."""
     std: float
-    """One standard deviation of the share from pair to pair."""
+    """Standard deviation of the share between pairs."""
     left: float
-    """Of what a neighbour shows, the part of its power that the restored frame, blurred as it was, does not."""
+    """Fraction of a neighbour's power that the restored frame, blurred along the neighbour's path, does not predict."""
     pairs: int
+    """Number of compared pairs."""
 
     def expected_db(self, promised_db: float) -> float:
-        """The expected gain for a gain that the model promises, before anything is restored."""
+        """The expected gain, dB, given the model's predicted gain, before a frame is restored."""
         return _gain_db(min(self.share, 1.0) * (1 - 10 ** (-promised_db / 10)))
 
     def taken(self, further: float) -> float:
-        """Part of the change that leaves the least error.
+        """The fraction of the change that leaves the least error.
 
-        further: sum of the weights of pictures restored with the frame; what is wrong with one's kernels is not what is
-        wrong with another's, so the wrong part of the change falls with their number.
+        further: sum of the weights of the neighbours restored with the frame.  Errors of the frames' kernels are
+        independent, so the wrong part of the change falls with their number.
         """
         return float(np.clip(1 - 0.5 * (1 - self.share) / (1 + further), 0.0, 1.0))
 
     def of_change_db(
         self, changed: float, lost: float, ideal: float, misplaced: Misplaced = IN_PLACE
     ) -> tuple[float, float]:
-        """The gain of a restored picture that differs by ``changed`` from the recorded one, and its deviation.
+        """Gain, dB, of a restored picture, and its standard deviation.
 
-        Mean squares in grey levels; lost: what the blur took, ideal: what an ideal filter would leave, by the spectra.
-        misplaced: what rows that lie wrong make of that.  Unknown are what is left, by its law; what was removed, by
-        the scatter of the share and by how far the two that tell it lie apart; and where the rows lie.
+        changed: mean square difference from the recorded picture; lost: that removed by the blur; ideal: an ideal
+        filter's error, the last two from the spectra, all in grey levels squared.  misplaced: error by displaced rows.
+        The deviation combines the uncertainty of the remaining error (LEFT_OVER_STD), of the removed error (the scatter
+        of the share, and the disagreement of ``changed`` and ``lost``), and of the rows' displacement.
         """
         left = float(np.exp(tellers(ideal, self.left) @ np.array(LEFT_OVER)))
         gone = removed(changed, lost)
@@ -86,36 +88,36 @@ class ConfirmedGain:
 
 
 def errors(left: Array | float, gone: Array | float, blurred: Array, restored: Array) -> tuple[Array, Array]:
-    """Squared errors before and after a restoration: what it leaves, removes, and what misplaced rows add to each."""
+    """Squared errors before and after a restoration, from what it leaves and removes, and what displaced rows add."""
     return left + gone + blurred, left + restored
 
 
 def removed(changed: float, lost: float) -> float:
-    """Squared error that restoring removes, by what it changed and by what the blur took.
+    """Squared error that restoring removes: the geometric mean of its squared change and of what the blur removed.
 
-    Either would be it, were the restoration right and were the spectra, and a change beyond what was lost is an error
-    of its own: the mean of their logarithms.  A fit that weighs them freely gives the change 0.36 ± 0.12.
+    The first would be exact for a correct restoration, the second for correct spectra, and a change larger than the
+    loss is itself an error.  A fit with a free weight finds 0.36 ± 0.12 instead of ½ for the change.
     """
     return float(np.sqrt(changed * max(lost, 0.0)))
 
 
 def tellers(ideal: float, left: float) -> Array:
-    """(3,) what :data:`LEFT_OVER` multiplies."""
+    """(3,) the regressors of :data:`LEFT_OVER`."""
     return np.asarray(np.log(np.maximum((np.e, ideal, left), 1e-6)))
 
 
 def _gain_db(part: float) -> float:
-    """Gain in dB for a removed part of the error."""
+    """Gain, dB, if this fraction of the squared error is removed."""
     return 10 * float(np.log10(1 / max(1 - part, 1e-3)))
 
 
 def confirmed_gain(found: Sequence[tuple[float, float, float, float]]) -> ConfirmedGain | None:
-    """The share by pairs of (fall of the squared error, squared change, part lacked, part left); None: too few.
+    """The share from pairs of (decrease of the squared error, squared change, part lacked, part left).
 
-    A ratio of sums: pairs that changed little tell little.  Few pairs tell the share no better than their scatter lets
-    them, so it is weighed against what is usual (normal distributions; the deviation of a mean of few is Student's).
-    Nothing is confirmed where a change for the better predicts neighbours hardly better than recorded frames do: what
-    these lack is then something else than sharpness.
+    None with fewer than LEAST_PAIRS pairs, or if restoring changed nothing.  The share is a ratio of sums, since pairs
+    that changed little carry little information.  It is combined with the prior USUAL_SHARE by its scatter (normal
+    distributions; Student's deviation for a mean of few).  A positive share becomes 0 if the restored frames predict
+    the neighbours hardly better than the recorded ones do: what these lack is then not sharpness.
     """
     if len(found) < LEAST_PAIRS:
         return None

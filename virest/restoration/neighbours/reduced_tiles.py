@@ -1,7 +1,7 @@
-"""Tiles of reduced frames in the Fourier domain: cut out, blurred, shifted, and compared by their phases.
+"""Tiles of reduced frames in the Fourier domain: cut out, blurred, shifted, and registered by phase.
 
-Two tiles of one scene under one blur differ by a shift.  It is found where the phases of their spectra agree best
-(Kuglin & Hines 1975), from low frequencies to high ones.
+Two tiles of one scene under the same blur differ by a shift.  It is estimated as the one that aligns the phases of
+their spectra (Kuglin & Hines 1975), from low to high frequencies.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ from virest.image_formation.kernels import KernelField
 
 Array = NDArray[np.float64]
 TILE = 64
-"""Side of a compared tile, in pixels of the reduced pictures."""
+"""Side of a compared tile, reduced pixels."""
 SHORT_SIDE = 400
-"""Pictures are halved until their shorter side is less: shifts are then known to a tenth of a recorded pixel."""
+"""Pictures are halved until their shorter side is below this; shifts are then known to a tenth of a recorded pixel."""
 AROUND = TILE // 4
-"""What a tile is blurred together with on each side: half of the longest path that is compared."""
+"""Margin of a tile for blurring, reduced pixels: half of the longest path that is compared."""
 WIDE = TILE + 2 * AROUND
+"""Side of a tile with its margins."""
 INNER = slice(AROUND, AROUND + TILE)
 MOST_TILES = 16
 CUTOFFS = (0.06, 0.12, 0.2, 0.25)
-"""Highest frequencies of the successive fits, cycles per pixel: the first sees shifts of four pixels without a wrap."""
+"""Highest frequencies of the successive fits, cycles per pixel: the first allows shifts of 4 px without phase wrap."""
 RIVAL_PEAK = 0.8
-"""Of two agreements nearly as good the one nearer to the prediction is taken: periodic texture has many."""
+"""Among correlation peaks of at least this fraction of the highest, the one nearest to the prediction is used: periodic
+texture has many."""
 LEAST_COHERENCE = 0.5
-"""Tiles whose spectra agree less, Σ|Re A*B| over Σ|A||B|, show different things."""
+"""Tiles with a lower coherence, Σ|A||B| cos(phase residual) over Σ|A||B|, show different content."""
 
 
 def reduction(height: int, width: int) -> int:
@@ -50,14 +52,14 @@ def reduced_light(luma: NDArray[np.uint8], light: NDArray[np.float32]) -> Image:
 
 
 def reduced(picture: NDArray[Any]) -> NDArray[Any]:
-    """A picture (height, width) of the size at which pictures are compared; rows and columns too many are cut off."""
+    """A picture (height, width) reduced to the size for comparison; excess rows and columns are cut off."""
     times = reduction(*picture.shape)
     height, width = (length // times for length in picture.shape)
     return cv2.resize(picture[: times * height, : times * width], (width, height), interpolation=cv2.INTER_AREA)
 
 
 def shifted(spectra: NDArray[np.complex64], shift: Array) -> NDArray[np.complex64]:
-    """Spectra (n, side, side / 2 + 1) of tiles that lie so far (n, 2) on."""
+    """Spectra (n, side, side / 2 + 1) of tiles moved by ``shift`` (n, 2), px: f(x + shift)."""
     along, down = (
         np.exp(2j * np.pi * d[:, None] * f).astype(np.complex64)
         for d, f in zip(shift.T, _axes(spectra.shape[1]), strict=True)
@@ -71,7 +73,10 @@ def power_of(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
 
 
 def spread_tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
-    """(n, 2) top and left of tiles spread evenly over a picture, at most the given number."""
+    """(n, 2) top and left of at most ``most`` tiles, evenly spaced over a picture.
+
+    With ``most`` above MOST_TILES, tiles overlap where needed to cover the picture completely.
+    """
     tops, lefts = (
         np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(
             np.intp
@@ -84,23 +89,23 @@ def spread_tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.
 
 
 def full_px(tops_lefts: NDArray[np.intp], times: int, at: float) -> Array:
-    """(n, 2) pixels x, y of the recorded picture at a place ``at`` rows and columns into each reduced tile."""
+    """(n, 2) x, y in the recorded picture of the point ``at`` rows and columns into each reduced tile."""
     return np.asarray((tops_lefts[:, ::-1] + at + 0.5) * times - 0.5)
 
 
 def kernel_spectra(
     field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int
 ) -> NDArray[np.complex64] | None:
-    """Transposes of the kernels at tiles' centres, (n, WIDE, WIDE / 2 + 1).
+    """Spectra of the transposed kernels at tiles' centres, (n, WIDE, WIDE / 2 + 1); a product applies the blur.
 
-    None where a path does not fit into half a tile.
+    None if a path does not fit into half a tile.
     """
     kernels = field(full_px(tops_lefts, times, (TILE - 1) / 2)).scaled(1 / times)
     radius = kernels.radius_px
     if 2 * radius + 1 > TILE // 2:
         return None
     along, down = (np.exp(2j * np.pi * radius * f).astype(np.complex64) for f in _axes(WIDE))
-    rows = fft.rfft(kernels.arrays()[:, ::-1, ::-1], WIDE, axis=2) * along  # the transpose, its middle at 0
+    rows = fft.rfft(kernels.arrays()[:, ::-1, ::-1], WIDE, axis=2) * along  # the transpose, centred at 0
     return np.asarray(fft.fft(rows, WIDE, axis=1) * down[:, None])
 
 
@@ -110,26 +115,26 @@ def cut(picture: NDArray[Any], tops_lefts: NDArray[np.intp], side: int = TILE) -
 
 
 def wide_spectra(picture: Image, tops_lefts: NDArray[np.intp]) -> NDArray[np.complex64]:
-    """Spectra (n, WIDE, WIDE / 2 + 1) of tiles with what lies around them; the picture is mirrored at its edges."""
+    """Spectra (n, WIDE, WIDE / 2 + 1) of tiles with their margins; the picture is mirrored at its edges."""
     padded = cv2.copyMakeBorder(picture, AROUND, AROUND, AROUND, AROUND, cv2.BORDER_REFLECT_101)
     return np.asarray(fft.rfft2(cut(padded, tops_lefts, WIDE)))
 
 
 def inner(wide: NDArray[np.complex64]) -> Image:
-    """Tiles (n, TILE, TILE) of spectra (n, WIDE, WIDE / 2 + 1)."""
+    """Tiles (n, TILE, TILE) from their wide spectra (n, WIDE, WIDE / 2 + 1)."""
     rows = fft.ifft(wide, axis=1)[:, INNER]
     return np.asarray(fft.irfft(rows, WIDE, axis=2)[:, :, INNER])
 
 
 def read_at(picture: Image, source: NDArray[np.float32]) -> Image:
-    """A reduced picture at the places of a map (h, w, 2); beyond its edges, these."""
+    """A reduced picture resampled by a map (h, w, 2); its edges are replicated."""
     return cv2.remap(picture, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def spectra_of(tiles: Image, seen: Image | None = None) -> NDArray[np.complex64]:
-    """Spectra (n, TILE, TILE / 2 + 1) of tiles less their mean, under a Hann window; light that changed is evened.
+    """Spectra (n, TILE, TILE / 2 + 1) of tiles under a Hann window, divided by their mean, minus 1.
 
-    seen: (n, TILE, TILE) weights of the places that make the mean; None: all.
+    The division removes brightness changes.  seen: (n, TILE, TILE) weights for the mean; None: all 1.
     """
     window = _window()
     weight = np.broadcast_to(window, tiles.shape) if seen is None else window * seen
@@ -145,21 +150,21 @@ def _window() -> Image:
 
 
 def _axes(side: int = TILE) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Frequencies along and down of half a spectrum (side, side / 2 + 1), cycles per pixel."""
+    """Horizontal and vertical frequencies of half a spectrum (side, side / 2 + 1), cycles per pixel."""
     return np.fft.rfftfreq(side).astype(np.float32), np.fft.fftfreq(side).astype(np.float32)
 
 
 @lru_cache(maxsize=2)
 def radii(side: int = TILE) -> Array:
-    """Distance from zero over half a spectrum (side, side / 2 + 1), cycles per pixel."""
+    """Radial frequency over half a spectrum (side, side / 2 + 1), cycles per pixel."""
     return np.hypot(*np.meshgrid(np.fft.rfftfreq(side), np.fft.fftfreq(side)))
 
 
 @lru_cache(maxsize=1)
-def _looked_at() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
-    """Places of half a spectrum whose phases are looked at, by rising frequency, and 2π f there, (2, m).
+def _fitted_phases() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
+    """Flat indices into half a spectrum of the m phases to fit, by increasing frequency, and 2π f there, (2, m).
 
-    The third: how many of them each of CUTOFFS takes.
+    The third: how many of them lie below each of CUTOFFS.
     """
     radius = radii().ravel()
     order = np.argsort(radius, kind="stable")
@@ -169,7 +174,7 @@ def _looked_at() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]
 
 
 def common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
-    """Shift d (2,) with b(x) ≈ a(x + d) for most tiles: the peak of their summed phase correlation, whole pixels."""
+    """Shift d (2,) with b(x) ≈ a(x + d) for most tiles: the peak of their summed phase correlation, integer pixels."""
     product = np.conj(a) * b
     surface = fft.irfft2((product / np.sqrt(np.abs(product) + 1e-12)).sum(axis=0), (TILE, TILE))
     rows, columns = np.nonzero(surface >= RIVAL_PEAK * surface.max())
@@ -179,26 +184,26 @@ def common_shift(a: NDArray[np.complex64], b: NDArray[np.complex64]) -> Array:
 
 
 def tile_shifts(a: NDArray[np.complex64], b: NDArray[np.complex64], start_px: Array) -> tuple[Array, Array]:
-    """Shifts (n, 2) of tiles and their precision (n,), 1 / px², by the phases' scatter; 0: it shows something else."""
-    places, waves, counts = _looked_at()
-    product = np.conj(a.reshape(len(a), -1)[:, places]) * b.reshape(len(b), -1)[:, places]
+    """Shifts (n, 2) of tiles and their precision (n,), 1 / px², from the phases' scatter; 0: different content."""
+    indices, waves, counts = _fitted_phases()
+    product = np.conj(a.reshape(len(a), -1)[:, indices]) * b.reshape(len(b), -1)[:, indices]
     size, phase, shift = np.abs(product), np.angle(product), np.tile(start_px, (len(a), 1))
     squares = np.stack([waves[0] ** 2, waves[0] * waves[1], waves[1] ** 2], -1)
     for count in counts:
-        left = _left(phase[:, :count], shift, waves[:, :count])
+        left = _phase_residual(phase[:, :count], shift, waves[:, :count])
         weight = size[:, :count] * np.maximum(np.cos(left), 0)
         xx, xy, yy = (weight @ squares[:count]).T.astype(float)
         x, y = ((weight * left) @ waves[:, :count].T).T.astype(float)
         determinant = np.maximum(xx * yy - xy * xy, 1e-3 * (xx + yy) ** 2 + 1e-20)
         shift += np.stack([(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant], -1)
     total = np.maximum(size.sum(axis=1, dtype=float), 1e-20)
-    coherence = (size * np.cos(_left(phase, shift, waves))).sum(axis=1, dtype=float) / total
+    coherence = (size * np.cos(_phase_residual(phase, shift, waves))).sum(axis=1, dtype=float) / total
     scatter = np.maximum(1 - coherence**2, 1e-4) / np.maximum(coherence**2, 1e-4)
     narrow = determinant / np.maximum(xx + yy, 1e-20) / total
     return shift, np.where(coherence > LEAST_COHERENCE, narrow / scatter, 0.0)
 
 
-def _left(phase: NDArray[np.float32], shift: Array, waves: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Phases (n, m) that shifts (n, 2) leave, within a half turn."""
+def _phase_residual(phase: NDArray[np.float32], shift: Array, waves: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Phase residuals (n, m) after shifts (n, 2), wrapped to ± π."""
     left = phase - shift.astype(np.float32) @ waves
     return np.asarray(left - np.float32(2 * np.pi) * np.rint(left * np.float32(0.5 / np.pi)), np.float32)

@@ -1,9 +1,9 @@
-"""Blur paths corrected by what a frame's two neighbours show of the turn that the prediction lacks.
+"""Correct blur paths by the rotation that a frame's two neighbours show and the prediction lacks.
 
-An offset, a stabiliser's rest, a gyroscope's low pass, a focal length: whatever is wrong with the profile, the picture
-moves otherwise than predicted, and the shift between two frames measures by how much, on average from the one to the
-other.  What follows from the predicted rate is fitted once a capture.  Between the middles of intervals the rest
-is taken as linear in time; how large it usually is, and how far from linear, is measured once a capture.
+Whatever is wrong with the profile (clock offset, residual stabilisation, the gyroscope's low pass, focal length), the
+picture moves otherwise than predicted, and the shift between two frames measures the mean error between them.  The part
+that is a function of the predicted rate is fitted once per capture.  The rest is interpolated linearly in time between
+the middles of the intervals; its typical size, and the error of the interpolation, are measured once per capture.
 """
 
 from __future__ import annotations
@@ -22,63 +22,65 @@ from virest.restoration.neighbours.registration import PairTurn
 
 Array = NDArray[np.float64]
 FALSE_ALARM = 1e-3
-"""Probability at which right predictions would be corrected all the same."""
+"""Probability of correcting a correct prediction."""
 NEGLIGIBLE_PX = 0.05
-"""A path that is wrong by so little spoils 0.2 % of the power at half a cycle per pixel (|2πf δ|² / 12): less than any
-movie's noise."""
+"""Path error below which nothing is corrected: it spoils 0.2 % of the power at 0.5 cycles per pixel (|2πf δ|² / 12),
+less than any movie's noise."""
 FARTHEST = 5.0
-"""Standard deviations of the usual missing rate beyond which a pair shows something else, such as a passing bus."""
+"""Reject a pair whose missing rate exceeds this many standard deviations: it shows something else, such as a passing
+bus."""
 HALF_SPACING = 0.25
-"""Of the error of linear interpolation at twice the spacing, which falls with its square."""
+"""Error of linear interpolation over that at twice the spacing: it is proportional to the spacing squared."""
 
 
 LAG_STD_S, PART_STD = 0.003, 0.1
-"""What is usual of both: recorders stamp frames and samples to some milliseconds, and what a stabiliser or a low pass
-keeps from the picture or from the log is about a tenth."""
-BELIEVED = 0.5
-"""What follows from the predicted rate is taken where it leaves less than this part of what interpolation left, in
-variance: a stabiliser that holds slow turns only follows no rate, and a fit of two values always leaves a little less
-(captures with 0.75 and more lost up to 2 dB by it, those with 0.3 and less gained).
+"""Priors of both: recorders stamp frames and samples to a few milliseconds, and a stabiliser or low pass removes about
+a tenth of the rotation from the picture or the log."""
+MOST_REMAINING = 0.5
+"""Use the fitted lag and part if they reduce the interpolation error's variance below this fraction.  A stabiliser that
+cancels only slow rotation is no function of the rate, and a fit of two values always reduces the variance a little
+(captures at 0.75 and above lost up to 2 dB, those at 0.3 and below gained).
 """
 NODE_S = 0.004
-"""Spacing of instants between which the missing rate is linear: hands shake at up to some 12 Hz."""
+"""Spacing, s, of the nodes between which the missing rate is linear: hands shake at up to about 12 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class FollowingTurn:
-    """What of the missing rate follows from the predicted one ω: lag · dω/dt + part · ω.
+    """The part of the missing rate that is a function of the predicted rate ω: lag · dω/dt + part · ω.
 
-    That is an offset of the clocks, and a scale, a stabiliser's rest or a low pass.
+    The lag is a clock offset; the part is a scale error, residual stabilisation or a low pass.
     """
 
     lag_s: float = 0.0
     part: float = 0.0
 
     def at(self, trajectory: Trajectory, time_s: Array) -> Array:
-        """(n, 3) rad/s at instants (n,)."""
+        """(n, 3) rad/s at times (n,)."""
         return np.asarray(
             self.lag_s * trajectory.angular_acceleration_rad_s2(time_s) + self.part * trajectory.rate_rad_s(time_s)
         )
 
-    def left_of(self, turn: PairTurn, trajectory: Trajectory) -> PairTurn:
-        """What it does not explain of a turn."""
+    def residual_of(self, turn: PairTurn, trajectory: Trajectory) -> PairTurn:
+        """The part of a pair's missing rate that it does not explain."""
         change, mean = _change_and_mean(turn, trajectory)
         return replace(turn, rate_rad_s=turn.rate_rad_s - self.lag_s * change - self.part * mean)
 
 
 @dataclass(frozen=True, slots=True)
 class MissingTurn:
-    """What the prediction of a capture usually lacks, by pairs of its frames."""
+    """Statistics of the rotation that a capture's prediction lacks, from pairs of its frames."""
 
     rate_rad_s: float
-    """One standard deviation of the missing turn rate, each axis."""
+    """Standard deviation of the missing rotation rate, per axis."""
     rest_rad_s: float
-    """The same of what does not follow from the predicted rate."""
+    """The same for the part that is not a function of the predicted rate."""
     bend_rad_s: float
-    """One standard deviation of what linear interpolation between neighbouring intervals leaves of that rest."""
+    """Standard deviation, per axis, of the error of linear interpolation of that rest between adjacent intervals."""
     scatter_px_s: float
-    """One standard deviation, each axis, of the speeds of parts of the picture about the common turn."""
+    """Standard deviation, per axis, of the tiles' speeds about the common rotation."""
     pairs: int
+    """Number of pairs."""
     following: FollowingTurn = FollowingTurn()
 
     def refined(
@@ -88,13 +90,13 @@ class MissingTurn:
         after: Sequence[PairTurn | None],
         trajectory: Trajectory,
     ) -> RefinedMotion:
-        """The motion of a frame with the missing turn, by the pairs of frames before and after it, nearest first.
+        """A frame's motion with the missing rotation added, from the pairs before and after the frame, nearest first.
 
-        Those next to it tell its own motion; those beyond, as far as they follow without a gap, that of its neighbours.
+        The adjacent pairs give the frame's own correction; those beyond, up to the first gap, that of its neighbours.
         """
         prior = self.rest_rad_s**2 * np.eye(3)
         chains = [
-            self._unbroken([None if turn is None else self.following.left_of(turn, trajectory) for turn in turns])
+            self._until_gap([None if turn is None else self.following.residual_of(turn, trajectory) for turn in turns])
             for turns in (before, after)
         ]
         if not any(chains):
@@ -116,40 +118,40 @@ class MissingTurn:
         further = FurtherTurn(nodes_s, rest + self.following.at(trajectory, nodes_s))
         return RefinedMotion(motion.turned(further), covariance + bend**2 * np.eye(3), scatter, further)
 
-    def _unbroken(self, turns: Sequence[PairTurn | None]) -> list[PairTurn]:
-        """The turns up to the first that is missing or shows something else."""
-        known = [turn if turn is not None and self._likely(turn) else None for turn in turns]
+    def _until_gap(self, turns: Sequence[PairTurn | None]) -> list[PairTurn]:
+        """The pairs up to the first that is missing or is an outlier."""
+        known = [turn if turn is not None and self._is_inlier(turn) else None for turn in turns]
         return [turn for turn in known[: known.index(None) if None in known else None] if turn is not None]
 
-    def _likely(self, turn: PairTurn) -> bool:
+    def _is_inlier(self, turn: PairTurn) -> bool:
         spread = turn.covariance + self.rest_rad_s**2 * np.eye(3)
         return float(turn.rate_rad_s @ np.linalg.solve(spread, turn.rate_rad_s)) < FARTHEST**2
 
 
 @dataclass(frozen=True, slots=True)
 class RefinedMotion:
-    """A frame's motion and how well its blur paths are known."""
+    """A frame's motion and the uncertainty of its blur paths."""
 
     motion: RowMotion
     rate_covariance: Array
-    """(3, 3) of the turn rate, (rad/s)²."""
+    """(3, 3) covariance of the rotation rate, (rad/s)²."""
     scatter_px_s: float
-    """One standard deviation, each axis, of parts of the picture about it."""
+    """Standard deviation, per axis, of the tiles' speeds about this motion."""
     further: FurtherTurn | None = None
-    """What was added to the predicted motion; None: it stays as predicted."""
+    """The rotation added to the predicted motion; None: none."""
 
     def path_covariance_px2(self) -> Array:
-        """(2, 2) covariance of the blur path's end over its start, at the picture's middle, x then y."""
+        """(2, 2) covariance of the blur path's end relative to its start, at the picture's centre, x then y."""
         profile = self.motion.profile
         centre = np.array([[(profile.width - 1) / 2, (profile.height - 1) / 2]])
         jacobian = turn_jacobian_px(self.motion, centre)[0]
         spread = jacobian @ self.rate_covariance @ jacobian.T + self.scatter_px_s**2 * np.eye(2)
         return np.asarray(spread * self.motion.exposure_s**2)
 
-    def place_std_px(self) -> float:
-        """How well it is known where rows belong, as the middles of their exposures show them: rms, each axis.
+    def position_std_px(self) -> float:
+        """RMS uncertainty of the rows' positions at mid-exposure after straightening, per axis.
 
-        What is unknown of the speed adds up over the time from the instant that is restored.
+        The speed error accumulates over the time between a row's mid-exposure and the reference time.
         """
         motion = self.motion
         if motion.exposure_s <= 0:
@@ -163,9 +165,10 @@ class RefinedMotion:
 def missing_turn(
     runs: Sequence[Sequence[PairTurn | None]], motions: Sequence[RowMotion], trajectory: Trajectory
 ) -> MissingTurn | None:
-    """Measure it on runs of consecutive pairs; None where the pairs agree with the prediction, or are too few.
+    """Measure the missing rotation on runs of consecutive pairs.
 
-    motions: of frames whose exposures are typical.  trajectory: as predicted.
+    None with fewer than two pairs, or if they agree with the prediction, or if the path error is negligible.  motions:
+    of frames with typical exposures.  trajectory: as predicted.
     """
     turns = [turn for run in runs for turn in run if turn is not None]
     if len(turns) < 2 or not motions:
@@ -176,8 +179,8 @@ def missing_turn(
     variance = _variance(turns)
     if variance <= 0:
         return None
-    following, bend = believed_turn(runs, trajectory)
-    rest = max(_variance([following.left_of(turn, trajectory) for turn in turns]), 0.0)
+    following, bend = accepted_turn(runs, trajectory)
+    rest = max(_variance([following.residual_of(turn, trajectory) for turn in turns]), 0.0)
     bend = rest if bend is None else bend
     found = MissingTurn(
         float(np.sqrt(variance)),
@@ -192,7 +195,7 @@ def missing_turn(
 
 
 def following_turn(turns: Sequence[PairTurn], trajectory: Trajectory) -> FollowingTurn:
-    """The lag and the part that explain turns best, weighed against what is usual of both (ridge regression)."""
+    """Fit the lag and the part to pairs' missing rates, with their priors (ridge regression)."""
     design = np.concatenate([np.stack(_change_and_mean(turn, trajectory), -1) for turn in turns])
     rates = np.concatenate([turn.rate_rad_s for turn in turns])
     left = rates - design @ np.linalg.lstsq(design, rates, rcond=None)[0]
@@ -203,32 +206,32 @@ def following_turn(turns: Sequence[PairTurn], trajectory: Trajectory) -> Followi
 
 
 def _change_and_mean(turn: PairTurn, trajectory: Trajectory) -> tuple[Array, Array]:
-    """(3,) rad/s² that the predicted rate changes by over a turn's time, and (3,) rad/s its mean."""
+    """(3,) rad/s², mean rate of change of the predicted rate between a pair's frames, and (3,) rad/s, its mean."""
     rate_rad_s = trajectory.rate_rad_s(np.linspace(turn.start_s, turn.end_s, 17))
     mean = (rate_rad_s[1:] + rate_rad_s[:-1]).mean(axis=0) / 2
     return np.asarray((rate_rad_s[-1] - rate_rad_s[0]) / (turn.end_s - turn.start_s)), np.asarray(mean)
 
 
 def _variance(turns: Sequence[PairTurn]) -> float:
-    """Of the rates about 0, each axis, beyond that of their own errors."""
+    """Variance of the rates about 0, per axis, minus that of their measurement errors."""
     noise = np.mean([np.trace(t.covariance) / 3 for t in turns])
     return float(np.median([t.rate_rad_s @ t.rate_rad_s for t in turns]) / chi2_median(3) - noise)
 
 
-def believed_turn(
+def accepted_turn(
     runs: Sequence[Sequence[PairTurn | None]], trajectory: Trajectory
 ) -> tuple[FollowingTurn, float | None]:
-    """What follows from the predicted rate, if it makes the rest that smooth, and :func:`_bend` of that rest."""
+    """The fitted lag and part if they meet MOST_REMAINING, else zeros, and :func:`_bend` of the rest."""
     none, bend = FollowingTurn(), _bend(runs)
     if bend is None:
         return none, None
-    tried = following_turn([turn for run in runs for turn in run if turn is not None], trajectory)
-    left = _bend([[None if turn is None else tried.left_of(turn, trajectory) for turn in run] for run in runs])
-    return (tried, left) if left is not None and left < BELIEVED * bend else (none, bend)
+    fitted = following_turn([turn for run in runs for turn in run if turn is not None], trajectory)
+    left = _bend([[None if turn is None else fitted.residual_of(turn, trajectory) for turn in run] for run in runs])
+    return (fitted, left) if left is not None and left < MOST_REMAINING * bend else (none, bend)
 
 
 def _bend(runs: Sequence[Sequence[PairTurn | None]]) -> float | None:
-    """Variance of the rates about what neighbouring intervals on both sides tell, each axis; None: nowhere seen."""
+    """Variance, per axis, of the rates about the mean of the two adjacent intervals; None: no three in a row."""
     bends = [
         (here.rate_rad_s - (a.rate_rad_s + b.rate_rad_s) / 2, here.covariance + (a.covariance + b.covariance) / 4)
         for run in runs
@@ -239,13 +242,13 @@ def _bend(runs: Sequence[Sequence[PairTurn | None]]) -> float | None:
 
 
 def _path_change_px(motion: RowMotion, rate_rad_s: float) -> float:
-    """Pixels by which such a missing rate changes the blur path in the picture's middle."""
+    """Change, px, of the blur path in the picture's centre by such a missing rate."""
     profile = motion.profile
     centre = np.array([[(profile.width - 1) / 2, (profile.height - 1) / 2]])
     return float(np.abs(turn_jacobian_px(motion, centre)[0]).max() * rate_rad_s * motion.exposure_s)
 
 
 def _shrunk(turn: PairTurn, prior: Array) -> tuple[float, Array, Array]:
-    """(middle of the interval, rate, covariance) with the usual size of missing rates as a prior."""
+    """(middle of the interval, rate, covariance) after applying the prior covariance of missing rates."""
     gain = prior @ np.linalg.inv(prior + turn.covariance)
     return 0.5 * (turn.start_s + turn.end_s), gain @ turn.rate_rad_s, gain @ turn.covariance

@@ -1,7 +1,7 @@
-"""How far two neighbouring frames lie apart once the predicted motion is undone, tile by tile.
+"""Residual shift between two neighbouring frames after compensating the predicted motion, tile by tile.
 
-Never sharp against blurred: the first frame is blurred along the second one's paths and the second along the first
-one's, so both are the same blur of one scene, and only a shift is left between them.
+Both are compared under the same blur: the first frame is blurred along the second one's paths and the second along the
+first one's, so only a shift remains between them.
 """
 
 from __future__ import annotations
@@ -41,66 +41,67 @@ from virest.restoration.neighbours.reduced_tiles import (
 
 Array = NDArray[np.float64]
 LEAST_TILES = 4
-"""A turn has three unknowns and a tile's shift tells two; fewer tiles leave nothing to check it by."""
+"""A rotation has three unknowns and a tile's shift gives two equations; fewer tiles leave too little redundancy."""
 FAR_PX = 3.0
-"""A common shift beyond this is taken out before the fits, in reduced pixels: tiles then show the same again."""
+"""Compensate a larger common shift, reduced pixels, before the fits, so that tiles show the same content."""
 CLIPPED_LIGHT = 0.95
-"""Brighter places are not judged: light that was clipped cannot be blurred again."""
+"""Brighter pixels are not compared: clipped light cannot be blurred again."""
 LEAST_SEEN = 0.5
-"""Part of a tile that must be seen for it to be judged."""
+"""Least fraction of a tile that must be comparable."""
 HUBER = 1.5
-"""Standard deviations beyond which a tile's weight falls (95 % efficiency at normal errors is 1.345)."""
+"""Standard deviations beyond which a tile's weight falls (1.345 gives 95 % efficiency for normal errors)."""
 ROBUST_STEPS = 8
 WORST_CONDITION = 1e12
-"""Of the normal equations: beyond it nothing of a turn about some axis is seen."""
+"""Condition number of the normal equations above which rotation about some axis is unobservable."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairTurn:
-    """The turn rate that the prediction lacks between two frames, by what they show."""
+    """The rotation rate that the prediction lacks between two frames, measured on them."""
 
     start_s: float
-    """Middle of the exposure of the first frame's middle row, IMU clock."""
+    """Mid-exposure of the first frame's middle row, IMU clock."""
     end_s: float
-    """The same of the second frame."""
+    """The same for the second frame."""
     rate_rad_s: Array
-    """(3,) to be added, camera axes: x_t' = exp(rate · t) x_t."""
+    """(3,) rate to be added, camera axes: x_t' = exp(rate · t) x_t."""
     covariance: Array
-    """(3, 3) of the rate, by the scatter of the tiles."""
+    """(3, 3) covariance of the rate, from the tiles' scatter."""
     scatter_px_s: float
-    """One standard deviation, per axis, of the tiles' speeds about the fitted turn: relief, moving things, noise."""
+    """Standard deviation, per axis, of the tiles' speeds about the fitted rotation: relief, moving objects, noise."""
     tiles: int
+    """Number of tiles used."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTiles:
-    """Tiles of a reduced frame and their kernels, to be compared with those of any of its neighbours."""
+    """Tiles of a reduced frame and their kernels, to be compared with those of its neighbours."""
 
     tops_lefts: NDArray[np.intp]
-    """(n, 2) in the reduced picture."""
+    """(n, 2) positions in the reduced picture."""
     times: int
-    """How many times smaller that is."""
+    """Recorded size over reduced size."""
     light: Image
-    """The whole of it."""
+    """The whole reduced picture, linear light."""
     means: Array
-    """(n,) of the light."""
+    """(n,) mean light of each tile."""
     spectra: NDArray[np.complex64]
-    """(n, WIDE, WIDE / 2 + 1) of the light with what lies around."""
+    """(n, WIDE, WIDE / 2 + 1) spectra of the tiles' light with margins."""
     kernels: NDArray[np.complex64]
-    """(n, WIDE, WIDE / 2 + 1) transposes of the kernels."""
+    """(n, WIDE, WIDE / 2 + 1) spectra of the transposed kernels."""
 
     @property
     def centres_px(self) -> Array:
-        """(n, 2) in the recorded picture."""
+        """(n, 2) tile centres in the recorded picture."""
         return full_px(self.tops_lefts, self.times, (TILE - 1) / 2)
 
 
 def frame_tiles(
     light: Image, profile: CameraProfile, field: Callable[[Array], KernelField], everywhere: bool = False
 ) -> FrameTiles | None:
-    """Tiles of a frame's light, from :func:`reduced_light`; None where a path does not fit into a tile.
+    """Tiles of a frame's light, from :func:`reduced_light`; None if a path does not fit into half a tile.
 
-    everywhere: tiles all over the picture instead of a few.
+    everywhere: cover the whole picture instead of MOST_TILES tiles.
     """
     times = reduction(profile.height, profile.width)
     tops_lefts = spread_tiles(light.shape[0], light.shape[1], light.size if everywhere else MOST_TILES)
@@ -113,7 +114,7 @@ def frame_tiles(
 
 
 def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | None:
-    """The turn rate missing between two frames; None where they do not show it.
+    """The rotation rate missing between two frames; None if it cannot be measured on them.
 
     first, second: from :func:`reduced_light`, of the view's frame and its neighbour.
     """
@@ -126,7 +127,7 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
         return None
     a, apart = spectra_of(inner(tiles.spectra * there)), np.zeros(2)
     for _ in range(2):
-        b = wide_spectra(_brought(view, second, times, apart), tops_lefts)
+        b = wide_spectra(_registered(view, second, times, apart), tops_lefts)
         b = spectra_of(inner(b * tiles.kernels))
         common = common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
@@ -138,50 +139,50 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
 
 @dataclass(frozen=True, slots=True)
 class TileAgreement:
-    """How a neighbour's tiles agree with a frame's, each blurred as the other was and shifted onto it."""
+    """Comparison of a neighbour's tiles with a frame's, each blurred along the other's path."""
 
     tops_lefts: NDArray[np.intp]
-    """(n, 2) in the reduced picture."""
+    """(n, 2) positions in the reduced picture."""
     centres_px: Array
-    """(n, 2) in the frame."""
+    """(n, 2) tile centres in the frame."""
     shift_px: Array
-    """(n, 2): the neighbour shows at a predicted place what the frame has so far on."""
+    """(n, 2): the neighbour shows at the predicted position of x what the frame shows at x + shift."""
     precision: Array
-    """(n,) of the shifts, relative; 0: the tile shows something else."""
+    """(n,) relative precision of the shifts; 0: the tile shows different content."""
     here: NDArray[np.complex64]
-    """(n, WIDE, WIDE / 2 + 1) spectra of the frame's tiles, blurred, in light over its mean."""
+    """(n, WIDE, WIDE / 2 + 1) spectra of the frame's tiles, blurred, light over its mean."""
     there: Image
-    """(n, TILE, TILE) the neighbour's, blurred, in light over its mean."""
+    """(n, TILE, TILE) the neighbour's tiles, blurred, light over its mean."""
     gain: float
     """The neighbour's light over the frame's."""
     light: float
     """The frame's light, median of the tiles."""
     inside: NDArray[np.bool_]
-    """Of the reduced picture: where the neighbour has one."""
+    """At the reduced size: where the neighbour covers the frame."""
     clipped: NDArray[np.bool_]
-    """Of the reduced picture: where light that was too bright to be measured may reach, in either frame."""
+    """At the reduced size: where clipped light of either frame may reach."""
     blur_px: int
-    """How far both kernels reach together, reduced pixels."""
+    """Half the neighbour's longest blur path, reduced pixels, at most TILE / 4."""
     passed: Array
-    """(WIDE, WIDE / 2 + 1) mean of both kernels' |K|²: independent noise N makes the error Σ passed N."""
+    """(WIDE, WIDE / 2 + 1) sum of both kernels' mean |K|²: independent noise N makes the error Σ passed N."""
     times: int
-    """How many times smaller the compared pictures are."""
+    """Recorded size over reduced size."""
 
     def differences(self, shift_px: Array, numbers: NDArray[np.intp] | slice = slice(None)) -> Image:
-        """What the frame's tiles, so far (n, 2) on, have less than the neighbour's: (n, TILE, TILE), light over mean.
+        """The neighbour's tiles minus the frame's shifted by shift_px (n, 2): (n, TILE, TILE), light over its mean.
 
-        numbers: of those tiles.
+        numbers: indices of the tiles.
         """
         return np.asarray(self.there[numbers] - inner(shifted(self.here[numbers], shift_px / self.times)))
 
     def shown(self) -> Image:
-        """What both show, (n, TILE, TILE), in light over its mean."""
+        """Contrast of the neighbour's tiles, (n, TILE, TILE): light over its mean, minus 1."""
         return self.there - 1
 
     def side_by_side(self, tiles: Image) -> Image:
-        """Tiles (n, TILE, TILE) as a picture (height, width) of the reduced size.
+        """Tiles (n, TILE, TILE) assembled into a picture (height, width) of the reduced size.
 
-        Nearer to its edges than the blur reaches, where what lies beyond decides, stands what is next to that.
+        A border of blur_px, which depends on content beyond the picture, is replaced by reflection of the inside.
         """
         height, width = self.tops_lefts.max(axis=0) + TILE
         whole = np.zeros((height, width), np.float32)
@@ -192,12 +193,12 @@ class TileAgreement:
 
     @property
     def wholly_seen(self) -> NDArray[np.bool_]:
-        """(n,) whether the neighbour shows all of a tile."""
+        """(n,) whether the neighbour covers all of a tile."""
         seen = self.inside.astype(np.float32)
         return np.asarray(cut(seen, self.tops_lefts).min(axis=(1, 2)) > 0)
 
     def over_picture(self, values: Array) -> Image:
-        """The largest of tiles (n,) and those beside them, at all places (height, width) of the reduced size."""
+        """Tiles' values (n,), each the largest of its 3 × 3 neighbourhood, interpolated to the reduced size."""
         rows = len(np.unique(self.tops_lefts[:, 0]))
         height, width = self.tops_lefts.max(axis=0) + TILE
         largest = cv2.dilate(values.reshape(rows, -1).astype(np.float32), np.ones((3, 3), np.uint8))
@@ -206,7 +207,8 @@ class TileAgreement:
     def expected_error(self, frequency: Array, noise: Array, slope: float) -> float:
         """The mean square difference that independent noise makes, in light over its mean.
 
-        noise: (rings,) power in grey levels at frequencies in cycles per recorded pixel.  slope: grey levels per light.
+        noise: (rings,) power, grey levels squared, at ``frequency``, cycles per recorded pixel.  slope: grey levels per
+        unit of light.
         """
         recorded = radii(WIDE) / self.times
         power = np.interp(recorded, frequency, noise) / (self.times * slope * max(self.light, 1e-6)) ** 2
@@ -216,9 +218,9 @@ class TileAgreement:
 def tile_agreement(
     view: NeighbourView, tiles: FrameTiles, field: Callable[[Array], KernelField], second: Image
 ) -> TileAgreement | None:
-    """Compare a frame's tiles with its neighbour's reduced picture; None where a path does not fit into a tile.
+    """Compare a frame's tiles with its neighbour's reduced picture; None if a path does not fit into half a tile.
 
-    field: of the neighbour's kernels, from the view.
+    field: the neighbour's kernels, from the view.  second: the neighbour, from :func:`reduced_light`.
     """
     kernels = kernel_spectra(field, tiles.tops_lefts, tiles.times)
     if kernels is None:
@@ -240,7 +242,7 @@ def tile_agreement(
         float(np.median(cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
         _inside(source, second),
-        _near_lamps(tiles.light, there, blur_px) > 0,
+        _near_clipped_light(tiles.light, there, blur_px) > 0,
         blur_px,
         np.asarray(power_of(tiles.kernels).mean(axis=0) + power_of(kernels).mean(axis=0)),
         tiles.times,
@@ -248,7 +250,7 @@ def tile_agreement(
 
 
 def _reach_px(field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int) -> int:
-    """Half of the longest path of a neighbour's kernels, reduced pixels, rounded up."""
+    """Half the longest path of a neighbour's kernels, reduced pixels, rounded up."""
     centres_px = full_px(tops_lefts, times, (TILE - 1) / 2)
     return int(np.ceil(0.5 * field(centres_px).length_px.max() / times))
 
@@ -256,14 +258,15 @@ def _reach_px(field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp
 def judged_change(
     view: NeighbourView, recorded: Image, restored: Image, second: Image
 ) -> tuple[float, float, float, float] | None:
-    """What restoring a frame gains by a neighbour's account, what it changed, and what was and is left.
+    """Judge the restoration of a frame by a neighbour: its gain, its change, and the error before and after.
 
-    With D what restoring changed, M what the recorded frame lacks of the neighbour, both blurred as that one was, and G
-    what the neighbour shows: |M|² − |M − D|² and |D|², mean squares in grey levels, and |M|² and |M − D|² over |G|².
-    What only shifts a tile is no error of the blur: both pictures are shifted alike.  Tiles that the neighbour
-    does not show whole are left out, and places that light may reach that the frame does not show: what was clipped,
-    and what lies beyond its edges.  All are reduced; None where a path does not fit into a tile, or where less than
-    LEAST_TILES tiles are seen, by half at least.
+    Let D be the change by restoring and M the neighbour's picture minus the recorded frame, frames blurred along the
+    neighbour's path, and G the neighbour's picture.  Returns |M|² − |M − D|² and |D|², mean squares in grey levels
+    squared, and |M|² / |G|² and |M − D|² / |G|².  A shift of a tile is not an error of the blur, so recorded and
+    restored tiles are shifted onto the neighbour.  Left out are tiles that the neighbour does not fully cover, and
+    pixels that the blur reaches from clipped light or from beyond the frame's edges.  All pictures are reduced.  None
+    if a path does not fit into half a tile, or if fewer than LEAST_TILES tiles are usable over at least LEAST_SEEN of
+    their area.
     """
     times = reduction(view.frame.profile.height, view.frame.profile.width)
     tops_lefts, field = spread_tiles(*recorded.shape), view.field()
@@ -272,7 +275,7 @@ def judged_change(
         return None
     source = view.map_px(times=times)
     brought = read_at(second, source)
-    unknown = _near_lamps(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
+    unknown = _near_clipped_light(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
     seen = cut(np.float32(1) - unknown, tops_lefts)
     b = spectra_of(cut(brought, tops_lefts), seen)
     onto = [spectra_of(inner(wide_spectra(picture, tops_lefts) * kernels), seen) for picture in (recorded, restored)]
@@ -293,7 +296,7 @@ def judged_change(
 
 
 def _levels_per_part(tiles: Image, profile: CameraProfile) -> Image:
-    """Grey levels that a change by a part of the mean light makes in each tile, (n, 1, 1)."""
+    """Grey levels per unit of light over the tile's mean, (n, 1, 1)."""
     curve = profile.response or ResponseCurve("srgb")
     light = tiles.mean(axis=(1, 2), keepdims=True)
     grey = np.rint(255 * curve.encode(light)).astype(np.uint8)
@@ -301,25 +304,25 @@ def _levels_per_part(tiles: Image, profile: CameraProfile) -> Image:
 
 
 def _inside(source: NDArray[np.float32], second: Image) -> NDArray[np.bool_]:
-    """Whether a map (h, w, 2) finds something in the neighbour's picture."""
+    """Where a map (h, w, 2) points inside the neighbour's picture."""
     height, width = second.shape
     return np.asarray(cv2.inRange(source, (-0.5, -0.5), (width - 0.5, height - 0.5)) > 0)
 
 
-def _near_lamps(light: Image, there: Image, reach_px: int, beyond: int = 0) -> NDArray[np.uint8]:
-    """1 where light that was too bright to be measured may reach, in either of two reduced pictures of one scene.
+def _near_clipped_light(light: Image, there: Image, reach_px: int, beyond: int = 0) -> NDArray[np.uint8]:
+    """1 where clipped light of either of two registered reduced pictures may reach by blur.
 
-    beyond: 1 if what lies beyond their edges is not to reach either.
+    beyond: 1 to mark also what light from beyond their edges may reach.
     """
-    lamps = (cv2.max(light, there) > CLIPPED_LIGHT).astype(np.uint8)
+    clipped_light = (cv2.max(light, there) > CLIPPED_LIGHT).astype(np.uint8)
     around = np.ones((4 * reach_px + 1, 4 * reach_px + 1), np.uint8)
-    return cv2.dilate(lamps, around, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
+    return cv2.dilate(clipped_light, around, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
 
 
-def _brought(view: NeighbourView, second: Image, times: int, apart: Array) -> Image:
-    """The neighbour's reduced picture where the prediction puts the frame's, less a common shift (2,), reduced pixels.
+def _registered(view: NeighbourView, second: Image, times: int, apart: Array) -> Image:
+    """The neighbour's reduced picture registered by the prediction, minus a common shift (2,), reduced pixels.
 
-    Row by row: over the rows of a tile, 5 ms, a hand's shake bends the map by up to half a pixel.
+    The map is computed per row: over the rows of a tile, 5 ms, hand shake bends it by up to half a pixel.
     """
     return read_at(second, view.map_px(lambda p: p - times * apart, times))
 
@@ -327,13 +330,13 @@ def _brought(view: NeighbourView, second: Image, times: int, apart: Array) -> Im
 def _turn(
     view: NeighbourView, tops_lefts: NDArray[np.intp], times: int, shift: Array, precision: Array
 ) -> PairTurn | None:
-    """Fit one turn rate to the tiles' shifts, by Huber's weights."""
+    """Fit one rotation rate to the tiles' shifts with Huber's weights; None: too few tiles, or ill-conditioned."""
     used = precision > 0
     if np.count_nonzero(used) < LEAST_TILES:
         return None
     centres_px = full_px(tops_lefts, times, (TILE - 1) / 2)[used]
     apart_s = view.apart_s(centres_px)
-    speed = -shift[used] * times / apart_s[:, None]  # b(x) = a(x + d): the neighbour saw x + d where x was predicted
+    speed = -shift[used] * times / apart_s[:, None]  # b(x) = a(x + d): the neighbour shows x + d where x was predicted
     jacobian = turn_jacobian_px(view.frame, centres_px)
     weight = precision[used] / precision[used].max()
     robust, squares = np.ones_like(weight), np.einsum("nki,nkj->nij", jacobian, jacobian)
@@ -345,7 +348,7 @@ def _turn(
         rate = np.linalg.solve(normal, np.einsum("n,nki,nk->i", both, jacobian, speed))
         left = speed - jacobian @ rate
         distance = np.linalg.norm(left, axis=1)
-        typical = max(float(np.median(distance)) / 1.1774, 1e-9)  # of a plane normal distribution
+        typical = max(float(np.median(distance)) / 1.1774, 1e-9)  # median of a 2-D normal distribution's radius
         robust = np.minimum(1.0, HUBER * typical / np.maximum(distance, 1e-12))
     freedom = max(2 * len(left) - 3, 1)
     variance = float((both[:, None] * left**2).sum() / both.sum() * 2 * len(left) / freedom) / 2

@@ -1,4 +1,4 @@
-"""Frames as they pass, each with its neighbours in the movie."""
+"""Stream of frames, each with its neighbours in the movie."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.joint import (
     NeighbourPicture,
-    NeighbourPlace,
+    NeighbourRegistration,
     half_size,
     is_detailed,
-    most_telling,
-    neighbour_picture,
-    neighbour_place,
+    most_useful,
+    register_neighbour,
+    resample_neighbour,
     rings_passed,
 )
 from virest.restoration.neighbours.reduced_tiles import reduced_light
@@ -43,36 +43,36 @@ from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureSt
 from virest.restoration.statistics.rings import RINGS
 
 TYPICAL_WEIGHTS = (1.0, 0.95, 0.85)
-"""What neighbours one, two, and three or more frames away weighed in the mean before any was chosen: on four simulated
+"""Mean weights of neighbours one, two, and three or more frames away, all neighbours included: on four simulated
 captures, a shake, a pan, a walk and photographs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """One frame, decoded, and how the camera is predicted to have moved."""
+    """One decoded frame with its predicted motion."""
 
     frame: Frame
     picture: NDArray[np.uint8]
     """(height, width, 3) RGB, or the luma alone, (height, width)."""
     motion: RowMotion | None
-    """None: no focal length."""
+    """None: focal length unknown."""
     outside: str = ""
-    """Why its motion is not known, where it reaches beyond the inertial data."""
+    """Why its motion is unknown, if it reaches beyond the inertial data; else empty."""
     recorded: NDArray[np.uint8] | None = None
-    """As it was recorded, where ``picture`` is without the phone's sharpening; None: ``picture`` is."""
+    """The recorded picture, if the phone's sharpening was undone in ``picture``; None: ``picture`` is as recorded."""
     coding_step: float | None = None
-    """Step of the coder's quantiser, grey levels; None: not known."""
+    """The coder's quantiser step, grey levels; None: unknown."""
 
     @property
     def usable(self) -> bool:
-        """Whether it tells its neighbours anything."""
+        """Whether its motion and exposure are known, so that it can be compared with its neighbours."""
         return self.motion is not None and not self.outside and self.motion.exposure_s > 0
 
 
 def with_neighbours(
     sights: Iterable[Sight], reach: int
 ) -> Iterator[tuple[tuple[Sight, ...], Sight, tuple[Sight, ...]]]:
-    """Each frame with up to ``reach`` before and after it, in order; holds 2 reach + 1 at a time."""
+    """Yield each frame with up to ``reach`` frames before and after it, in order; holds 2 reach + 1 at a time."""
     window: deque[Sight] = deque()
     here = 0
     for sight in sights:
@@ -93,13 +93,13 @@ def _around(window: Sequence[Sight], here: int, reach: int) -> tuple[tuple[Sight
 
 
 class FrameNeighbours:
-    """What passing frames' neighbours tell: the turn that the prediction lacks, and further measurements.
+    """Uses neighbours to refine each frame's motion, and registers them for joint restoration.
 
-    A pair is compared once, for the frame before it and for the one after it.
+    Each pair of frames is compared once and the result reused.
     """
 
     def __init__(self, trajectory: Trajectory, lens: MovingLens, missing: MissingTurn | None) -> None:
-        """lens: of the whole trajectory.  missing: what the capture usually lacks; None: nothing."""
+        """lens: of the whole trajectory.  missing: the capture's missing rotation; None: none."""
         self._trajectory, self._lens, self._missing = trajectory, lens, missing
         self._light: dict[int, Image] = {}
         self._full: dict[int, tuple[Image, Image]] = {}
@@ -107,7 +107,10 @@ class FrameNeighbours:
         self._turns: dict[int, PairTurn | None] = {}
 
     def refined(self, before: Sequence[Sight], here: Sight, after: Sequence[Sight]) -> RefinedMotion | None:
-        """The frame's motion by its neighbours; one that does not follow in the movie tells nothing."""
+        """The frame's motion refined by its neighbours; None if the capture lacks no rotation.
+
+        Pairs that are not consecutive in the movie are not used.
+        """
         assert here.motion is not None
         self._forget_before(here.frame.index - max(len(before), 1))
         if self._missing is None:
@@ -124,36 +127,36 @@ class FrameNeighbours:
         luma: PictureStatistics,
         field: Callable[[NDArray[np.float64]], KernelField],
     ) -> tuple[NeighbourPicture, ...]:
-        """At most ``most`` of a frame's neighbours, those with the most telling blur, brought to its pixels.
+        """Register at most ``most`` of a frame's neighbours, chosen by how much they reduce the ideal filter's error.
 
-        A neighbour is predicted to weigh as is usual so far from a frame.  One that was looked at counts by what was
-        measured, and those at least as far from the frame are then expected to be no better than it was: before relief
-        near ones lie closer, and they are taken instead.
+        A neighbour's weight is first predicted from its distance in frames.  Once registered, the measured weight
+        counts, and neighbours at least as far from the frame are expected to lose as much: in scenes with relief,
+        nearer neighbours are then preferred.
 
-        luma: what was measured on the frame's.  field: of its kernels.
+        luma: the frame's statistics.  field: its kernels.
         """
         assert here.motion is not None
         left = {other.frame.index: other for other in around if other.usable and other.frame.index != here.frame.index}
         if not left or not most:
             return ()
         tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
-        found: dict[int, NeighbourPlace] = {}
+        found: dict[int, NeighbourRegistration] = {}
         taken: list[int] = []
         sights = dict(left)
-        passed = {n: _finer(other, here) * self._passed_of(other, here) for n, other in left.items()}
+        passed = {n: _coding_noise_ratio(other, here) * self._passed_of(other, here) for n, other in left.items()}
         while tiles is not None and left and len(taken) < most:
             sum_taken = np.sum([np.zeros(RINGS), *(passed[number] for number in taken)], axis=0)
-            number = list(left)[most_telling([passed[n] for n in left], sum_taken, luma)]
+            number = list(left)[most_useful([passed[n] for n in left], sum_taken, luma)]
             if number in found:
                 taken.append(number)
                 del left[number]
                 continue
-            place = self._place(here, left[number], refined, tiles, luma)
-            if place is None or place.weight == 0:
+            registration = self._registration(here, left[number], refined, tiles, luma)
+            if registration is None or registration.weight == 0:
                 del left[number]
                 continue
-            found[number] = place
-            measured = place.passed(luma.frequency)
+            found[number] = registration
+            measured = registration.passed(luma.frequency)
             share = np.minimum(measured / np.maximum(passed[number], 1e-12), 1.0)
             apart = abs(number - here.frame.index)
             for other in left:
@@ -161,12 +164,12 @@ class FrameNeighbours:
                     passed[other] = passed[other] * share
             passed[number] = measured
         detailed = {n: is_detailed(replace(luma, passed=self._passed[n])) for n in taken}
-        return tuple(neighbour_picture(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
+        return tuple(resample_neighbour(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
 
-    def _place(
+    def _registration(
         self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
-    ) -> NeighbourPlace | None:
-        """Where a neighbour lies in the frame; None where it shows something else."""
+    ) -> NeighbourRegistration | None:
+        """Register a neighbour to the frame; None if it shows different content or its path is too long."""
         assert here.motion is not None
         assert other.motion is not None
         curve, further = here.motion.profile.response or ResponseCurve("srgb"), refined.further if refined else None
@@ -178,17 +181,19 @@ class FrameNeighbours:
         level = 255 * float(curve.encode(np.array(agreement.light)))
         slope = float(np.interp(level, np.arange(256), curve.slope_table()))
         error = agreement.expected_error(luma.frequency, luma.noise, slope)
-        place = neighbour_place(view, along, other.frame.index, agreement, error)
-        return None if place is None else replace(place, finer=_finer(other, here))
+        registration = register_neighbour(view, along, other.frame.index, agreement, error)
+        return (
+            None if registration is None else replace(registration, coding_noise_ratio=_coding_noise_ratio(other, here))
+        )
 
-    def knowing(self, missing: MissingTurn | None) -> FrameNeighbours:
-        """The same, and what was found already, with what the capture lacks."""
+    def with_missing_turn(self, missing: MissingTurn | None) -> FrameNeighbours:
+        """A copy with the capture's missing rotation, which shares the pair comparisons made so far."""
         found = FrameNeighbours(self._trajectory, self._lens, missing)
         found._light, found._turns = self._light, self._turns
         return found
 
     def turn(self, first: Sight, second: Sight) -> PairTurn | None:
-        """The turn rate missing between a frame and the next; None: it is not the next, or one tells nothing."""
+        """The rotation rate missing between two frames; None if not consecutive, or if either is unusable."""
         number = first.frame.index
         if second.frame.index != number + 1:
             return None
@@ -201,13 +206,13 @@ class FrameNeighbours:
         return self._turns[number]
 
     def light(self, sight: Sight) -> Image:
-        """A usable frame's luma in linear light, reduced."""
+        """A usable frame's luma in linear light, reduced and cached."""
         if sight.frame.index not in self._light:
             self._light[sight.frame.index] = light_of(sight)
         return self._light[sight.frame.index]
 
     def _passed_of(self, sight: Sight, here: Sight) -> NDArray[np.float64]:
-        """(RINGS,) mean |K|² over a frame's picture, with the weight that is usual so far from another frame."""
+        """(RINGS,) mean |K|² over a neighbour's picture, times the typical weight at its distance from the frame."""
         assert sight.motion is not None
         if sight.frame.index not in self._passed:
             width, height = sight.motion.profile.width, sight.motion.profile.height
@@ -228,11 +233,11 @@ class FrameNeighbours:
                 del kept[old]  # type: ignore[attr-defined]
 
 
-def _finer(other: Sight, here: Sight) -> float:
-    """The noise of a frame over that of another, by the steps with which both were coded; 1 where they are not known.
+def _coding_noise_ratio(other: Sight, here: Sight) -> float:
+    """The frame's noise over the neighbour's, as the ratio of their coding steps; 1 if these are unknown.
 
-    What a coder leaves wrong grew as its step to the power of 1.15 from frame to frame on five simulated captures at
-    0.25 bits a pixel (40 frames, correlation 0.86): less than as its square, for what lies below the step is dropped.
+    Coding noise grew as the step to the power of 1.15 between frames on five simulated captures at 0.25 bits per pixel
+    (40 frames, correlation 0.86): less than as its square, since the coder drops what lies below the step.
     """
     if here.coding_step is None or other.coding_step is None:
         return 1.0
@@ -247,7 +252,7 @@ def light_of(sight: Sight) -> Image:
 
 
 def _luma_and_half(sight: Sight) -> tuple[Image, Image]:
-    """Luma of a frame's light, (height, width), and its light at half the size, (height / 2, width / 2, 3)."""
+    """Luma of a frame's linear light, (height, width), and its light at half the size, (height / 2, width / 2, 3)."""
     assert sight.motion is not None
     light = cv2.LUT(sight.picture, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
     weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
@@ -262,11 +267,11 @@ def _linear(curve: ResponseCurve) -> NDArray[np.float32]:
 def turn_between(
     first: Sight, second: Sight, first_light: Image, second_light: Image, trajectory: Trajectory, lens: MovingLens
 ) -> PairTurn | None:
-    """The turn rate missing between two frames; None where one of them tells nothing. lens: of the trajectory."""
+    """The rotation rate missing between two frames; None if either is unusable.  lens: of the trajectory."""
     if not first.usable or not second.usable:
         return None
     assert first.motion is not None
     assert second.motion is not None
-    if first.motion.start_s == second.motion.start_s:  # a repeated picture shows nothing of another instant
+    if first.motion.start_s == second.motion.start_s:  # a repeated picture shows the same instant
         return None
     return pair_turn(neighbour_view(first.motion, second.motion, trajectory, lens), first_light, second_light)

@@ -1,4 +1,4 @@
-"""What a capture's neighbouring frames show of the prediction, asked once at planning on a few runs of frames."""
+"""Measure missing rotation and confirmed gain on a few runs of consecutive frames, once per capture at planning."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from virest.restoration.neighbours.registration import judged_change
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 
 RUN_FRAMES = 4
-"""Three pairs: what linear interpolation leaves of the middle one shows."""
+"""Length of a run: three pairs, so that the middle one tests linear interpolation between the outer ones."""
 MOST_RUNS = 4
 TELLING_PX = 3.0
-"""Paths of this length cancel a third of a cycle per pixel, and frames are compared up to a quarter.  On eleven
-simulated captures 36 of 38 shares of frames with longer paths were positive, of those with 1 to 2.5 px 12 of 40."""
+"""Blur paths of this length cancel ⅓ cycle per pixel; frames are compared up to ¼.  On eleven simulated captures 36 of
+38 shares of frames with longer paths were positive, against 12 of 40 for paths of 1 to 2.5 px."""
 Picture = NDArray[np.uint8]
 
 
 def survey_runs(numbers: Iterable[int], path_px: Mapping[int, float]) -> list[tuple[int, ...]]:
-    """Runs of consecutive frames among those at hand: the most blurred of each unbroken stretch, evenly over these.
+    """At most MOST_RUNS runs of consecutive frames, the most blurred of each unbroken stretch, evenly spaced.
 
-    path_px: about how long the blur path of each frame is.
+    numbers: frames to choose from.  path_px: approximate blur path length by frame index.
     """
     ordered = np.array(sorted(numbers), np.intp)
     if not len(ordered):
@@ -48,10 +48,10 @@ def survey_runs(numbers: Iterable[int], path_px: Mapping[int, float]) -> list[tu
     return [runs[k] for k in chosen if len(runs[k]) > 1]
 
 
-def kept_lumas(
+def store_lumas(
     pictures: Iterable[tuple[int, Picture]], wanted: Iterable[int], into: dict[int, Picture]
 ) -> Iterator[tuple[int, Picture]]:
-    """Pass lumas on by their index, and keep those that are wanted."""
+    """Pass (index, luma) pairs through, and store the wanted ones in ``into``."""
     chosen = set(wanted)
     for index, luma in pictures:
         if index in chosen:
@@ -62,7 +62,7 @@ def kept_lumas(
 def survey_turns(
     runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours, trajectory: Trajectory
 ) -> MissingTurn | None:
-    """What the predicted turns lack by these runs of frames; None: nothing of significance, or it cannot be told."""
+    """The rotation that the prediction lacks, from runs of frames; None: not significant, or not measurable."""
     motions: list[RowMotion] = [s.motion for s in sights.values() if s.usable and s.motion is not None]
     turns = [
         [neighbours.turn(sights[a], sights[b]) if a in sights and b in sights else None for a, b in pairwise(run)]
@@ -77,25 +77,25 @@ def survey_gain(
     neighbours: FrameNeighbours,
     trajectory: Trajectory,
     lens: MovingLens,
-    tried: Callable[[Sight, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
+    restore: Callable[[Sight, RowMotion, RefinedMotion | None], tuple[Image, Image] | None],
 ) -> ConfirmedGain | None:
-    """What deblurring gains by the neighbours' account.
+    """The gain of deblurring that neighbours confirm; None: not measurable.
 
-    tried: luma of a frame's light, as recorded and as restored, at the middle of its exposures and reduced; None: it is
-    left alone.  One blurred frame of each run is restored, and one more where runs are few.  Each is compared with both
-    its neighbours; if neither can judge it, the next frame takes its place.
+    restore: returns a frame's luma of light as recorded and as restored, at mid-exposure and reduced, or None if it is
+    not deblurred.  One blurred frame per run is restored, and one more if there are fewer than MOST_RUNS runs.  Each is
+    compared with both neighbours; if neither can judge it, the next candidate takes its place.
     """
     found: list[tuple[float, float, float, float]] = []
     path_px = {n: path_length_px(s.motion) for n, s in sights.items() if s.usable and s.motion is not None}
     asked, most = 0, min(len(runs) + 1, MOST_RUNS)
-    for number in lively_frames(runs, path_px)[: 2 * most]:
+    for number in gain_test_candidates(runs, path_px)[: 2 * most]:
         if asked == most:
             break
         before, here, after = (sights[number + step] for step in (-1, 0, 1))
         assert here.motion is not None
         refined = neighbours.refined((before,), here, (after,))
         motion = here.motion if refined is None else refined.motion
-        pictures = tried(here, motion, refined)
+        pictures = restore(here, motion, refined)
         if pictures is None:
             continue
         before_this = len(found)
@@ -110,11 +110,12 @@ def survey_gain(
     return confirmed_gain(found)
 
 
-def lively_frames(runs: Sequence[Sequence[int]], path_px: Mapping[int, float]) -> list[int]:
-    """Numbers of frames that lie between two others: the first telling one of each run, then the others.
+def gain_test_candidates(runs: Sequence[Sequence[int]], path_px: Mapping[int, float]) -> list[int]:
+    """Candidates for testing the gain, each between two usable frames: the best of each run, then the others.
 
-    A frame that was hardly blurred tells little: what restoring it changes is finer than the compared pictures show.
-    Those that tell come in the movie's order, then the most blurred.  path_px: length of each usable frame's blur path.
+    A frame with a short path is of little use: restoring it changes detail finer than the compared pictures resolve.
+    Frames with paths of TELLING_PX and more come first, in movie order, then the others, most blurred first.  path_px:
+    blur path length of each usable frame.
     """
     inner = [n for n in sorted(path_px) if n - 1 in path_px and n + 1 in path_px]
     ranked = sorted(inner, key=lambda n: -min(path_px[n], TELLING_PX))
@@ -124,6 +125,6 @@ def lively_frames(runs: Sequence[Sequence[int]], path_px: Mapping[int, float]) -
 
 
 def path_length_px(motion: RowMotion) -> float:
-    """Length of the blur path in the picture's middle."""
+    """Length of the blur path in the picture's centre."""
     middle_px = 0.5 * np.array([[motion.profile.width, motion.profile.height]])
     return float(np.linalg.norm(blur_chords(motion, middle_px)[0]))

@@ -1,4 +1,4 @@
-"""Measuring a picture: which tiles, and what of them."""
+"""Measure the noise and signal spectra of a picture: choose tiles, transform them, fit the rings."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from virest.restoration.statistics.rings import SIDE
 from virest.restoration.statistics.tile_power import (
     MANY_TILES,
     cut,
-    evenly_steep,
     known_part,
+    light_in_grey_levels,
     passed_power,
     white_noise,
     windowed_power,
 )
 
 _MAX_CLIPPED = 0.002
-"""Tiles with a larger part of clipped pixels are taken only where there are none better."""
+"""Use tiles with a larger fraction of clipped pixels only if too few tiles have less."""
 
 
 def measure_picture(
@@ -39,10 +39,10 @@ def measure_picture(
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
-    picture: (height, width, 3) RGB, or a luma (height, width), which then stands for the chroma too.  clipped: (height,
-    width), 1 where light was too much to be measured; it and what a path reaches from it are left out.  coding_step: of
-    the coder's quantiser of the luma, grey levels; None: not known.  Returns the statistics of luma and of chroma, both
-    colour differences together.
+    picture: (height, width, 3) RGB, or luma (height, width), whose statistics are then returned for the chroma too.
+    clipped: (height, width), 1 where light is clipped; such pixels, and those that a blur path reaches from them, are
+    left out.  coding_step: the coder's luma quantiser step, grey levels; None: unknown.  Returns the statistics of luma
+    and of chroma, the latter for both colour differences together.
     """
     corners = _corners(field, picture.shape[:2])
     if not corners or field.radius_px >= SIDE // 2:
@@ -50,7 +50,7 @@ def measure_picture(
     chosen = _least_clipped(clipped, corners, most_tiles)
     kernels = field.chosen(chosen).arrays()
     passed = np.stack([passed_power(kernel) for kernel in kernels])
-    real = 0.5 * (1 + passed - np.stack([passed_power(_less_one(kernel)) for kernel in kernels]))
+    real = 0.5 * (1 + passed - np.stack([passed_power(_minus_impulse(kernel)) for kernel in kernels]))
     known = [
         None if clipped is None else known_part(clipped, corners[i], k) for i, k in zip(chosen, kernels, strict=True)
     ]
@@ -62,7 +62,10 @@ def measure_picture(
 
     tiles = zip(chosen, known, strict=True)
     light = np.stack(
-        [windowed_power(evenly_steep(_luma_light(cut(picture, corners[i]), curve), curve), seen) for i, seen in tiles]
+        [
+            windowed_power(light_in_grey_levels(_luma_light(cut(picture, corners[i]), curve), curve), seen)
+            for i, seen in tiles
+        ]
     )
     luma, *red_blue = _planes(_some_rows(picture))
     cells, white_levels, grey = RingCells(passed), white_noise(luma), observed(0, range(len(parts)))
@@ -89,40 +92,40 @@ def measure_picture(
 
 
 def _planes(picture: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
-    """Luma and both colour differences of a picture (height, width, 3); a luma (height, width) by itself."""
+    """Luma and both colour differences of a picture (height, width, 3), or a luma (height, width) alone."""
     return (picture,) if picture.ndim == 2 else tuple(cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb)))
 
 
 def _most_colourful(parts: Sequence[tuple[NDArray[np.uint8], ...]]) -> NDArray[np.intp]:
-    """Numbers of the half of the tiles whose colours vary most, rising.
+    """Indices, ascending, of the half of the tiles whose colours vary most.
 
-    What others hold tells of no colour, and the filter that is best for them takes away what these have.
+    The others hold little colour, and a filter that is optimal for them would remove the colour of these.
     """
     spread = [sum(float(cv2.meanStdDev(plane)[1][0, 0]) ** 2 for plane in part[1:]) for part in parts]
     return np.sort(np.argsort(spread)[len(parts) // 2 :])
 
 
-def _less_one(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A kernel less the one that leaves all as it is."""
+def _minus_impulse(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A kernel minus the unit impulse."""
     left = kernel.copy()
     left[kernel.shape[0] // 2, kernel.shape[1] // 2] -= 1
     return left
 
 
 def _ring_means(cells: RingCells, values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(RINGS,) means of values at the places of the cells; ½ in rings without any, which then count for nothing."""
+    """(RINGS,) mean of values over each ring's cells; ½ in empty rings."""
     count = cells.count.sum(axis=1)
     return np.where(count > 0, (cells.count * cells.means(values)).sum(axis=1) / np.maximum(count, 1), 0.5)
 
 
 def _some_rows(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Every other four rows of a picture (height, width, ...): enough for :func:`white_noise`, which looks at such."""
+    """Rows 0 to 3 of every 8 of a picture (height, width, ...): enough for :func:`white_noise`, which samples rows."""
     height, width, *channels = picture.shape
     return picture[: height - height % 8].reshape(-1, 8, width, *channels)[:, :4].reshape(-1, width, *channels)
 
 
 def _luma_light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.float32]:
-    """Luma of the light of a tile (height, width, 3), (height, width); that of a luma's tile is its own."""
+    """Luma (height, width) of the linear light of a tile, (height, width, 3) or already luma (height, width)."""
     light = cv2.LUT(tile, curve.linear_table())
     if light.ndim == 2:
         return np.asarray(light, np.float32)
@@ -132,7 +135,7 @@ def _luma_light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.flo
 def _least_clipped(
     clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]], most_tiles: int
 ) -> NDArray[np.intp]:
-    """Numbers of the tiles to measure: at most ``most``, spread evenly over those with the least clipped light."""
+    """Indices of at most ``most_tiles`` tiles to measure, evenly spaced among those with the least clipped light."""
     chosen = np.arange(len(corners))
     if clipped is not None:
         parts = np.array([np.count_nonzero(cut(clipped, corner)) for corner in corners]) / SIDE**2

@@ -1,4 +1,4 @@
-"""Statistics of a picture as restoring takes them: most blurred places; long paths, defocus, doubt about the curve."""
+"""Statistics of a picture for restoration: tile selection, long blur paths, defocus, and tone-curve uncertainty."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from virest.restoration.statistics.rings import SIDE
 SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
 MIN_SAMPLES = 6
-"""Least number of measured tiles, the most blurred ones."""
+"""Measure at least this many tiles, the most blurred ones."""
 LARGEST_RADIUS = SIDE // 4
-"""Kernels of a larger radius leave too little of a measured tile that is not bent by its window."""
+"""Largest kernel radius, px: larger kernels leave too little of a tile that its window does not attenuate."""
 CURVE_SLOPE_STD = 0.1
-"""One standard deviation of the real tone curve's slope over the profile's, from one brightness to another.
+"""Standard deviation of the true tone curve's slope relative to the profile's, from one brightness to another.
 
-No phone keeps to a curve that nobody measured on it.  A slope that differs by ε makes an error of ε times the picture's
-own detail wherever brightness changes, blurred or not: ε² S beside the noise.  On 14 simulated captures 0.093 ± 0.011
-gains most (``python -m virest.app.bench --only fits``); no measured curves stand behind it."""
+A phone's true curve differs from one that was not measured on it.  A slope error ε makes an error of ε times the
+picture's own detail wherever brightness changes, blurred or not: extra noise ε² S.  On 14 simulated captures
+0.093 ± 0.011 gains most (``python -m virest.app.bench --only fits``); it is not based on measured curves."""
 _LEAST_FALL = 2.0
-"""The power of pictures falls with frequency at least so steeply: f⁻² is that of edges alone, without texture."""
+"""Least exponent of the fall of picture power with frequency: f⁻² is that of edges alone, without texture."""
 
 
 def most_blurred(motion: RowMotion, centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Centres (m, 2) of the tiles to measure on: the most blurred, and all that are blurred half as much.
+    """Centres (m, 2) of the tiles to measure: the MIN_SAMPLES most blurred, and all with half the longest path or more.
 
-    A path of a pixel cancels nothing, and tells no noise from signal; a coder's noise is where the motion is.
+    A path of 1 px cancels no frequency, so it cannot separate noise from signal; and coding noise is where motion is.
     """
     length_px = np.linalg.norm(blur_chords(motion, centres_px), axis=-1)
     ranked = np.sort(length_px)[::-1]
@@ -50,12 +50,12 @@ def picture_statistics(
     most_tiles: int,
     coding_step: float | None = None,
 ) -> tuple[PictureStatistics, PictureStatistics]:
-    """Statistics of luma and chroma of a picture (height, width, 3) or of a luma alone, (height, width).
+    """Statistics of luma and chroma of a picture (height, width, 3), or of luma alone (height, width).
 
-    Noise shows where the paths cancel; a Gaussian, the same all round, hides it.  So the paths alone are fitted, which
-    measures the noise and the defocused picture, and that is focused afterwards.  Paths too long for a tile are
-    measured on a picture that is smaller; the finer frequencies take the finest one's.  coding_step: as of
-    :func:`measure_picture`.
+    Noise shows where the motion paths cancel frequencies; Gaussian defocus, the same in all directions, would hide it.
+    So the fit uses the paths alone, which gives the noise and the spectrum of the defocused picture, and defocus is
+    divided out afterwards.  If paths are too long for a tile, the picture is measured at reduced size; frequencies
+    above the finest measured one take its values.  coding_step: as in :func:`measure_picture`.
     """
     sigma_px, times = np.asarray(field.defocus_sigma_px, float), 1
     field = replace(field, defocus_sigma_px=0.0)
@@ -68,18 +68,20 @@ def picture_statistics(
         coding_step = None if coding_step is None else coding_step / times
     found = measure_picture(picture, field, curve, clipped_anywhere(picture, curve), most_tiles, coding_step)
     luma, chroma = (
-        focused(one.scaled(times) if times > 1 and one.measured else one, sigma_px).with_error_share(CURVE_SLOPE_STD**2)
+        without_defocus(one.scaled(times) if times > 1 and one.measured else one, sigma_px).with_error_share(
+            CURVE_SLOPE_STD**2
+        )
         for one in found
     )
     return luma, chroma
 
 
-def focused(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64]) -> PictureStatistics:
-    """Spectra of the picture before a Gaussian came over it, of one size or of (n,) at the places that were measured.
+def without_defocus(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64]) -> PictureStatistics:
+    """Spectra of the picture before Gaussian defocus; sigma_px: one value, or (n,) for the measured tiles.
 
-    The Gaussian leaves next to nothing of high frequencies, and what is recorded there divided by next to nothing is no
-    picture: no scene's power falls slower than f⁻².  So S is held to that law ring by ring, and what was recorded
-    beyond it counts as noise; where less than the noise is left, S falls as f⁻³.
+    The Gaussian leaves almost nothing of high frequencies, so dividing by it there gives no valid spectrum.  No scene's
+    power falls more slowly than f⁻², so S is limited to that ring by ring, and recorded power beyond it counts as
+    noise.  Where the remaining signal is below the noise, S falls at least as f⁻³.
     """
     if not np.any(sigma_px) or not defocused.measured:
         return defocused
@@ -90,10 +92,10 @@ def focused(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64])
     signal[1:] = np.minimum.accumulate((signal * rise)[1:]) / rise[1:]
     passed = defocused.passed * left
     noise = np.maximum(defocused.noise, through - passed * signal)
-    drowned = np.flatnonzero(passed * signal < noise)
-    drowned = drowned[drowned > 0]
-    if len(drowned):
-        last = drowned[0] - 1
+    below_noise = np.flatnonzero(passed * signal < noise)
+    below_noise = below_noise[below_noise > 0]
+    if len(below_noise):
+        last = below_noise[0] - 1
         signal[last + 1 :] = np.minimum(signal, falling_power(frequency, signal, last))[last + 1 :]
     places = defocused.places and defocused.places.after(left)
     real, cells = defocused.real, defocused.cells

@@ -1,4 +1,4 @@
-"""Measured spectra spread over the packed spectrum of a tile that is restored."""
+"""Interpolate measured spectra onto the packed spectrum of a restored tile."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from virest.restoration.statistics.rings import RINGS, SIDE
 
 @lru_cache(maxsize=8)
 def packed_frequency(size: int) -> NDArray[np.float32]:
-    """Frequency in cycles per pixel of each place of OpenCV's packed spectrum, (size, size)."""
+    """Frequency, cycles per pixel, of each value of OpenCV's packed spectrum, (size, size)."""
     index = (np.arange(size) + 1) // 2
     along = np.minimum(np.arange(size), size - np.arange(size)) / size
     packed = np.hypot(along[:, None], index[None, :] / size)
@@ -24,7 +24,7 @@ def packed_frequency(size: int) -> NDArray[np.float32]:
 
 
 def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Real values over half a spectrum (size, size / 2 + 1), even about zero, on OpenCV's packed one (size, size)."""
+    """Real, even values over half a spectrum (size, size / 2 + 1), in OpenCV's packed layout (size, size)."""
     size = len(values)
     index = (np.arange(size) + 1) // 2
     found = values[:, index]
@@ -35,33 +35,33 @@ def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
 def on_spectrum(
     statistics: PictureStatistics, ring_values: Array, size: int, scale: float = 1.0, by_place: bool = True
 ) -> NDArray[np.float32]:
-    """Noise-to-signal of the rings spread over a packed spectrum of a tile; falls as f² below the lowest ring.
+    """The rings' noise-to-signal ratio interpolated to a tile's packed spectrum; falls as f² below the lowest ring.
 
-    scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.  by_place: where S
-    is uneven, by each place's own.
+    scale: pixels of the measured picture per pixel of the tile, 2 for a picture of half the size.  by_place: use the
+    per-frequency S where it was measured.
     """
     below, part, falling = _between_rings(size, _widening(statistics, scale))
     levels = np.log(ring_values).astype(np.float32)
     values = np.exp(levels[below] + part * np.append(np.diff(levels), np.float32(0))[below]) * falling
     if statistics.places is not None and by_place:
-        values = values / _spread_places(statistics.places.share, size, _widening(statistics, scale))
+        values = values / _resampled_places(statistics.places.share, size, _widening(statistics, scale))
     return np.asarray(values, np.float32)
 
 
 def _widening(statistics: PictureStatistics, scale: float) -> float:
-    """Pixels of the picture whose rings were measured per pixel of a tile."""
+    """Pixels of the picture on which the rings were measured, perhaps at reduced size, per pixel of a tile."""
     return scale * float(statistics.frequency[0] + statistics.frequency[-1]) / 0.5
 
 
-def _spread_places(share: NDArray[np.float32], size: int, scale: float) -> NDArray[np.float32]:
-    """Values at the places of a spectrum on a packed spectrum (size, size); the nearest beyond them."""
+def _resampled_places(share: NDArray[np.float32], size: int, scale: float) -> NDArray[np.float32]:
+    """Values per frequency interpolated to a packed spectrum (size, size); beyond them, the nearest."""
     rising = np.roll(share, SIDE // 2, axis=0)
-    return cv2.remap(rising, *_on_places(size, scale), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(rising, *_spectrum_coordinates(size, scale), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=8)
-def _on_places(size: int, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row, rows from the lowest frequency on, at which each place of a packed spectrum lies."""
+def _spectrum_coordinates(size: int, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row of the measured spectrum, rows from the lowest frequency up, for each packed value."""
     packed = (np.arange(size) + 1) // 2 / size
     fx, fy = (a.copy() for a in np.broadcast_arrays(packed[None, :], np.fft.fftfreq(size)[:, None]))
     fx[:, -1] = 0.5
@@ -71,7 +71,7 @@ def _on_places(size: int, scale: float) -> tuple[NDArray[np.float32], NDArray[np
 
 @lru_cache(maxsize=8)
 def _between_rings(size: int, scale: float) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
-    """Ring below each place of a packed spectrum, part of the way to the next one, and f² below the lowest ring."""
+    """For each packed value: ring below it, fraction of the way to the next, and factor f² below the lowest ring."""
     position = packed_frequency(size) / scale * (RINGS / 0.5) - 0.5
     held = np.clip(position, 0, RINGS - 1)
     below = np.floor(held).astype(np.intp)

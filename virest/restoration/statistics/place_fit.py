@@ -1,4 +1,7 @@
-"""Pictures whose power lies at few places of the spectrum: told by the rings' misfit, measured place by place."""
+"""Pictures whose power lies at few frequencies: detected by the rings' misfit, measured frequency by frequency.
+
+A place is one frequency (row and column) of a tile's spectrum.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +14,23 @@ from virest.restoration.statistics.rings import RINGS, axes, place_ring
 from virest.restoration.statistics.tile_power import MANY_TILES
 
 _LITTLE_MISFIT, _LARGE_MISFIT = 0.8, 1.1
-"""RMS of ln |G|² about the fit's, over its cells, below which rings are trusted fully, and above which not at all.
+"""RMS misfit of ln |G|² over the cells below which rings are fully trusted, and above which not at all.
 
-Of MANY_TILES; what fewer of them hold differs more from one to the next."""
+For MANY_TILES; fewer tiles scatter more."""
 _SINGLE_PLACES = 2.0
-"""Along the axes, which the fit leaves out, single places scatter this many times as much as cells."""
+"""Along the axes, which the fit leaves out, single places scatter this many times as much as the fit's cells."""
 _INDEPENDENT = 4.0
 """Effective number of independent places in a 3×3 neighbourhood under the window."""
 _STEEPEST_PLACE = 4.0
-"""S of a place is at most this many times its ring's, or what came through the blur, whichever is more.
+"""Upper bound on S of a place over its ring's S; the recorded power beyond the noise is allowed too, if larger.
 
-What exceeds both where kernels cancel is the coder's pattern."""
+Anything above both, where kernels cancel, is the coder's pattern."""
 _FEW_PLACES = 20.0
-"""A ring with this many reliable places lies half way between its fit and their mean."""
+"""With this many reliable places, a ring's typical S is half way (in the logarithm) between the fit and their mean."""
 
 
 def unevenness(rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32]) -> float:
-    """0 where what rings do not fit is an ordinary picture's, to 1 where its power lies at few places.
+    """0 if the rings fit as well as for ordinary pictures, up to 1 if the power lies at few places.
 
     observed, passed: as in :func:`place_statistics`.
     """
@@ -37,10 +40,10 @@ def unevenness(rings: PictureStatistics, observed: NDArray[np.float32], passed: 
 
 
 def _scatter_along_axes(rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32]) -> float:
-    """Standard deviation of ln |G|² about the fit's along the axes, where upright things have their power.
+    """Standard deviation of ln |G|² about the fit along the axes, where horizontal and vertical edges have their power.
 
-    Boards, print and the coder's blocks have more of it there than elsewhere, but about as much everywhere; upright
-    bars and lying blinds have theirs at few places.  observed, passed: as in :func:`place_statistics`.
+    Boards, print and the coder's blocks have more power there than elsewhere, but spread evenly; vertical bars and
+    horizontal blinds have it at few places.  observed, passed: as in :func:`place_statistics`.
     """
     rows, columns = axes()
     ring = place_ring()[rows, columns]
@@ -51,26 +54,26 @@ def _scatter_along_axes(rings: PictureStatistics, observed: NDArray[np.float32],
 def place_statistics(
     rings: PictureStatistics, observed: NDArray[np.float32], passed: NDArray[np.float32], weight: float
 ) -> PlaceStatistics:
-    """S of each place, (|G|² − N) / |K|² around it, as far as that is known; else what is typical of its ring.
+    """S of each place, (|G|² − N) / |K|² around it where that is reliable, else the typical S of its ring.
 
-    Typical is the mean of the logarithm, which a few strong places do not raise, over those that come through the blur.
-    observed, passed: |G|² and |K|² of the tiles, (n, SIDE, SIDE / 2 - 1).
+    Typical is the mean of ln S over the places that pass the blur, which a few strong places do not raise, and at most
+    the ring's fit.  observed, passed: |G|² and |K|² of the tiles, (n, SIDE, SIDE / 2 - 1).
     """
     count, ring = _INDEPENDENT * len(observed), place_ring()
     signal, noise = rings.signal[ring], rings.noise[ring]
     seen, k = (_around(np.asarray(spectra.mean(axis=0))) for spectra in (observed, passed))
     k = np.maximum(k, 1e-6)
-    own, doubt = (seen - noise) / k, noise / (k * np.sqrt(count))
+    own, own_std = (seen - noise) / k, noise / (k * np.sqrt(count))
     most = np.maximum(_STEEPEST_PLACE * signal, seen - noise)
-    logarithms = np.log(np.clip(own, np.minimum(doubt, signal), most) / signal)
+    logarithms = np.log(np.clip(own, np.minimum(own_std, signal), most) / signal)
     reliable = k * signal / (k * signal + noise)
     sums, counts = (np.bincount(ring.ravel(), w.ravel(), RINGS) for w in (reliable * logarithms, reliable))
     typical = signal * np.exp(np.minimum(sums / (counts + _FEW_PLACES), 0.0))[ring]
     known = count / (count + (1 + noise / (k * typical)) ** 2)
-    found = np.clip(typical + known * (own - typical), np.minimum(doubt, typical), most)
+    found = np.clip(typical + known * (own - typical), np.minimum(own_std, typical), most)
     return PlaceStatistics(weight, ((found / signal) ** weight).astype(np.float32), k.astype(np.float32))
 
 
 def _around(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mean of each place and its eight neighbours; the rows go round."""
+    """Mean over each place and its eight neighbours; rows wrap around."""
     return cv2.blur(cv2.copyMakeBorder(spectrum, 1, 1, 0, 0, cv2.BORDER_WRAP), (3, 3))[1:-1]

@@ -1,4 +1,7 @@
-"""What was measured on a blurred picture: over rings of spatial frequency, and over places where those do not do."""
+"""Statistics of a blurred picture: over rings of spatial frequency, and per frequency where rings do not fit.
+
+A place is one frequency (row and column) of a tile's spectrum.
+"""
 
 from __future__ import annotations
 
@@ -15,40 +18,41 @@ LUMA_RED, LUMA_BLUE = 0.299, 0.114
 _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 _EDGES_BEYOND = 2.0
-"""A picture's edges exceed its mean spectrum by this factor: rings of tiles have the mean of edge and plain surface."""
+"""Edge amplitude over that of the mean spectrum: the tiles' rings average edges and plain surfaces."""
 _STANDS_OUT = 2.0
 """Gradients of this many times the noise survive the prior."""
 _DETAIL_SLOPE = 3.0
-"""The power of a natural picture falls with frequency about like f⁻³."""
+"""The power of a natural picture falls with frequency approximately as f⁻³."""
 ROUNDING_POWER = 1 / 12
+"""Variance of rounding to whole grey levels."""
 _LIKELY_SQUARES, _LIKELY_WEIGHTS = np.polynomial.laguerre.laggauss(12)
-"""Half the squares of distances, in standard deviations of each axis, and how likely each is, together 1."""
+"""Quadrature nodes: half the squared distance, in units of the variance per axis, and their weights, which sum to 1."""
 _DEAD_ZONE = 5 / 6
-"""Part of its step below which an H.264 coder leaves a coefficient out, and of a further step at which it rounds up."""
+"""Fraction of its step below which an H.264 coder drops a coefficient, and of a further step at which it rounds up."""
 _CODER_SHARE = (_DEAD_ZONE**3 + (1 - _DEAD_ZONE) ** 3) / 3
-"""Error that leaves, as part of the step's square: of a remainder that is anywhere between two steps."""
+"""Mean square error of that rounding over the step's square, for remainders spread evenly over a step."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceStatistics:
-    """What rings do not tell: power over the places of a tile's spectrum, ordered as in :mod:`rings`."""
+    """Power per place of a tile's spectrum, ordered as in :mod:`rings`."""
 
     weight: float
-    """How far the rings' S is wrong: more than 0, and 1 from a large misfit on."""
+    """How far the rings' S is wrong: above 0, and 1 at a large misfit."""
     share: NDArray[np.float32]
     """(SIDE, SIDE / 2 - 1) S of each place over that of its ring."""
     passed: NDArray[np.float32]
     """(SIDE, SIDE / 2 - 1) mean |K|² of the kernels."""
 
     def after(self, passed: Array) -> PlaceStatistics:
-        """The same after further blur that passes the given part (RINGS,) of |G|²."""
+        """The same after further blur that passes the fraction ``passed`` (RINGS,) of |G|²."""
         return replace(self, passed=(self.passed * passed[place_ring()]).astype(np.float32))
 
     def expected_gain_db(self, signal: Array, noise: Array) -> float:
-        """As :attr:`PictureStatistics.expected_gain_db`, by the rings' S and N, (RINGS,).
+        """As :attr:`PictureStatistics.expected_gain_db`, from the rings' S and N, (RINGS,).
 
-        More noise than what comes through the blur counts as that: it may be a grating that the kernels nearly cancel,
-        and taking it away is no gain.
+        Removing noise counts as a gain only up to the power that passes the blur: the rest may be a grating that the
+        kernels nearly cancel, and removing that is no gain.
         """
         ring = place_ring()
         s, n = signal[ring] * self.share, noise[ring]
@@ -59,23 +63,24 @@ class PlaceStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Misplaced:
-    """What it costs that a picture's rows do not lie quite where they belong.
+    """Error caused by rows that straightening puts slightly off their true positions.
 
-    Mean squares in grey levels, (n,), for n distances that are as likely as their weights say.
+    Mean squares in grey levels squared, (n,), for n displacements with the probabilities ``weight``.
     """
 
     blurred: Array = field(default_factory=lambda: np.zeros(1))
-    """Of the picture as it was recorded."""
+    """Error added to the recorded picture."""
     restored: Array = field(default_factory=lambda: np.zeros(1))
-    """Of what an ideal filter makes of it: sharp edges beside their place are farther off than blurred ones."""
+    """Error added to the ideal filter's result: displaced sharp edges differ more than displaced blurred ones."""
     removed: float = 0.0
-    """What that filter takes off the squared error of rows in their place."""
+    """Squared error that the ideal filter removes from rows at their true positions."""
     weight: Array = field(default_factory=lambda: np.ones(1))
+    """Probabilities, (n,), which sum to 1."""
 
     def errors(self, removed: float) -> tuple[Array, Array]:
-        """Errors (n,) by misplaced rows before and after a restoration, by the squared error that it removes elsewhere.
+        """Errors (n,) by displaced rows before and after a restoration that removes the squared error ``removed``.
 
-        A restoration that removes less than the ideal filter sharpens less, and loses less by edges beside their place.
+        A restoration that removes less than the ideal filter sharpens less, and loses less by displaced edges.
         """
         part = min(removed / self.removed, 1.0) if self.removed > 0 else 1.0
         return self.blurred, self.blurred + part * (self.restored - self.blurred)
@@ -83,10 +88,10 @@ class Misplaced:
 
 @dataclass(frozen=True, slots=True)
 class PictureStatistics:
-    """Measured on one blurred picture, over rings of spatial frequency, in grey levels squared."""
+    """Statistics of one blurred picture over rings of spatial frequency; powers in grey levels squared."""
 
     frequency: Array
-    """(RINGS,) middle of each ring, cycles per pixel."""
+    """(RINGS,) centre of each ring, cycles per pixel."""
     signal: Array
     """(RINGS,) power of the sharp picture."""
     noise: Array
@@ -94,21 +99,22 @@ class PictureStatistics:
     passed: Array
     """(RINGS,) mean |K|² of the kernels."""
     noise_levels: float
-    """One standard deviation of the noise: at the frequencies where signal and noise are about equal."""
+    """Standard deviation of the noise, weighted to frequencies where signal and noise are about equal."""
     measured: bool = True
-    """False where the picture told nothing, and the values stand in for it."""
+    """False if the picture could not be measured and the values are placeholders."""
     misfit: float = 0.0
-    """RMS of the natural logarithm of |G|² over the fit's |K|² S + N, cell by cell."""
+    """RMS over the cells of ln of |G|² over the fit's |K|² S + N."""
     places: PlaceStatistics | None = None
-    """Of a picture that the rings do not fit; None: they do."""
+    """S per place, for a picture that the rings do not fit; None: they fit."""
     real: Array | None = None
-    """(RINGS,) mean real part of the kernels' spectra: what of the picture stays in its place; None: √passed."""
+    """(RINGS,) mean real part of the kernels' spectra; None: √passed."""
     cells: tuple[Array, Array] | None = None
-    """Places (RINGS, cells), and their |K|², which a ring's mean hides; None: the mean alone."""
+    """Number of places in each cell, (RINGS, cells), and its |K|², which varies within a ring; None: the ring's mean
+    only."""
 
     @property
     def unevenness(self) -> float:
-        """0 where S is even over each ring, up to 1 where it lies at few places."""
+        """0 if S is even over each ring, up to 1 if it lies at few places."""
         return 0.0 if self.places is None else self.places.weight
 
     @property
@@ -118,37 +124,40 @@ class PictureStatistics:
 
     @property
     def between_rings_and_level(self) -> PictureStatistics:
-        """The same with noise half way, by its logarithm, from the rings' own to the level that was measured in light.
+        """The same with the geometric mean of two noise estimates: the rings' own, and the level measured in light.
 
-        The rings' takes in the overtones of blurred edges, most of all at low frequencies; the level is that of the
-        frequencies where signal and noise are about equal, and a coder's noise is not level.  The truth lies between.
+        The rings' noise contains overtones of blurred edges, mostly at low frequencies.  The level holds where signal
+        and noise are about equal, but coding noise is not white.  The truth lies between the two.
         """
         return replace(self, noise=np.sqrt(self.noise) * self.noise_levels)
 
     @property
     def gradient_scale(self) -> float:
-        """Unit u of the prior exp(−|∇f/u|^⅔): of edges, that stand out of the sharp picture's mean square gradient."""
+        """Unit u, grey levels, of the prior exp(−|∇f/u|^⅔), from the sharp picture's mean square gradient."""
         # forward differences pass 4 sin²(π f_x); its mean over a ring's directions is 2 − 2 J0(2π f)
         gain = 2 - 2 * _bessel_j0(2 * np.pi * self.frequency)
         area = 2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]) * (self.frequency < 0.5)
         return float(_EDGES_BEYOND * np.sqrt(np.sum(area * gain * self.signal)) / _HYPER_LAPLACIAN_RMS)
 
     @property
-    def drowned(self) -> float:
-        """0 where the picture's gradients stand out of the noise, up to 1 where nothing does.
+    def below_noise(self) -> float:
+        """0 if the picture's gradients stand out of the noise, towards 1 the less they do.
 
-        A prior of sparse gradients then takes texture for noise.
+        The sparse gradient prior then takes texture for noise.
         """
         return 1 - min(1.0, self.gradient_scale / self.noise_levels / _STANDS_OUT)
 
     @property
     def finest(self) -> float:
-        """Highest frequency, in cycles per pixel, at which more of the picture than of noise comes through the blur."""
+        """Highest frequency, cycles per pixel, at which the signal that passes the blur exceeds the noise."""
         clear = np.flatnonzero(self.passed * self.signal > self.noise)
         return float(self.frequency[clear[-1] if len(clear) else 0])
 
     def scaled(self, scale: float) -> PictureStatistics:
-        """Those of the same picture ``scale`` times as large, each pixel the mean of what it covers; the rings stay."""
+        """Statistics of the picture enlarged ``scale`` times, where pixels are means over the area that they cover.
+
+        The rings stay the same, at other frequencies.
+        """
         return replace(
             self,
             frequency=self.frequency / scale,
@@ -158,22 +167,23 @@ class PictureStatistics:
         )
 
     def with_error_share(self, share: float) -> PictureStatistics:
-        """With an error of ``share`` times S beside the noise: the known error of the model of light.
+        """With ``share`` times S added to the noise: the known error of the tone curve.
 
-        It comes from edges, whose power lies everywhere; a grating's, which lies at few places, is as it is.
+        The error comes from edges, whose power lies at all places; it is reduced by ``unevenness``, since a grating's
+        power lies at few.
         """
         share *= 1 - self.unevenness
         return self._with_noise(self.noise + share * self.signal) if self.measured and share else self
 
     def with_coder_noise(self, step: float, share: float) -> PictureStatistics:
-        """With no less than ``share`` of the noise that a quantiser of such a step leaves, grey levels."""
+        """With the noise at least ``share`` times that of a quantiser with this step, grey levels."""
         if not self.measured:
             return self
         least = share * coder_noise(self.passed * self.signal + self.noise, step)
         return self._with_noise(np.maximum(self.noise, least))
 
     def _with_noise(self, noise: Array) -> PictureStatistics:
-        """With more noise (RINGS,), and a level that has grown as the noise where it weighs."""
+        """With more noise (RINGS,), and ``noise_levels`` raised as the noise where signal and noise are about equal."""
         through = self.frequency * self.passed * self.signal
         before, after = (
             np.sum(through * n * n / (self.passed * self.signal + n) ** 2)
@@ -182,8 +192,8 @@ class PictureStatistics:
         )
         return replace(self, noise=noise, noise_levels=self.noise_levels * float(np.sqrt(after / before)))
 
-    def doubted_by(self, spread: KernelSpread | None) -> PictureStatistics:
-        """With uncertain kernels: what their variance leaves unknown of S counts as noise."""
+    def with_kernel_variance(self, spread: KernelSpread | None) -> PictureStatistics:
+        """With uncertain kernels: their variance times S is added to the noise."""
         if spread is None:
             return self
         over_places = spread.variance(SIDE)[:, 1 : SIDE // 2]
@@ -193,37 +203,38 @@ class PictureStatistics:
 
     @property
     def expected_gain_db(self) -> float:
-        """:meth:`joint_gain_db` of the picture by itself."""
+        """:meth:`joint_gain_db` of the picture alone."""
         return self.joint_gain_db(np.zeros(RINGS))
 
     def joint_gain_db(self, further: Array) -> float:
-        """What the ideal linear filter gains over leaving the blur, by these spectra; 0 or more, 0 if not measured.
+        """Gain of the ideal linear filter over the recorded picture, for these spectra; ≥ 0, and 0 if not measured.
 
-        Left as it is, a picture misses (1 − K) F, |1 − K|² = 1 − 2 Re K + |K|²; where a path reverses a frequency
-        that is more than all of it.  further: (RINGS,) weighted |K|² of further pictures restored with it.
+        The recorded picture's error is (1 − K) F, with |1 − K|² = 1 − 2 Re K + |K|², which exceeds 1 where a path
+        reverses the phase.  further: (RINGS,) weighted |K|² of further pictures restored with it; not used for a
+        picture with ``places``.
         """
         if not self.measured:
             return 0.0
         if self.places is not None:
             return self.places.expected_gain_db(self.signal, self.noise)
-        left = np.sum(self.frequency * (self._lost() + self.noise))
-        return max(float(10 * np.log10(left / np.sum(self.frequency * self._wrong(further)))), 0.0)
+        left = np.sum(self.frequency * (self._blur_loss() + self.noise))
+        return max(float(10 * np.log10(left / np.sum(self.frequency * self._remaining_error(further)))), 0.0)
 
     def ideal_error(self, further: Array) -> float:
-        """Mean square, in grey levels, that the ideal linear filter leaves; arguments as of :meth:`joint_gain_db`."""
-        return float(self._area() @ self._wrong(further))
+        """Mean square error, grey levels squared, of the ideal linear filter; further: as in :meth:`joint_gain_db`."""
+        return float(self._area() @ self._remaining_error(further))
 
     @property
     def blur_error(self) -> float:
-        """Mean square, in grey levels, of what the picture misses for its blur."""
-        return float(self._area() @ self._lost())
+        """Mean square error, grey levels squared, of the recorded picture by its blur."""
+        return float(self._area() @ self._blur_loss())
 
     def misplaced(self, std_px: float, further: Array) -> Misplaced:
-        """What rows that lie wrong by ``std_px``, each axis, make of restoring; further: as of :meth:`joint_gain_db`.
+        """Error by rows displaced with a deviation of ``std_px`` per axis; further: as in :meth:`joint_gain_db`.
 
-        Of power S at f, restored to a part R and moved by δ, |1 − R e^{2πi f δ}|² S is missing: (1 − R)² as in its
-        place and 2 R (1 − J₀(2π f |δ|)) for the move, in the mean over a ring; √|K|² for R where nothing was
-        restored.  The square of a normal δ is distributed exponentially (Gauss–Laguerre quadrature).
+        Power S at f, restored to a fraction R and displaced by δ, leaves the error |1 − R e^{2πi f δ}|² S.  Averaged
+        over a ring that is (1 − R)² plus, by the displacement, 2 R (1 − J₀(2π f |δ|)).  R is √|K|² in the recorded
+        picture.  |δ|² of a normal δ has an exponential distribution, hence the Gauss–Laguerre quadrature.
         """
         off = 2 - 2 * _bessel_j0(2 * np.pi * np.outer(std_px * np.sqrt(2 * _LIKELY_SQUARES), self.frequency))
         passed, power = self.passed + further, self._area() * self.signal
@@ -234,13 +245,13 @@ class PictureStatistics:
     def _area(self) -> Array:
         return np.asarray(2 * np.pi * self.frequency * (self.frequency[1] - self.frequency[0]))
 
-    def _lost(self) -> Array:
+    def _blur_loss(self) -> Array:
         """(RINGS,) power of (1 − K) F."""
         real = np.sqrt(self.passed) if self.real is None else self.real
         return np.asarray((1 - 2 * real + self.passed) * self.signal)
 
-    def _wrong(self, further: Array) -> Array:
-        """(RINGS,) power of what the ideal linear filter leaves."""
+    def _remaining_error(self, further: Array) -> Array:
+        """(RINGS,) power of the ideal linear filter's error."""
         count, passed = (np.ones((RINGS, 1)), self.passed[:, None]) if self.cells is None else self.cells
         signal, noise, passed = self.signal[:, None], self.noise[:, None], passed + further[:, None]
         wrong = count * signal * noise / (passed * signal + noise)
@@ -248,10 +259,10 @@ class PictureStatistics:
 
 
 def coder_noise(observed: Array, step: float) -> Array:
-    """Noise (RINGS,) that a coder leaves in a picture, by the step of its quantiser.
+    """Coding noise (RINGS,) of a picture with power ``observed`` (RINGS,), from the step of the coder's quantiser.
 
-    Of what stands far above the step an error of the step's own, and what lies far below it is left out: reverse
-    water-filling (Cover & Thomas 2006, section 10.3.3), smooth between the two, for rings hold weak and strong places.
+    Power far above the step gets the quantiser's error; power far below it is dropped and is itself the error: reverse
+    water-filling (Cover & Thomas 2006, section 10.3.3), smooth in between, since rings hold weak and strong places.
     """
     level = max(_CODER_SHARE * step**2, ROUNDING_POWER)
     falling = np.maximum(np.maximum.accumulate(observed[::-1])[::-1], ROUNDING_POWER)
@@ -259,12 +270,12 @@ def coder_noise(observed: Array, step: float) -> Array:
 
 
 def falling_power(frequency: Array, signal: Array, ring: int) -> Array:
-    """S by a ring's own, falling as f⁻³: between edges (f⁻³) and the lens's softening of the texture."""
+    """S extrapolated from one ring as f⁻³: the law of edges, and nearly that of texture softened by the lens."""
     return np.asarray(signal[ring] * (frequency[ring] / frequency) ** _DETAIL_SLOPE)
 
 
 def unknown_picture() -> PictureStatistics:
-    """Nothing could be measured: the picture is smaller than a tile, or the blur larger."""
+    """Placeholder for a picture that could not be measured: it is smaller than a tile, or its blur is too long."""
     frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
     return PictureStatistics(frequency, np.ones(RINGS), np.ones(RINGS), np.ones(RINGS), 1.0, False)
 

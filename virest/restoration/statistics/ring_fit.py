@@ -1,4 +1,4 @@
-"""|G|² = |K|² S + N, ring by ring: what is noise, and what the sharp picture."""
+"""Fit |G|² = |K|² S + N ring by ring, to separate noise from the sharp picture."""
 
 from __future__ import annotations
 
@@ -21,46 +21,46 @@ _CELLS = 64
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _STEEPEST_NOISE, _LEVEL_BELOW = 2.0, 0.08
-"""A coded movie's error grows towards low frequencies like f⁻² at most, and below 0.08 cycles per pixel no more."""
+"""Coding noise rises towards low frequencies as f⁻² at most, and not at all below 0.08 cycles per pixel."""
 _CODER_SLOPE = 1.5
-"""Where kernels cancel nothing, only the highest frequencies show noise by itself, and a coder leaves least of it
-there: recorded less true pictures at 0.25 bits a pixel fall about as f⁻¹·⁵ from 0.08 to 0.5 cycles per pixel (five
-frames, read by eye).  It hardly matters: ``python -m virest.app.bench --only fits`` finds 1.9 ± 2.2, and between 0.5
-and 2.5 the mean gain on 14 captures changes by 0.01 dB."""
+"""Where kernels cancel nothing, only the highest frequencies show noise alone, and coding noise is least there.  The
+error of pictures coded at 0.25 bits per pixel falls about as f⁻¹·⁵ from 0.08 to 0.5 cycles per pixel (five frames,
+read by eye).  The value hardly matters: ``python -m virest.app.bench --only fits`` finds 1.9 ± 2.2, and between 0.5 and
+2.5 the mean gain on 14 captures changes by 0.01 dB."""
 _FINEST = slice(-3, None)
-"""Rings of the finest detail."""
+"""The rings of highest frequency."""
 _RECORDED = 0.1
-"""Mean |K|² of the finest rings above which the coder still had detail to code there: paths of up to some 4 px."""
+"""Mean |K|² of the finest rings above which they still had detail to code: paths of up to about 4 px."""
 _SLOPE_SPAN = 3.0
-"""The noise's growth is measured from the lowest determined ring to this many times its frequency."""
+"""The noise's slope is fitted from the lowest determined ring to this many times its frequency."""
 _STANDS_OUT = 0.5
-"""A coder's noise is no longer cut with the picture where it has less than this part of what is seen."""
+"""Noise below this fraction of the observed power is constant: the coder no longer drops it with the picture."""
 _CLEAR_SIGNAL = 3.0
-"""What passes the blur is clear where it has this many times the noise's power."""
+"""S is reliable where the power that passes the blur is at least this many times the noise."""
 _PLACES_IN_CELL = 4
-"""The mean of fewer tells little."""
+"""Cells with fewer places are left out of the misfit."""
 _OF_FIT = 2.0
-"""How many times the misfit of the fit itself counts beside that of what is settled on.
+"""Factor on the misfit of the ring fit when it is compared with that of the final S and N; the smaller one counts.
 
-Of 108 gratings (waves, bars and boards of 7 to 21 px in four directions, under paths of 3 to 10 px) 94 have more
-than 0.8 of the latter, and 92 of these have 0.58 to 2.2 of the former.  Of frames of ordinary scenes, from which a
-coder took detail, 15 in six simulated captures have more than 1.1 of the latter, ten of them 0.3 to 0.5 of the former.
+Of 108 gratings (waves, bars and boards of 7 to 21 px in four directions, under paths of 3 to 10 px) 94 have a final
+misfit above 0.8, and 92 of these have 0.58 to 2.2 for the ring fit.  Of frames of ordinary scenes, from which a coder
+removed detail, 15 in six simulated captures have a final misfit above 1.1, ten of them 0.3 to 0.5 for the ring fit.
 """
 
 
 class RingCells:
-    """The places of all tiles' spectra, sorted into cells of equal ring and nearly equal |K|²."""
+    """The places of all tiles' spectra, sorted into cells of the same ring and nearly equal |K|²."""
 
     def __init__(self, passed: NDArray[np.float32]) -> None:
         """passed: |K|² of each tile, ordered as in :mod:`rings`."""
         share = np.minimum((passed * np.float32(_CELLS)).astype(np.intp), _CELLS - 1)
         self._cell = (ring_index(SIDE) * _CELLS + share).ravel()
         self.count = self._sums(None)
-        """(RINGS, _CELLS) places in each cell."""
+        """(RINGS, _CELLS) number of places in each cell."""
         self.passed = self.means(passed)
 
     def means(self, values: NDArray[np.float32]) -> Array:
-        """(RINGS, _CELLS) mean of each cell; 0 where it is empty."""
+        """(RINGS, _CELLS) mean of each cell; 0 if it is empty."""
         return np.asarray(self._sums(values.ravel()) / np.maximum(self.count, 1))
 
     def _sums(self, weights: NDArray[np.float32] | None) -> Array:
@@ -71,10 +71,10 @@ class RingCells:
 def fit_rings(
     *spectra: tuple[NDArray[np.float32], RingCells, float, float | None],
 ) -> list[PictureStatistics]:
-    """Weighted least squares of |G|² = |K|² S + N in every ring, on cells of equal ring and nearly equal |K|².
+    """Fit |G|² = |K|² S + N in every ring by weighted least squares over its cells.
 
-    spectra: |G|², its cells, the white noise of the picture that it is of, and the step of its coder's quantiser, None
-    where that is not known; all are fitted at once.
+    spectra, all fitted at once: each |G|², its cells, the picture's white noise, and the coder's quantiser step or
+    None if unknown; the last two in grey levels.
     """
     count, k, g = (
         np.stack(parts)
@@ -95,27 +95,27 @@ def fit_rings(
     determined = (spread > 0.1) & (mean_k < _MUST_CANCEL) & (in_ring > 20)
     found = []
     for i, (_, _, white_levels, step) in enumerate(spectra):
-        settled = _settled(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels, step)
+        final = _final_statistics(signal[i], noise[i], mean_k[i], mean_g[i], determined[i], white_levels, step)
         by_law, by_fit = (
             _misfit(count[i], g[i], n[:, None] + s[:, None] * k[i])
-            for n, s in ((settled.noise, settled.signal), (noise[i], signal[i]))
+            for n, s in ((final.noise, final.signal), (noise[i], signal[i]))
         )
-        found.append(replace(settled, misfit=min(by_law, _OF_FIT * by_fit)))
+        found.append(replace(final, misfit=min(by_law, _OF_FIT * by_fit)))
     return found
 
 
 def _misfit(count: Array, observed: Array, expected: Array) -> float:
-    """RMS of ln(observed / expected) over the cells, by their places; of what is below the rounding's power, none.
+    """RMS of ln(observed / expected) over the cells, weighted by their places; powers below rounding's count as that.
 
-    No S and N of rings fit a grating.  Where those that fit differ from those that are settled on, a coder took away
-    detail that the law of natural pictures puts back: nothing is wrong with rings.
+    No S and N of rings fit a grating.  But where the ring fit is good and the final S and N are not, the coder removed
+    detail that the law of natural pictures restores: the rings themselves are adequate.
     """
     weight = count * (count >= _PLACES_IN_CELL)
     logarithms = np.log(np.maximum(observed, ROUNDING_POWER) / np.maximum(expected, ROUNDING_POWER))
     return float(np.sqrt(np.sum(weight * logarithms**2) / max(np.sum(weight), 1.0)))
 
 
-def _settled(
+def _final_statistics(
     signal: Array,
     noise: Array,
     passed: Array,
@@ -124,18 +124,18 @@ def _settled(
     white_levels: float,
     step: float | None,
 ) -> PictureStatistics:
-    """Rings that cannot tell S from N borrow the noise of those that can; S never rises with frequency.
+    """The final statistics: rings that cannot separate S from N take over N from those that can; S never rises.
 
-    Kernels too short to cancel anything leave the noise open: at the highest frequencies it is then what a picture's
-    second differences say, and at most what these hold; below, it rises as a coder's does.
+    If the kernels are too short to cancel anything, N is undetermined.  At the highest frequencies it is then taken
+    from the picture's second differences, and is at most the power there; below, it rises as coding noise does.
     """
     frequency = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
     if determined.any():
         noise = np.interp(frequency, frequency[determined], noise[determined])
         noise = np.maximum.accumulate(noise[::-1])[::-1]
-        noise *= _growth_downwards(frequency, noise, determined, observed)
+        noise *= _low_frequency_growth(frequency, noise, determined, observed)
         if passed[_FINEST].mean() > _RECORDED:
-            noise = np.minimum(noise, _at_most(frequency, observed))
+            noise = np.minimum(noise, _noise_bound(frequency, observed))
         if step is not None:
             noise = np.minimum(noise, observed[_FINEST].mean() + coder_noise(observed, step))
     else:
@@ -144,36 +144,36 @@ def _settled(
     through = np.maximum(observed - noise, 0.05 * observed) / np.maximum(passed, 0.05)
     signal = np.where(determined, signal, through)
     signal = np.maximum(np.maximum.accumulate(signal[::-1])[::-1], 1e-3 * noise)
-    signal = _as_detail_falls(frequency, signal, passed, noise)
+    signal = _extrapolated_detail(frequency, signal, passed, noise)
     return PictureStatistics(frequency, signal, noise, passed, _standard_deviation(frequency, passed * signal, noise))
 
 
 def _standard_deviation(frequency: Array, through: Array, noise: Array) -> float:
-    """That of the noise, weighted to where about as much of the signal comes through the blur."""
+    """Standard deviation of the noise, weighted to frequencies where about as much signal passes the blur."""
     weight = frequency * through * noise / (through + noise) ** 2
     return float(np.sqrt(np.sum(weight * noise) / np.sum(weight)))
 
 
-def _at_most(frequency: Array, observed: Array) -> Array:
-    """Most noise that there can be in each ring (RINGS,) where the finest ones hold detail.
+def _noise_bound(frequency: Array, observed: Array) -> Array:
+    """Upper bound on the noise of each ring (RINGS,) where the finest rings still hold detail.
 
-    A short path cancels little, in one direction only, and what a picture lacks or has in that direction passes for
-    noise: fits of 40 to 440 grey levels squared were seen where less than 10 was true.  Of noise the finest rings hold
-    their part, all of what they show at most, and towards low frequencies it grows like f⁻² at most.
+    A short path cancels little, and in one direction only, so the picture's own anisotropy is fitted as noise: fits
+    gave 40 to 440 grey levels squared where the truth was below 10.  In the finest rings noise is at most the observed
+    power, and towards low frequencies it rises as f⁻² at most.
     """
     return _falling_noise(frequency, float(observed[_FINEST].mean()), _STEEPEST_NOISE)
 
 
 def _falling_noise(frequency: Array, finest: float, slope: float) -> Array:
-    """Noise (RINGS,) by that of the finest rings, growing towards low frequencies as a coder's does."""
+    """Noise (RINGS,) extrapolated from the finest rings, rising towards low frequencies as coding noise does."""
     return np.asarray(max(finest, ROUNDING_POWER) * (frequency[-2] / np.maximum(frequency, _LEVEL_BELOW)) ** slope)
 
 
-def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.bool_], observed: Array) -> Array:
-    """How many times larger the noise is below the determined rings, (RINGS,): it goes on as they rise.
+def _low_frequency_growth(frequency: Array, noise: Array, determined: NDArray[np.bool_], observed: Array) -> Array:
+    """Factor on the noise, (RINGS,), below the determined rings: it continues at the slope of the determined ones.
 
-    A sensor's noise is white. A coder's falls with the picture's power where it cuts that away; where the picture
-    stands out of the noise, at lower frequencies, it is level (reverse water-filling).
+    Sensor noise is white.  Coding noise falls with the picture's power where the coder drops it; at lower frequencies,
+    where the picture stands out of the noise, it is constant (reverse water-filling).
     """
     first = int(np.flatnonzero(determined)[0])
     near = determined & (frequency <= _SLOPE_SPAN * frequency[first])
@@ -189,10 +189,10 @@ def _growth_downwards(frequency: Array, noise: Array, determined: NDArray[np.boo
     return growth
 
 
-def _as_detail_falls(frequency: Array, signal: Array, passed: Array, noise: Array) -> Array:
-    """S where the noise comes near it: at least what the last clear ring says by the law of natural pictures.
+def _extrapolated_detail(frequency: Array, signal: Array, passed: Array, noise: Array) -> Array:
+    """S, and where it is close to the noise, at least the f⁻³ extrapolation from the last reliable ring.
 
-    There the coder has taken the blurred picture's faint detail away, and the fit finds less than the sharp one has.
+    There the coder has removed the blurred picture's faint detail, and the fit finds less than the sharp picture has.
     """
     doubtful = np.flatnonzero(passed * signal < _CLEAR_SIGNAL * noise)
     doubtful = doubtful[doubtful > 1]

@@ -1,6 +1,6 @@
-"""Where the rings of spatial frequency lie in the spectrum of a measured tile.
+"""Rings of spatial frequency in the spectrum of a measured tile.
 
-A spectrum has a tile's rows of frequencies, and the horizontal ones 1 ... side / 2 − 1: (side, side / 2 − 1).
+A spectrum has shape (side, side / 2 − 1): all vertical frequencies, and the horizontal ones 1 ... side / 2 − 1.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 RINGS, SIDE = 24, 128
-"""Rings up to half a cycle per pixel, and the side, in pixels, of the tiles that are measured."""
+"""Number of rings up to 0.5 cycles per pixel, and the side, px, of the measured tiles."""
 
 
 @lru_cache(maxsize=8)
 def ring_index(side: int) -> NDArray[np.intp]:
-    """Ring of each place of a spectrum; RINGS for those beyond half a cycle per pixel, and for the lowest."""
+    """Ring of each place of a spectrum; RINGS beyond 0.5 cycles per pixel, at the lowest ones and near the axes."""
     fy, fx = np.fft.fftfreq(side)[:, None], np.arange(1, side // 2)[None, :] / side
     radius = np.hypot(fx, fy)
     ring = (radius / 0.5 * RINGS).astype(np.intp)
@@ -27,14 +27,14 @@ def ring_index(side: int) -> NDArray[np.intp]:
 
 @lru_cache(maxsize=1)
 def place_ring() -> NDArray[np.intp]:
-    """Ring of each place of a spectrum, the highest for those beyond half a cycle per pixel."""
+    """Ring of each place of a spectrum; the highest ring for those beyond 0.5 cycles per pixel."""
     fy, fx = np.fft.fftfreq(SIDE)[:, None], np.arange(1, SIDE // 2)[None, :] / SIDE
     return np.minimum((np.hypot(fx, fy) / 0.5 * RINGS).astype(np.intp), RINGS - 1)
 
 
 @lru_cache(maxsize=1)
 def axes() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the places of a spectrum that :func:`ring_index` leaves out near the axes."""
+    """Rows and columns of the places near the axes, which :func:`ring_index` leaves out."""
     fy, fx = np.fft.fftfreq(SIDE)[:, None], np.arange(1, SIDE // 2)[None, :] / SIDE
     radius = np.hypot(fx, fy)
     rows, columns = np.nonzero((ring_index(SIDE) == RINGS) & (radius > 2.5 / SIDE) & (radius < 0.5))

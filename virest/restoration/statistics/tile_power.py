@@ -13,19 +13,20 @@ _WINDOW = np.outer(np.hanning(SIDE + 2)[1:-1], np.hanning(SIDE + 2)[1:-1]).astyp
 _WINDOW_SUM = float(_WINDOW.sum())
 _WINDOW_POWER = np.float32((_WINDOW**2).sum())
 MANY_TILES, FEW_TILES = 12, 8
-"""Largest number of measured tiles; fewer determine weak noise to a third only."""
+"""Largest number of measured tiles; with FEW_TILES, weak noise is known to about a third only."""
 _ON_PATH = 2e-3
-"""Kernels are larger than this where the path goes."""
+"""Kernel values above this are on the path."""
 _FILLING_PX = (5, 15, 45, 135)
+"""Sides of the neighbourhoods from which unknown pixels are filled in, tried in this order."""
 
 
 def cut(plane: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]:
-    """The tile of a plane or picture whose top and left these are."""
+    """The tile of a plane or picture at ``corner``, (top, left)."""
     return plane[corner[0] : corner[0] + SIDE, corner[1] : corner[1] + SIDE]
 
 
-def evenly_steep(light: NDArray[np.float32], curve: ResponseCurve) -> NDArray[np.float32]:
-    """Light of a tile (height, width) as grey levels of the straight curve through its mean."""
+def light_in_grey_levels(light: NDArray[np.float32], curve: ResponseCurve) -> NDArray[np.float32]:
+    """Light of a tile (height, width) scaled to grey levels by the curve's slope at its mean."""
     mean_level = 255 * float(curve.encode(np.array(light.mean())))
     return np.asarray(light * np.interp(mean_level, np.arange(256), curve.slope_table()), np.float32)
 
@@ -33,7 +34,7 @@ def evenly_steep(light: NDArray[np.float32], curve: ResponseCurve) -> NDArray[np
 def known_part(
     clipped: NDArray[np.uint8], corner: tuple[int, int], kernel: NDArray[np.float32]
 ) -> NDArray[np.float32] | None:
-    """1.0 where a tile shows no light that a path reaches from clipped light; None: everywhere."""
+    """1.0 where no blur path reaches a tile's pixel from clipped light, else 0.0; None: no light is clipped."""
     tile = cut(clipped, corner)
     if not tile.any():
         return None
@@ -44,9 +45,9 @@ def known_part(
 def windowed_power(
     tile: NDArray[np.uint8] | NDArray[np.float32], known: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Power of a tile less its mean under a Hann window; white noise of variance σ² gives σ² everywhere.
+    """Power of a tile minus its mean under a Hann window; white noise of variance σ² gives σ² everywhere.
 
-    What is not known (0 in ``known``) is filled in smoothly and adds no power.
+    Unknown pixels (0 in ``known``) are filled in smoothly and do not count in the normalisation.
     """
     values, power = tile.astype(np.float32), float(_WINDOW_POWER)
     if known is not None:
@@ -56,7 +57,7 @@ def windowed_power(
 
 
 def _smoothly_filled(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means of what is known around each unknown place, over the smallest neighbourhood that knows any."""
+    """Fill each unknown pixel with the mean of the known ones around it, over the smallest sufficient neighbourhood."""
     filled, left = values * known, known == 0
     for side in _FILLING_PX:
         near = cv2.blur(known, (side, side))
@@ -69,7 +70,7 @@ def _smoothly_filled(values: NDArray[np.float32], known: NDArray[np.float32]) ->
 
 
 def passed_power(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """|K|² as seen through the tile's window."""
+    """|K|² of a kernel, smoothed as the tile's window smooths spectra."""
     padded = np.zeros((SIDE, SIDE), np.float32)
     padded[: kernel.shape[0], : kernel.shape[1]] = kernel
     return cv2.blur(_power(padded, kernel.shape[0]), (3, 3), borderType=cv2.BORDER_REPLICATE)
@@ -78,7 +79,7 @@ def passed_power(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
 def _power(tile: NDArray[np.float32], rows: int = 0) -> NDArray[np.float32]:
     """|F|² at the horizontal frequencies 1 ... side / 2 − 1 of the transform, (side, side / 2 − 1).
 
-    rows: from there on all is 0; 0: nowhere.
+    rows: number of leading rows that may differ from 0; 0: all.
     """
     packed = cv2.dft(tile, nonzeroRows=rows)[:, 1:-1]
     squares = packed * packed
@@ -86,9 +87,9 @@ def _power(tile: NDArray[np.float32], rows: int = 0) -> NDArray[np.float32]:
 
 
 def white_noise(plane: NDArray[np.uint8]) -> float:
-    """Standard deviation of a plane's white noise, grey levels: the median absolute second difference both ways.
+    """Standard deviation of a plane's white noise, grey levels, from the median absolute mixed second difference.
 
-    Immerkær 1996, doi:10.1006/cviu.1996.0060; edges and texture are outliers to the median.
+    Immerkær 1996, doi:10.1006/cviu.1996.0060; the median ignores edges and texture.
     """
     above, here, below = (plane[first : len(plane) - 4 + first : 4].astype(np.int16) for first in (1, 2, 3))
     down = above - 2 * here + below
@@ -97,7 +98,7 @@ def white_noise(plane: NDArray[np.uint8]) -> float:
 
 
 def _median(levels: NDArray[np.int16]) -> float:
-    """The median of whole numbers from 0 on, by their histogram: quicker than by their order."""
+    """The median of non-negative integers from their histogram, which is faster than sorting."""
     reached = np.cumsum(np.bincount(levels.ravel()))
     middles = (reached[-1] + 1) // 2, reached[-1] // 2 + 1
     return float(np.mean(np.searchsorted(reached, middles)))
