@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 
 import cv2
@@ -119,6 +119,19 @@ def noise_to_signal(
     return ratio, guarded
 
 
+def in_tiles(deconvolution: tiles.TileDeconvolution, ratio: Image, factors: Sequence[float]) -> Iterator[Image]:
+    """N / S of each tile, ``factors`` times the picture's; at least the border's in tiles that see beyond it.
+
+    Good until the next.
+    """
+    own, least = np.empty((2, *ratio.shape), np.float32)
+    least[:] = BORDER_NOISE_TO_SIGNAL
+    least[0, 0] = 0.0  # the mean is no noise
+    for factor, border in zip(factors, deconvolution.at_border, strict=True):
+        cv2.multiply(ratio, factor, own)
+        yield cv2.max(own, least, own) if border else own
+
+
 def join_neighbours(
     blurred: BlurredPicture,
     deconvolution: tiles.TileDeconvolution,
@@ -126,11 +139,12 @@ def join_neighbours(
     channels: Callable[[NeighbourPicture], Sequence[Image]],
     ratio: Image,
     scale: float = 1.0,
+    factors: Sequence[float] | None = None,
 ) -> None:
     """Add the neighbours to the data term of all tiles.
 
     own: the frame's channels, at the deconvolution's scale.  channels: gives those of a neighbour.  ratio: N / S on a
-    tile's packed spectrum.
+    tile's packed spectrum, multiplied by each tile's own of the ``factors``; None: by 1.
     """
     if not blurred.neighbours:
         return
@@ -145,7 +159,7 @@ def join_neighbours(
         if highlights is not None:
             trust[cv2.resize(highlights, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
         further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, one.coding_noise_ratio))
-    deconvolution.join(own, further, ratio)
+    deconvolution.join(own, further, ratio, factors)
 
 
 def _reached_by_highlights(blurred: BlurredPicture) -> Image | None:

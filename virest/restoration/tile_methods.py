@@ -119,7 +119,7 @@ def tile_hyper_laplacian(
     projected = _projected_luma(blurred, deconvolution, settings)
     start = statistics.between_rings_and_level if few else statistics
     ratios = noise_to_signal(deconvolution, settings, start)
-    linear = sharp = deconvolution.blend(deconvolution.solutions(projected, *ratios))
+    linear = sharp = deconvolution.blend(deconvolution.solutions(projected, deconvolution.inside_or_at_border(*ratios)))
     extra_noise = _extra_noise(statistics, deconvolution.size)
     before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
     betas = beta_schedule(settings.iterations)
@@ -128,7 +128,7 @@ def tile_hyper_laplacian(
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
         pulled = deconvolution.pulled(projected, pull, beta / trust, beta / guarded)
         inner, at_border = (gradients * np.float32(beta / t) + extra_noise for t in (trust, guarded))
-        solved = deconvolution.solutions(pulled, inner, at_border)
+        solved = deconvolution.solutions(pulled, deconvolution.inside_or_at_border(inner, at_border))
         if step == len(betas) - 1 and not few:
             solved = _with_residual(deconvolution, projected, solved, statistics)
         sharp = deconvolution.blend(solved)

@@ -133,7 +133,13 @@ class TileDeconvolution:
         spectrum = self._without_highlights.get(number)
         return transforms.forward(self.periodic(padded, *corner), self._spectrum) if spectrum is None else spectrum
 
-    def join(self, channels: Sequence[Image], further: Sequence[FurtherPicture], ratio: Image) -> None:
+    def join(
+        self,
+        channels: Sequence[Image],
+        further: Sequence[FurtherPicture],
+        ratio: Image,
+        factors: Sequence[float] | None = None,
+    ) -> None:
         """Add further pictures of the same scene to the data term; channels (height, width) of the tiles' own picture.
 
         Registration error acts as extra noise, (1 − s²) |K|² of the signal, beside the frame's own, N / S ``ratio``,
@@ -150,7 +156,6 @@ class TileDeconvolution:
         """
         padded = [self.padded(channel) for channel in channels]
         others = [_Joining(self, one) for one in further]
-        least = cv2.add(ratio, LEAST_RATIO)
         self._joined = [np.empty_like(self.kernels) for _ in channels]
         one, sums, *_ = buffers = np.empty((4, self.size, self.size), np.float32)
         for number, corner in enumerate(self.grid.corners()):
@@ -163,13 +168,15 @@ class TileDeconvolution:
             if not telling:
                 continue
             sums[:] = self.kernels[number]
+            own_ratio = ratio if factors is None else cv2.multiply(ratio, factors[number])
+            least = cv2.add(own_ratio, LEAST_RATIO)
             for other in telling:
                 known: list[Image] = []
                 if not other.whole[number]:
-                    divisor = cv2.add(power, ratio)
+                    divisor = cv2.add(power, own_ratio)
                     rest = self._rest.get(number)
                     known = [cv2.divide(b, divisor) for b in projected] if rest is None else [rest]
-                other.add(number, known, (ratio, least), power, projected, buffers)
+                other.add(number, known, (own_ratio, least), power, projected, buffers)
             _whole_power(sums, one)
             evidence = cv2.divide(power, cv2.max(cv2.max(one, power), LEAST_RATIO), one)
             for spectrum in (power, *projected):
@@ -234,14 +241,18 @@ class TileDeconvolution:
         shares, highlights = (whole[: grid.height, : grid.width] for whole in (shares, highlights))
         return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), highlights)
 
-    def solutions(self, projected: Iterable[Image], inner: Image, at_border: Image) -> Iterator[Image]:
-        """Each tile's spectrum over |K|² + R; R: regularisation, ``inner`` or ``at_border``.
+    def inside_or_at_border(self, inner: Image, at_border: Image) -> Iterator[Image]:
+        """One of the two for each tile: the second for those that see beyond the picture."""
+        return (at_border if border else inner for border in self.at_border)
+
+    def solutions(self, projected: Iterable[Image], regularisations: Iterable[Image]) -> Iterator[Image]:
+        """Each tile's spectrum over |K|² + R, with its own regularisation R.
 
         A spectrum is valid until the next is requested, as those of :meth:`pulled` are.
         """
         divisor = self._divisor
-        for spectrum, power, border in zip(projected, self.powers, self.at_border, strict=True):
-            yield cv2.divide(spectrum, cv2.add(power, at_border if border else inner, divisor), divisor)
+        for spectrum, power, regularisation in zip(projected, self.powers, regularisations, strict=True):
+            yield cv2.divide(spectrum, cv2.add(power, regularisation, divisor), divisor)
 
     def pulled(self, projected: Iterable[Image], pull: Image, inner: float, at_border: float) -> Iterator[Image]:
         """Each tile's spectrum plus a factor times that of ``pull`` (height, width).

@@ -21,12 +21,16 @@ from virest.restoration.statistics.tile_power import (
     known_part,
     light_in_grey_levels,
     passed_power,
+    variance_within,
     white_noise,
     windowed_power,
 )
 
 _MAX_CLIPPED = 0.002
 """Use tiles with a larger fraction of clipped pixels only if too few tiles have less."""
+
+STORED_COLOUR_PX = 2
+"""Side of the square of pixels that share one colour sample in a 4:2:0 movie."""
 
 
 def measure_picture(
@@ -86,6 +90,10 @@ def measure_picture(
         of_luma = replace(of_luma, places=place_statistics(of_luma, grey, passed, weight))
     if not of_chroma:
         return of_luma, of_luma
+    planes = [plane.astype(np.float32) for i in colourful for plane in parts[i][1:]]
+    variance = float(np.mean([variance_within(plane, round(of_chroma[0].period_px)).mean() for plane in planes]))
+    samples = len(colourful) * (SIDE / STORED_COLOUR_PX) ** 2
+    of_chroma = [of_chroma[0].with_signal_variance(variance, samples, of_luma)]
     if weight:
         of_chroma = [replace(of_chroma[0], places=place_statistics(of_chroma[0], colour, passed[colourful], weight))]
     return of_luma, of_chroma[0]

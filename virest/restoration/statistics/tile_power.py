@@ -69,6 +69,13 @@ def _smoothly_filled(values: NDArray[np.float32], known: NDArray[np.float32]) ->
     return filled
 
 
+def variance_within(plane: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Variance of a plane within the square of ``side`` pixels around each pixel."""
+    mean = cv2.blur(plane, (side, side))
+    power = cv2.blur(cv2.multiply(plane, plane), (side, side))
+    return np.asarray(cv2.subtract(power, cv2.multiply(mean, mean)), np.float32)
+
+
 def passed_power(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     """|K|² of a kernel, smoothed as the tile's window smooths spectra."""
     padded = np.zeros((SIDE, SIDE), np.float32)
