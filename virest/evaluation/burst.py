@@ -29,7 +29,7 @@ ANCHOR = 0.5
 REACHES = (1, 2, 3)
 """Numbers of neighbours on each side to try."""
 EXPONENTS = (3.0, 11.0, 30.0)
-"""Exponents of Fourier burst accumulation (11 in the paper; Delbracio & Sapiro 2015, doi:10.1109/CVPR.2015.7298855)."""
+"""Exponents of Fourier burst accumulation (11 in the paper: Delbracio & Sapiro 2015, doi:10.1109/CVPR.2015.7298855)."""
 SMOOTHED_SIDE = 50
 """The smoothing σ of its weights is the frame's shorter side divided by this, as in the paper."""
 
