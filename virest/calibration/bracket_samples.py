@@ -168,7 +168,7 @@ def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator)
     samples = BracketSamples(grey, site, channel, exposure, lows, highs, top, noise, shifts_px, ends)
     seen = samples.measured.sum(axis=1) >= 2
     if len(np.unique(site[seen])) < MIN_SITES:
-        text = f"only {len(np.unique(site[seen]))} flat places are unclipped in two pictures, {MIN_SITES} are needed"
+        text = f"only {len(np.unique(site[seen]))} flat areas are unclipped in two pictures, {MIN_SITES} are needed"
         raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, of a scene with flat areas")
     return samples.take(seen)
 
@@ -250,7 +250,7 @@ def _flat_sites(
     excess = np.where(measured, variances / expected, 0.0).max(axis=(0, 1))
     seen = np.flatnonzero((measured.sum(axis=1) >= 2).any(axis=0))
     if not len(seen):
-        text = "no place is unclipped in two pictures"
+        text = "no area is unclipped in two pictures"
         raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, at most 3 EV apart")
     return seen[excess[seen] <= max(np.quantile(excess[seen], 0.5), 2.0)]
 

@@ -272,9 +272,11 @@ def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]
     rms = np.sqrt((residual**2).sum(axis=1) / np.maximum(samples.measured.sum(axis=1), 1))
     moved = rms > limit
     if moved.mean() > MAX_MOVED:
-        text = f"the scene is not still, or the exposures are wrong throughout: {moved.mean():.0%} of the places change"
+        text = (
+            f"the scene is not still, or the exposures are wrong throughout: {moved.mean():.0%} of the samples deviate"
+        )
         raise CalibrationError(
-            f"{text} by more than {MOVED_LEVELS:g} grey levels against any curve",
+            f"{text} by more than {MOVED_LEVELS:g} grey levels from any curve",
             hint="take a still scene in steady light from a tripod",
         )
     worst = residual.max(axis=1)
@@ -331,20 +333,20 @@ def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
         before = trials[chosen].held_out_rms
         gain = 1.0 - tabulated.held_out_rms / max(before, 1e-9)
         notes.append(
-            f"{chosen} does not follow the data: residuals share {structure:.2f} grey levels at one grey; a table "
+            f"{chosen} does not fit the data: systematic residual of {structure:.2f} grey levels; a table "
             f"lowers the held-out rms from {before:.2f} to {tabulated.held_out_rms:.2f} ({gain:.0%}): "
             "--kind table"
         )
     elif structure > STRUCTURE_LEVELS:
-        notes.append(f"structure in the residuals over grey level: {structure:.2f} levels that no kind explains")
+        notes.append(f"systematic residual of {structure:.2f} grey levels that no kind explains")
     if chosen == "table" and "five_segment" in trials:
         five = trials["five_segment"].held_out_rms
         table = tabulated.held_out_rms
-        notes.append(f"no simpler kind follows: held-out rms {five:.2f} with five_segment, {table:.2f} with table")
+        notes.append(f"no simpler kind fits: held-out rms {five:.2f} with five_segment, {table:.2f} with table")
     if verdict.scatter_ev > SCATTER_EV:
         notes.append(
             f"the listed exposures agree to {verdict.scatter_ev:.2f} EV only: flicker, or several are wrong "
-            "(is ISO counted?) and too few right to tell which"
+            "(is ISO included?) and too few are right to tell which"
         )
     if len(samples.exposure) < MIN_PICTURES:
         notes.append(f"{len(samples.exposure)} pictures are too few to find wrong exposures")
@@ -354,8 +356,8 @@ def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
     open_levels = verdict.posterior.rms_levels
     if open_levels > OPEN_LEVELS:
         notes.append(
-            f"the pictures hold the curve to {open_levels:.1f} grey levels rms only"
-            f"{', the rest is the kind' * (chosen != 'table')}: more exposures, closer together, hold it better"
+            f"the pictures determine the curve to {open_levels:.1f} grey levels rms only"
+            f"{', the kind determines the rest' * (chosen != 'table')}: take more exposures, closer together"
         )
     if (final.curve.encode(np.array([1.0])) * 255)[0] - samples.top > 25:
         notes.append(f"no grey above {samples.top:.0f} was seen: the curve is extrapolated there")

@@ -119,9 +119,9 @@ def _parse_values(name: str, effect: Effect, text: str, drawn: list[Any], contex
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
-        raise SettingsError(f"effect {name}: '{text}' is no number", hint="write NAME=0.1 or NAME=0.1,0.2") from None
+        raise SettingsError(f"effect {name}: '{text}' is not a number", hint="write NAME=0.1 or NAME=0.1,0.2") from None
     if not all(math.isfinite(n) or (n == math.inf and effect.allow_infinity) for n in numbers):
-        raise SettingsError(f"effect {name}: '{text}' is no finite number", hint="write NAME=0.1 or NAME=0.1,0.2")
+        raise SettingsError(f"effect {name}: '{text}' is not a finite number", hint="write NAME=0.1 or NAME=0.1,0.2")
     if effect.per_frame:
         if len(numbers) not in (1, context.frames):
             raise SettingsError(

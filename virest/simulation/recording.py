@@ -168,7 +168,7 @@ def _require_free(out: Path, overwrite: bool) -> None:
     if not overwrite:
         raise OutputError(f"{out} exists and is not empty", hint="choose another folder, or pass --overwrite")
     if not (out / "truth" / "effects.json").is_file():
-        raise OutputError(f"{out} holds something else than a simulated capture", hint="choose another folder")
+        raise OutputError(f"{out} holds something else, not a simulated capture", hint="choose another folder")
 
 
 def _put_in_place(part: Path, out: Path) -> None:

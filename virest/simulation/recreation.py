@@ -192,7 +192,7 @@ def _require_ahead(motion: HandMotion, view: View, session: Session, shows: NDAr
     if ahead.min() < LEAST_AHEAD:
         far = int(np.argmin(ahead))
         raise CaptureError(
-            f"frame {far} of those asked for looks {np.degrees(np.arccos(turns[far, 2, 2])):.0f} degrees past the "
+            f"frame {far} of those selected looks {np.degrees(np.arccos(turns[far, 2, 2])):.0f} degrees past the "
             "picture that the scene is made of",
             hint="choose fewer frames with --frames A:B",
         )

@@ -303,7 +303,7 @@ def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
         raise SettingsError(f"simulation: {what}", hint=hint)
 
     if profile.width <= 0 or profile.height <= 0:
-        refuse(f"{profile.width}x{profile.height} is no picture size", "ask for at least 16x16")
+        refuse(f"{profile.width}x{profile.height} is not a valid picture size", "ask for at least 16x16")
     if profile.width % 2 or profile.height % 2:
         refuse(f"{profile.width}x{profile.height} is odd", "H.264 needs even width and height")
     if settings.frames < 1:

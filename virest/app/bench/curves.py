@@ -164,9 +164,9 @@ def clipping_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) ->
     for reader, read in readers.items():
         found = np.array([f for pair in pairs for f in _near_and_far(read(*pair), pair[0])])
         near, far, whole, share = found.mean(axis=0).tolist()
-        alike = reader != "nothing clipped"
+        comparable = reader != "nothing clipped"
         rows.append({"scene": name, "told": reader, "clipped": share, "elsewhere_db": far,
-                     "near_db": near if alike else None, "whole_db": whole if alike else None})  # fmt: skip
+                     "near_db": near if comparable else None, "whole_db": whole if comparable else None})  # fmt: skip
     return rows
 
 

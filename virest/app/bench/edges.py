@@ -84,20 +84,20 @@ def _soft_row(work: Path, number: int, hidden: tuple[float, str]) -> Row:
     seen = look_for_blur(source.gray, source.capture, source.profile, trajectory)
     effects: list[Any] = [Defocus()]
     found = fit(seen, source.profile, trajectory, effects)
-    told = {"told_px": float(found.values[0][0]), "std_px": float(found.std[0])} if found.determined[0] else {}
-    return {"scene": scene, "sigma_px": sigma_px, "edges": len(seen.edges), **told}
+    estimate = {"told_px": float(found.values[0][0]), "std_px": float(found.std[0])} if found.determined[0] else {}
+    return {"scene": scene, "sigma_px": sigma_px, "edges": len(seen.edges), **estimate}
 
 
 def _soft_text(rows: list[Row]) -> str:
-    told = [row for row in rows if "told_px" in row]
+    estimated = [row for row in rows if "told_px" in row]
     lines = [
         [f"{row['sigma_px']:g}", row["scene"], str(row["edges"]), f"{row['told_px']:.2f} ± {row['std_px']:.2f}"]
-        for row in told
+        for row in estimated
     ]
-    off = np.array([row["told_px"] / row["sigma_px"] - 1 for row in told])
+    off = np.array([row["told_px"] / row["sigma_px"] - 1 for row in estimated])
     return (
         f"DEFOCUS, px: relative error {np.mean(off):+.3f} in the mean, rms {np.sqrt(np.mean(off**2)):.3f},\n"
-        f"in {len(told)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "estimated"], lines)
+        f"in {len(estimated)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "estimated"], lines)
     )
 
 
@@ -129,21 +129,21 @@ def _text(groups: list[list[Row]]) -> str:
     ]
     lines = []
     for rows in groups:
-        told = [row for row in rows if row["p_value"] is not None]
-        seen = [row for row in told if row["p_value"] < FALSE_ALARM]
-        every, sharpest = (np.array([row[key] for row in told]) for key in ("of_all", "of_sharpest"))
-        fitted = np.array([row["fitted"] for row in (told if rows[0]["mask"][0] else seen)]).reshape(-1, 2)
+        measured = [row for row in rows if row["p_value"] is not None]
+        seen = [row for row in measured if row["p_value"] < FALSE_ALARM]
+        every, sharpest = (np.array([row[key] for row in measured]) for key in ("of_all", "of_sharpest"))
+        fitted = np.array([row["fitted"] for row in (measured if rows[0]["mask"][0] else seen)]).reshape(-1, 2)
         lines.append(
             [
                 f"{rows[0]['mask'][0]:g}, {rows[0]['mask'][1]:g} px" if rows[0]["mask"][0] else "none",
-                str(len(told)),
+                str(len(measured)),
                 _mean_and_std(every, 4),
                 _mean_and_std(sharpest, 4),
                 f"{sharpest.max():.3f}",
-                f"{len(seen)} of {len(told)}",
+                f"{len(seen)} of {len(measured)}",
                 _mean_and_std(fitted[:, 0], 2),
                 _mean_and_std(fitted[:, 1], 2),
-                _mean_and_std([row["expected"] for row in told], 2),
+                _mean_and_std([row["expected"] for row in measured], 2),
             ]
         )
     return (
