@@ -109,7 +109,7 @@ def test_imu_rotation_stands_on_the_left():
         ("time_ofset", "did you mean 'time_offset'"),
         ("gyro_bias=0.1", "takes 3"),
         ("readout_direction=sideways", "top_to_bottom"),
-        ("flicker=much", "no number"),
+        ("flicker=much", "not a number"),
         ("focal_length=inf", "not a finite number"),
         ("gain_drift=1,1.1,0.9", "3 factors for 20 frames"),
         ("gain_drift=1e9", "too much"),
